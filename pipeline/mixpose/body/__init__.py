@@ -1,0 +1,19 @@
+"""The object model q: features, their samples, and the body's symmetries."""
+
+from __future__ import annotations
+
+from mixpose.body.features import Feature, PointFeature, SegmentFeature
+from mixpose.body.model import Body, Nodes
+from mixpose.body.sampling import Sampler, uniforms
+from mixpose.body.symmetry import symmetries
+
+__all__ = [
+    "Body",
+    "Feature",
+    "Nodes",
+    "PointFeature",
+    "Sampler",
+    "SegmentFeature",
+    "symmetries",
+    "uniforms",
+]

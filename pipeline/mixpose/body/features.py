@@ -1,0 +1,124 @@
+"""Kinds of feature: the densities q_i of where a feature of the object may be.
+
+A feature kind states its mean and covariance, how uniform numbers become samples of it, and the
+few weighted points that stand for it where the body is not sampled (`nodes`).  A new kind is one
+class with these members.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+Floats: TypeAlias = NDArray[np.float64]
+
+SEGMENT_NODES = 24
+
+
+@runtime_checkable
+class Feature(Protocol):
+    """A feature density q_i in the object's frame."""
+
+    @property
+    def mean(self) -> Floats:
+        """Expected position (3,)."""
+        ...
+
+    @property
+    def covariance(self) -> Floats:
+        """Spread about the nodes (3, 3); zero where the feature is exact."""
+        ...
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """Points (K, 3) and weights (K,), summing to 1, that carry the spread."""
+        ...
+
+    def sample(self, uniforms: Floats) -> Floats:
+        """Turn uniform numbers (R, 4) in (0, 1) into samples (R, 3) of the density."""
+        ...
+
+
+def no_spread() -> Floats:
+    """The covariance of an exactly known feature."""
+    return np.zeros((3, 3))
+
+
+@dataclass(frozen=True)
+class PointFeature:
+    """A point: exact (delta) or Gaussian, q_i = N(z_i, Σ_i).
+
+    Parameters
+    ----------
+    position : (3,) array
+    covariance : (3, 3) array
+        Σ_i; zero for a delta.
+    """
+
+    position: Floats
+    covariance: Floats = field(default_factory=no_spread)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))
+        object.__setattr__(self, "covariance", np.asarray(self.covariance, dtype=np.float64))
+
+    @property
+    def mean(self) -> Floats:
+        """Expected position (3,)."""
+        return self.position
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """The position itself."""
+        return self.position[None], np.ones(1)
+
+    def sample(self, uniforms: Floats) -> Floats:
+        """Samples (R, 3) of the Gaussian from uniform numbers (R, 4); the last is not used."""
+        return self.position + gaussian(uniforms, self.covariance)
+
+
+@dataclass(frozen=True)
+class SegmentFeature:
+    """A straight line, uniform along its length, blurred by a Gaussian.
+
+    Parameters
+    ----------
+    start, end : (3,) array
+    covariance : (3, 3) array
+        Spread about the line; zero for a sharp line.
+    """
+
+    start: Floats
+    end: Floats
+    covariance: Floats = field(default_factory=no_spread)
+
+    def __post_init__(self) -> None:
+        for name in ("start", "end", "covariance"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+
+    @property
+    def mean(self) -> Floats:
+        """Expected position (3,), the middle of the line."""
+        return np.asarray((self.start + self.end) / 2)
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """Midpoints of equal pieces of the line."""
+        along = (np.arange(SEGMENT_NODES) + 0.5)[:, None] / SEGMENT_NODES
+        weights = np.full(SEGMENT_NODES, 1.0 / SEGMENT_NODES)
+        return self.start + along * (self.end - self.start), weights
+
+    def sample(self, uniforms: Floats) -> Floats:
+        """Samples (R, 3) from uniform numbers (R, 4); the last one runs along the line."""
+        on_line = self.start + uniforms[:, 3:] * (self.end - self.start)
+        return on_line + gaussian(uniforms, self.covariance)
+
+
+def gaussian(uniforms: Floats, covariance: Floats) -> Floats:
+    """Zero-mean Gaussian offsets (R, 3) from the first three of uniform numbers (R, 4)."""
+    if not covariance.any():
+        return np.zeros((len(uniforms), 3))
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(ndtri(uniforms[:, :3]) @ root.T)

@@ -1,0 +1,141 @@
+"""The object model: q = (1/N) Σ q_i, a mixture of feature densities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body.features import Feature
+from mixpose.body.sampling import Sampler, uniforms
+from mixpose.body.symmetry import default_tolerance, symmetries
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """The weighted points that stand for the body where it is not sampled.
+
+    Attributes
+    ----------
+    points : (Q, 3) float64
+    weights : (Q,) float64
+        Each feature's nodes sum to 1, so that all sum to N.
+    feature : (Q,) int
+        The feature that a node belongs to.
+    """
+
+    points: Floats
+    weights: Floats
+    feature: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body known by its features.
+
+    Attributes
+    ----------
+    name : str
+    features : tuple of Feature
+        The densities q_i in the object's frame.
+    normals : (N, 3) float64 or None
+        Outward normals: a feature is seen only by sensors it faces.
+    """
+
+    name: str
+    features: tuple[Feature, ...]
+    normals: Floats | None = None
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    @cached_property
+    def means(self) -> Floats:
+        """Expected feature positions (N, 3)."""
+        return np.array([feature.mean for feature in self.features])
+
+    @cached_property
+    def covariances(self) -> Floats:
+        """Spreads Σ_i (N, 3, 3)."""
+        return np.array([feature.covariance for feature in self.features])
+
+    @cached_property
+    def nodes(self) -> Nodes:
+        """Weighted points that stand for the features."""
+        parts = [feature.nodes() for feature in self.features]
+        counts = [len(weights) for _, weights in parts]
+        return Nodes(
+            points=np.concatenate([points for points, _ in parts]),
+            weights=np.concatenate([weights for _, weights in parts]),
+            feature=np.repeat(np.arange(len(parts)), counts),
+        )
+
+    @cached_property
+    def node_normals(self) -> Floats | None:
+        """Normals of the nodes (Q, 3), None where the body has none."""
+        return None if self.normals is None else self.normals[self.nodes.feature]
+
+    @cached_property
+    def is_exact(self) -> bool:
+        """Whether every feature is a delta: then no sampling is needed."""
+        return len(self.nodes.points) == len(self) and not self.covariances.any()
+
+    @cached_property
+    def radius(self) -> float:
+        """Largest distance of a feature node from the centre of the means."""
+        away = self.nodes.points - self.means.mean(axis=0)
+        return float(np.linalg.norm(away, axis=1).max())
+
+    @cached_property
+    def spread(self) -> float:
+        """Largest standard deviation of any feature in any direction."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.covariances).max(), 0.0)))
+
+    @cached_property
+    def symmetries(self) -> Floats:
+        """Motions T_object_object (G, 4, 4) that map the feature set onto itself."""
+        points = self.nodes.points
+        return symmetries(points, max(default_tolerance(points), self.spread))
+
+    def sample(
+        self,
+        count: int,
+        *,
+        sampler: Sampler = "latin-hypercube",
+        antithetic: bool = True,
+        common: bool = True,
+        seed: int = 0,
+    ) -> Floats:
+        """Draw R samples of every feature density.
+
+        Parameters
+        ----------
+        count : int
+            R; an exact body has one sample per feature whatever the count.
+        sampler : {"latin-hypercube", "low-discrepancy"}
+        antithetic : bool
+            Whether samples come in mirrored pairs.
+        common : bool
+            Whether all features use the same point set; fresh sets per feature are for
+            comparison only.
+        seed : int
+
+        Returns
+        -------
+        (N, R, 3) array
+        """
+        if self.is_exact:
+            return self.means[:, None, :].copy()
+        shared = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed)
+        samples = []
+        for i, feature in enumerate(self.features):
+            own = shared
+            if not common:
+                own = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed + 7919 * i)
+            samples.append(feature.sample(own))
+        return np.array(samples)

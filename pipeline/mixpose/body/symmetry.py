@@ -1,0 +1,102 @@
+"""Rotations that map a body onto itself: poses that no sensor can tell apart.
+
+A rotation of the body is fixed by where it sends three features that are not on a line.  All
+images of such a triple with the same distances are tried, and those that map every feature onto
+a feature within the tolerance are kept.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mixpose.rigid import from_parts
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def symmetries(points: Floats, tolerance: float) -> Floats:
+    """Find the proper rigid motions that map a point set onto itself.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+        Feature means.
+    tolerance : float
+        Largest distance, in length units, between an image and its feature.
+
+    Returns
+    -------
+    (G, 4, 4) array
+        T_object_object, the identity first.  Points on one line (a continuous symmetry) give
+        only the identity and the half-turn, if any.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    centre = points.mean(axis=0)
+    centred = points - centre
+    base = _widest_triple(centred)
+    tree = cKDTree(centred)
+    found = [np.eye(3)]
+    for image in _congruent_triples(centred, base, tolerance):
+        R = _aligning_rotation(centred[list(base)], centred[list(image)])
+        _, mapped = tree.query(centred @ R.T)
+        if len(set(mapped.tolist())) == len(points):
+            R = _aligning_rotation(centred, centred[mapped])
+        distance, index = tree.query(centred @ R.T)
+        one_to_one = len(set(index.tolist())) == len(points)
+        if one_to_one and distance.max() <= tolerance and not _known(R, found):
+            found.append(R)
+    rotations = np.array(found)
+    return from_parts(rotations, centre - rotations @ centre)
+
+
+def default_tolerance(points: Floats) -> float:
+    """A hundredth of the mean distance from the centre: below it a body is called symmetric."""
+    centred = points - points.mean(axis=0)
+    return float(0.01 * np.linalg.norm(centred, axis=1).mean())
+
+
+def _widest_triple(centred: Floats) -> tuple[int, int, int]:
+    """Three features that span the largest triangle with the first of them farthest out."""
+    first = int(np.linalg.norm(centred, axis=1).argmax())
+    second = int(np.linalg.norm(centred - centred[first], axis=1).argmax())
+    edge = centred[second] - centred[first]
+    area = np.linalg.norm(np.cross(centred - centred[first], edge), axis=1)
+    area[[first, second]] = -1.0
+    return first, second, int(area.argmax())
+
+
+def _congruent_triples(
+    centred: Floats, base: tuple[int, int, int], tolerance: float
+) -> list[tuple[int, int, int]]:
+    """Ordered triples with the side lengths and radii of the base triple."""
+    radius = np.linalg.norm(centred, axis=1)
+    distance = np.linalg.norm(centred[:, None] - centred[None], axis=-1)
+    a, b, c = base
+    slack = 2 * tolerance
+    alike = [np.flatnonzero(np.abs(radius - radius[i]) <= slack).tolist() for i in base]
+    triples = []
+    for i in alike[0]:
+        for j in alike[1]:
+            if i == j or abs(distance[i, j] - distance[a, b]) > slack:
+                continue
+            for k in alike[2]:
+                if k in (i, j) or abs(distance[i, k] - distance[a, c]) > slack:
+                    continue
+                if abs(distance[j, k] - distance[b, c]) <= slack:
+                    triples.append((i, j, k))
+    return triples
+
+
+def _aligning_rotation(source: Floats, target: Floats) -> Floats:
+    """Least-squares rotation (3, 3) from vectors (n, 3) to vectors (n, 3)."""
+    U, _, Vt = np.linalg.svd(target.T @ source)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def _known(R: Floats, found: list[Floats]) -> bool:
+    angles = [np.arccos(np.clip((np.trace(R.T @ S) - 1) / 2, -1, 1)) for S in found]
+    return bool(min(angles) < np.radians(1.0))

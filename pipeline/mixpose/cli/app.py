@@ -1,0 +1,155 @@
+"""What people type: commands and options.  Each command imports its work when it is called."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    name="mixpose",
+    help="6-D poses of a known rigid body from frames of calibrated sensors, "
+    "without matching markers. --debug after any command shows tracebacks.",
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
+
+
+class Format(StrEnum):
+    """Formats of poses."""
+
+    jsonl = "jsonl"
+    csv = "csv"
+    tum = "tum"
+    bop = "bop"
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from mixpose import __version__  # noqa: PLC0415
+
+        typer.echo(f"mixpose {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def run(
+    session: SessionFile,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write poses here, not to stdout.")
+    ] = None,
+    format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+    start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
+    stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
+    step: Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")] = 1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on after the last frame in the output.")
+    ] = False,
+) -> None:
+    """Print a pose per frame."""
+    from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
+    from mixpose.runner import Selection  # noqa: PLC0415
+
+    run_session(
+        session,
+        RunRequest(output, format.value, tuple(source or ()), Selection(start, stop, step), resume),
+    )
+
+
+@app.command()
+def check(session: SessionFile) -> None:
+    """Read everything, estimate nothing: sensors, recordings, symmetries, expected accuracy."""
+    from mixpose.cli.check import check_session  # noqa: PLC0415
+
+    check_session(session)
+
+
+@app.command()
+def simulate(
+    session: SessionFile,
+    output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the recording.")],
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")],
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same recording.")] = 0,
+    fps: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
+    noise: Annotated[float, typer.Option(help="Camera noise, grey levels.")] = 2.0,
+    clutter: Annotated[float, typer.Option(help="False features per frame and sensor.")] = 0.0,
+    hidden: Annotated[float, typer.Option(help="Chance that a feature is hidden.")] = 0.0,
+    missing: Annotated[float, typer.Option(help="Chance that a sensor has no frame.")] = 0.0,
+    brightness: Annotated[float, typer.Option(help="Peak of a spot, grey levels.")] = 170.0,
+    brightness_spread: Annotated[
+        float, typer.Option(help="Spread of the brightness over the features, as a share.")
+    ] = 0.1,
+    translation: Annotated[
+        float | None, typer.Option(help="Largest displacement along each axis, length units.")
+    ] = None,
+    rotation: Annotated[float, typer.Option(help="Largest turn about each axis, degrees.")] = 20.0,
+    period: Annotated[float, typer.Option(help="Seconds in which the motion comes round.")] = 4.0,
+    pixel_noise: Annotated[
+        float, typer.Option(help="Error of detections in a camera's table, px.")
+    ] = 0.1,
+    range_noise: Annotated[
+        float | None, typer.Option(help="Error of detections in a range table, length units.")
+    ] = None,
+    range_snr: Annotated[
+        float, typer.Option(help="Height of a profile's peak over its noise.")
+    ] = 30.0,
+    deform: Annotated[
+        bool, typer.Option("--deform", help="Displace features by the spread the object states.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a recording in the folder.")
+    ] = False,
+) -> None:
+    """Render a recording with truth.jsonl that `run` can play."""
+    from mixpose.cli.simulate import simulate_session  # noqa: PLC0415
+    from mixpose.simulation import SimulationOptions  # noqa: PLC0415
+
+    options = SimulationOptions(
+        frames=frames,
+        seed=seed,
+        fps=fps,
+        noise=noise,
+        clutter=clutter,
+        hidden=hidden,
+        missing=missing,
+        brightness=brightness,
+        brightness_spread=brightness_spread,
+        amplitude_translation=translation,
+        amplitude_rotation_deg=rotation,
+        period_s=period,
+        pixel_noise=pixel_noise,
+        range_noise=range_noise,
+        range_snr=range_snr,
+        deform=deform,
+    )
+    simulate_session(session, output, options, overwrite=overwrite)
+
+
+@app.command()
+def evaluate(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
+    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Errors of poses against the truth, modulo the object's symmetries."""
+    from mixpose.cli.evaluate import evaluate_poses  # noqa: PLC0415
+
+    evaluate_poses(poses, truth, as_json=json)

@@ -1,0 +1,99 @@
+"""``mixpose check``: what a session says, without estimating anything."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.estimation import expected_covariance, free_mask
+from mixpose.rigid import TWIST_NAMES
+from mixpose.runner import open_sources
+from mixpose.session import SensorSetup, Session, load_session
+
+
+def check_session(path: Path) -> None:
+    """Print sensors, recordings, the object's symmetries and the expected accuracy.
+
+    Raises
+    ------
+    SessionError, RecordingError
+        As ``mixpose run`` would before its first frame.
+    """
+    session = load_session(path)
+    lines = [f"session   {session.path}, lengths in {session.unit}"]
+    lines += _object_lines(session)
+    sources = open_sources(session, {})
+    for setup in session.sensors:
+        lines.append(f"sensor    {setup.name}: {_geometry(setup)}, {_extraction(setup)}")
+        lines.append(f"          {sources[setup.name].describe()}")
+    lines += _accuracy_lines(session)
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _object_lines(session: Session) -> list[str]:
+    body = session.body
+    spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
+    extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
+    lines = [f"object    {body.name}: {extent}{spread}"]
+    alike = len(body.symmetries)
+    if alike > 1:
+        lines.append(
+            f"symmetry  {alike} orientations look the same; the pose nearest to the previous one "
+            "is written"
+        )
+    else:
+        lines.append("symmetry  none")
+    return lines
+
+
+def _geometry(setup: SensorSetup) -> str:
+    if setup.resolution is None:
+        return setup.model
+    return f"{setup.model} {setup.resolution[0]}x{setup.resolution[1]}"
+
+
+def _extraction(setup: SensorSetup) -> str:
+    unit = "px" if setup.sensor.unit == "px" else "length units"
+    if setup.model == "lateration":
+        return f"sigma {setup.extract.sigma:g} {unit}"
+    return (
+        f"{setup.extract.method} ({setup.extract.polarity}), sigma {setup.extract.sigma:g} {unit}"
+    )
+
+
+def _accuracy_lines(session: Session) -> list[str]:
+    if session.start is None:
+        return ["accuracy  needs a [start] to be predicted at", "start     none: a start is needed"]
+    free = free_mask(session.estimator)
+    covariance, counts = expected_covariance(
+        [setup.sensor for setup in session.sensors],
+        [setup.extract.sigma for setup in session.sensors],
+        session.body,
+        session.start.T_world_object,
+        free,
+    )
+    seen = ", ".join(
+        f"{setup.name} {count}/{len(session.body)}"
+        for setup, count in zip(session.sensors, counts, strict=True)
+    )
+    deviations = np.sqrt(np.diag(covariance))
+    deviations[3:] = np.degrees(deviations[3:])
+    units = [session.unit] * 3 + ["deg"] * 3
+    terms = [
+        _deviation(name, value, unit)
+        for name, value, unit, is_free in zip(TWIST_NAMES, deviations, units, free, strict=True)
+        if is_free
+    ]
+    return [
+        f"in view   at the start: {seen}",
+        f"accuracy  one standard deviation at the start, if each feature errs by sigma: "
+        f"{', '.join(terms)}",
+    ]
+
+
+def _deviation(name: str, value: float, unit: str) -> str:
+    if not np.isfinite(value):
+        return f"{name} not determined"
+    return f"{name} {value:.3g} {unit}"

@@ -1,0 +1,41 @@
+"""``mixpose simulate``: a recording with its truth."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mixpose.session import load_session
+from mixpose.simulation import SimulationOptions, simulate
+
+
+def simulate_session(
+    path: Path, folder: Path, options: SimulationOptions, *, overwrite: bool
+) -> None:
+    """Render the recording of a session into a folder.
+
+    Raises
+    ------
+    SessionError
+        If the session or the options are wrong, or the folder holds a recording already.
+    """
+    session = load_session(path)
+    if not sys.stderr.isatty():
+        simulate(session, folder, options, overwrite=overwrite)
+    else:
+        from rich.console import Console  # noqa: PLC0415 - only where it is shown
+        from rich.progress import Progress  # noqa: PLC0415
+
+        with Progress(console=Console(stderr=True), transient=True) as progress:
+            task = progress.add_task("simulating", total=options.frames)
+            simulate(
+                session,
+                folder,
+                options,
+                overwrite=overwrite,
+                progress=lambda done: progress.update(task, completed=done),
+            )
+    print(
+        f"{options.frames} frames in {folder}; play them with: mixpose run {folder / path.name}",
+        file=sys.stderr,
+    )

@@ -1,0 +1,22 @@
+"""Densities g_l of where features are: blur, normalisation, windows, levels of blur."""
+
+from __future__ import annotations
+
+from mixpose.density.atlas import Atlas
+from mixpose.density.blur import render
+from mixpose.density.grid import FLOOR, Density, Window
+from mixpose.density.observation import STEPS_PER_SIGMA, Observation
+from mixpose.density.overlap import close_pairs, peak, self_overlap
+
+__all__ = [
+    "FLOOR",
+    "STEPS_PER_SIGMA",
+    "Atlas",
+    "Density",
+    "Observation",
+    "Window",
+    "close_pairs",
+    "peak",
+    "render",
+    "self_overlap",
+]

@@ -1,0 +1,128 @@
+"""A density on a grid, and how to look values up in it.
+
+A density is float32 values plus the affine map from sensor coordinates to array indices,
+``index = (y - origin) / step``: windows, coarse levels and range profiles (one row high) are all
+the same thing.  Channel 0 holds the density g, the following m channels its gradient by sensor
+coordinates.  Outside the array every channel is `FLOOR`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+
+FLOOR = 0.0
+"""Density outside the grid, behind the camera and wherever a sensor sees nothing."""
+
+_ROW = 16384  # cv2.remap takes maps of less than 32767 a side
+FAR = -1.0e6  # an index that is outside any array, finite in float32
+
+
+@dataclass(frozen=True)
+class Window:
+    """A grid in sensor coordinates.
+
+    Attributes
+    ----------
+    origin : (m,) float64
+        Sensor coordinates of the first grid point.
+    shape : (int, int)
+        Rows and columns; one row for ranges.
+    step : float
+        Sensor units between grid points.
+    """
+
+    origin: Floats
+    shape: tuple[int, int]
+    step: float
+
+    @classmethod
+    def around(cls, lower: Floats, upper: Floats, step: float) -> Window:
+        """The smallest grid that covers the box from `lower` to `upper`, both (m,)."""
+        count = np.maximum(np.ceil((upper - lower) / step - 1e-9).astype(int) + 1, 2)
+        rows = int(count[1]) if len(count) == 2 else 1
+        return cls(np.asarray(lower, dtype=np.float64), (rows, int(count[0])), float(step))
+
+    def axis(self, k: int) -> Floats:
+        """Sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
+        count = self.shape[1] if k == 0 else self.shape[0]
+        return np.asarray(self.origin[k] + self.step * np.arange(count))
+
+
+@dataclass(frozen=True)
+class Density:
+    """A probability density over sensor coordinates, sampled on a window.
+
+    Attributes
+    ----------
+    values : (H, W, 1 + m) or (H, W) float32
+        Density in 1/unit^m, then its gradient in 1/unit^(m+1) where it was asked for.
+    window : Window
+    sigma : float
+        Standard deviation, in sensor units, that one exact feature has in it.
+    """
+
+    values: NDArray[np.float32]
+    window: Window
+    sigma: float
+
+    @property
+    def dimension(self) -> int:
+        """m, the number of sensor coordinates."""
+        return len(self.window.origin)
+
+    def integral(self) -> float:
+        """Integral of the density over its window."""
+        first = self.values if self.values.ndim == 2 else self.values[..., 0]
+        return float(first.sum(dtype=np.float64) * self.window.step**self.dimension)
+
+    def sample(self, y: Floats) -> NDArray[np.float32]:
+        """Look the channels up, bilinearly.
+
+        Parameters
+        ----------
+        y : (..., m) float64
+            Sensor coordinates.
+
+        Returns
+        -------
+        (..., C) or (...,) float32
+            The channels at y, `FLOOR` outside; without the last axis for a single channel.
+        """
+        index = (y.reshape(-1, self.dimension) - self.window.origin) / self.window.step
+        np.nan_to_num(index, copy=False, nan=FAR)
+        np.clip(index, FAR, -FAR, out=index)
+        map_u = index[:, 0].astype(np.float32)
+        map_v = index[:, 1].astype(np.float32) if self.dimension == 2 else np.zeros_like(map_u)
+        looked_up = remap(self.values, map_u, map_v)
+        return looked_up.reshape(*y.shape[:-1], *self.values.shape[2:])
+
+
+def remap(
+    values: NDArray[np.float32], map_u: NDArray[np.float32], map_v: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Sample an array bilinearly at n indices: (n, C) or (n,); `FLOOR` outside."""
+    count = len(map_u)
+    channels = values.shape[2:]
+    if count == 0:
+        return np.zeros((0, *channels), dtype=np.float32)
+    rows = -(-count // _ROW)
+    width = count if rows == 1 else _ROW
+    if rows > 1:
+        padding = rows * width - count
+        map_u, map_v = np.pad(map_u, (0, padding)), np.pad(map_v, (0, padding))
+    looked_up = cv2.remap(
+        values,
+        map_u.reshape(rows, width),
+        map_v.reshape(rows, width),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=(FLOOR, FLOOR, FLOOR, FLOOR),
+    )
+    return np.asarray(looked_up, dtype=np.float32).reshape(rows * width, *channels)[:count]

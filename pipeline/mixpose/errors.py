@@ -1,0 +1,25 @@
+"""Errors that a user can mend: one base class, one line each.
+
+A message says what was found, what is allowed and what to do.  The command line prints it
+without a traceback and leaves with `exit_status`.
+"""
+
+from __future__ import annotations
+
+
+class MixposeError(Exception):
+    """Base of every error that mixpose raises on purpose."""
+
+    exit_status = 2
+
+
+class SessionError(MixposeError):
+    """The session file, an option or an argument is wrong."""
+
+    exit_status = 2
+
+
+class RecordingError(MixposeError):
+    """A recording (images, video, table, poses file) cannot be read."""
+
+    exit_status = 3

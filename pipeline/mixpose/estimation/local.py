@@ -1,0 +1,85 @@
+"""A pose near a start: annealed ascent of an objective."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import STEPS_PER_SIGMA
+from mixpose.estimation.annealing import ladder
+from mixpose.estimation.options import EstimatorOptions
+from mixpose.objective import View, build_objective
+from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.rigid import TWIST_NAMES, perturb
+
+Floats: TypeAlias = NDArray[np.float64]
+
+# bilinear values at four grid points per σ err by up to (1/4)²/8
+_VALUE_ERROR = 1.0 / (8 * STEPS_PER_SIGMA**2)
+COARSE = NewtonOptions(iterations=10, tolerance=1e-5, value_error=_VALUE_ERROR)
+FINE = NewtonOptions(iterations=40, tolerance=1e-11, value_error=_VALUE_ERROR)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a descent through the blurs ended.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    value : float
+        Of the objective at the finest blur.
+    converged : bool
+    sigmas : tuple of float
+        The finest blur per view.
+    """
+
+    T_world_object: Floats
+    value: float
+    converged: bool
+    sigmas: tuple[float, ...]
+
+
+def fit_near(
+    views: Sequence[View],
+    body: Body,
+    T_start: Floats,
+    uncertainty: Floats,
+    options: EstimatorOptions,
+    samples: Floats,
+) -> Fit:
+    """Descend from coarse blurs to σ_ε and climb the objective at each.
+
+    Parameters
+    ----------
+    views : sequence of View
+        At least one, none with an empty observation.
+    body : Body
+    T_start : (4, 4) array
+    uncertainty : (6,) array
+        Standard deviations of the start, lengths and radians.
+    options : EstimatorOptions
+    samples : (N, R, 3) array
+        Samples of the body, for the objectives that integrate by sampling.
+    """
+    free = free_mask(options)
+    levels = ladder(views, body, T_start, np.where(free, uncertainty, 0.0))
+    ascent = Ascent(T_start, 0.0, False, 0)
+    for k, sigmas in enumerate(levels):
+        last = k == len(levels) - 1
+        newton = FINE if last else COARSE
+        objective = build_objective(
+            options.objective, views, body, samples, sigmas, ascent.state, fine=last
+        )
+        ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
+    return Fit(ascent.state, ascent.value, ascent.converged, tuple(levels[-1]))
+
+
+def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:
+    """Which of the six directions are estimated."""
+    return np.array([name in options.free for name in TWIST_NAMES])

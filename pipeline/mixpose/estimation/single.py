@@ -1,0 +1,55 @@
+"""The pose of one frame, from densities."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.errors import SessionError
+from mixpose.estimation.options import EstimatorOptions
+from mixpose.estimation.tracker import Tracker
+from mixpose.objective import View
+from mixpose.records import Estimate
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def estimate_pose(
+    views: Sequence[View],
+    model: Body,
+    start: Floats | None = None,
+    options: EstimatorOptions | None = None,
+) -> Estimate:
+    """Estimate one pose.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Sensors with what they observed.
+    model : Body
+    start : (4, 4) array or None
+        T_world_object near the pose.
+    options : EstimatorOptions or None
+
+    Returns
+    -------
+    Estimate
+        Of frame 0.
+
+    Raises
+    ------
+    SessionError
+        If no start is given.
+    """
+    if start is None:
+        raise SessionError("estimate_pose: start: found none, a pose near the true one is needed")
+    tracker = Tracker.create(model, options or EstimatorOptions())
+    began = time.perf_counter()
+    _, estimate = tracker.advance(tracker.begin(start), 0, None, views)
+    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))

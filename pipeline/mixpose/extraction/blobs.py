@@ -1,0 +1,185 @@
+"""Bright or dark spots and disks: one point per blob, to parts of a pixel.
+
+Small blobs are located by the centroid of their grey values (`spots`), large ones by an ellipse
+through their rim (`ellipse`), even if it is broken or partly hidden, and compact things of
+another shape by their outline.  A blob that the border of the window cuts is left out, unless
+enough of its rim is seen: where its centre is nobody knows, and to the density a wrong point
+does more harm than a missing one.
+
+With the threshold "auto" (or "local") a blob has to stand out.  What is above the detection
+level but has no shape, as a lit floor, is searched again at higher levels, so that blobs are
+found on it too.  With a grey level (or "otsu") all that is above it is a blob.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.extraction.contours import (
+    Contour,
+    cut_out,
+    enclosed,
+    filled_area,
+    neighbours,
+    on_border,
+    outer,
+    outlines,
+)
+from mixpose.extraction.ellipse import Ellipse, distances, find_rim, is_waisted
+from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.spots import LEAST_STEP_SHARE, come_apart, find_spots
+from mixpose.extraction.threshold import Foreground, Window, above, foreground
+from mixpose.records import Image, PointPattern
+
+# Up to this area the centroid of the grey values is the better centre, above it the rim.
+SMALL_AREA_PX = 100.0
+
+# Least share of its convex hull that a blob fills, if it has no elliptical rim.
+LEAST_SOLIDITY = 0.9
+
+# What has no shape is searched again at a level higher by this factor.
+LEVEL_RATIO = 1.4
+
+# Something this much brighter than the rest of a blob may be the feature, the rest what it lights.
+CORE_RATIO = 3.0
+
+
+@dataclass(frozen=True)
+class Blob:
+    """One blob: centre in pixels of the window, area in px, and the rim of a disk."""
+
+    u: float
+    v: float
+    area: float
+    rim: Ellipse | None = None
+
+
+def extract_blobs(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
+    """Centres of the blobs in a window.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, uint16 or float32
+    options : ExtractOptions
+    window : (u0, v0, u1, v1)
+        Non-empty box inside the image, u1 and v1 exclusive.
+
+    Returns
+    -------
+    PointPattern
+        Points in pixels of the whole image, each of weight 1; none where nothing is found.
+    """
+    blobs = find_blobs(foreground(image, options, window), options)
+    points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
+    return PointPattern(points + window[:2], np.ones(len(points)))
+
+
+def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
+    """The blobs of a foreground.
+
+    Parameters
+    ----------
+    scene : Foreground
+    options : ExtractOptions
+        `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
+    """
+    contours = outlines(scene.grey, scene.zero + scene.level)
+    blobs = _search(scene, contours, scene.level, options.min_area)
+    largest = math.inf if options.max_area is None else options.max_area
+    return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
+
+
+def _search(
+    scene: Foreground, contours: Sequence[Contour], level: float, min_area: float
+) -> list[Blob]:
+    """Blobs among the outer contours of what is above a level."""
+    blobs: list[Blob] = []
+    shapeless: list[Contour] = []
+    for contour in contours:
+        # A contour of n pixels encloses less than n² of them: noise is soon done with.
+        if len(contour) ** 2 < min_area or (area := filled_area(contour)) < min_area:
+            continue
+        if area <= SMALL_AREA_PX:
+            spots = find_spots(scene, contour, level)
+            blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
+        elif (disk := _disk(scene, contour, level)) is not None:
+            blobs.append(disk)
+        else:
+            shapeless.append(contour)
+    for group in neighbours(shapeless):
+        whole = _disk(scene, np.concatenate(group), level) if len(group) > 1 else None
+        if whole is not None:
+            blobs.append(whole)
+            continue
+        for contour in group:
+            blobs += _other(scene, contour, level, min_area)
+    return blobs
+
+
+def _disk(scene: Foreground, contour: Contour, level: float) -> Blob | None:
+    """A blob whose rim is an ellipse, even if part of it is hidden or out of the window."""
+    rim = find_rim(scene.grey, contour, level)
+    if rim is None or not rim.good or is_waisted(scene.grey, rim.ellipse):
+        return None
+    if scene.judged:
+        patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
+        if rim.contrast < LEAST_STEP_SHARE * _brightness(scene, patch, inside)[0]:
+            return None
+    return Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
+
+
+def _other(scene: Foreground, contour: Contour, level: float, min_area: float) -> list[Blob]:
+    """A large blob without an elliptical rim if it is compact, or else the blobs inside of it."""
+    hull = cv2.convexHull(contour)
+    box = cv2.boundingRect(contour)
+    compact = cv2.contourArea(contour) >= LEAST_SOLIDITY * cv2.contourArea(hull)
+    whole = []
+    if not on_border(scene, box):
+        # The hull makes up for holes that broke through the outline.
+        moments = cv2.moments(hull)
+        centre = (moments["m10"] / moments["m00"], moments["m01"] / moments["m00"])
+        whole = [Blob(*centre, filled_area(contour))]
+    patch, inside, corner = cut_out(scene, contour, box, 0)
+    islands = enclosed(patch, inside, corner, level)
+    found = _search(scene, islands, level, min_area)
+    if not scene.judged:
+        return whole + found
+    typical, peak = _brightness(scene, patch, inside)
+    stands_out = compact and typical >= scene.least_peak
+    # What is on islands is found already.
+    cv2.drawContours(inside, islands, -1, 0, cv2.FILLED, offset=(-corner[0], -corner[1]))
+    inner: list[Blob] = []
+    for part, higher in come_apart(scene, contour, patch, inside, level):
+        inner += _search(scene, outer(part, corner), higher, min_area)
+    higher = LEVEL_RATIO * level
+    clear = stands_out and peak < CORE_RATIO * typical
+    if not inner and not clear and higher < peak:
+        inner = _search(scene, outer(above(patch, higher) & inside, corner), higher, min_area)
+    return found + (inner or (whole if stands_out else []))
+
+
+def _brightness(
+    scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]
+) -> tuple[float, float]:
+    """Median and maximum of what is above the detection level within a contour."""
+    values = patch[(inside > 0) & (patch > scene.level)]
+    if values.size == 0:
+        return 0.0, 0.0
+    return float(np.median(values)), float(values.max())
+
+
+def _outside_disks(blobs: list[Blob]) -> list[Blob]:
+    """Blobs without those inside of a larger disk: scraps of its own broken rim."""
+    centres = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
+    areas = np.array([blob.area for blob in blobs])
+    scrap = np.zeros(len(blobs), dtype=np.bool_)
+    for blob in blobs:
+        if blob.rim is not None:
+            scrap |= (distances(blob.rim, centres) < 0) & (areas < blob.area)
+    return [blob for blob, inner in zip(blobs, scrap, strict=True) if not inner]

@@ -1,0 +1,149 @@
+"""Outlines of what is above a level, and what they enclose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.extraction.background import Grey
+from mixpose.extraction.threshold import Foreground, above
+
+# (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
+Contour: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
+
+# Upright box about a contour: first column, first row, width, height.
+Box: TypeAlias = Sequence[int]
+
+STRIP_ROWS = 128
+
+# Parts of a broken rim are apart by at most this share of their length, and 2 px.
+GAP_SHARE = 0.1
+GAP_PX = 2
+CONTOUR_SAMPLES = 64
+
+
+def outlines(grey: Grey, level: float) -> list[Contour]:
+    """Outer contours of what is above a level in an image (H, W).
+
+    The mask is made strip by strip, and contours are followed where nothing crosses from one
+    strip to the next: on a frame with few features no second frame is ever written.
+    """
+    contours: list[Contour] = []
+    strips: list[NDArray[np.uint8]] = []
+    top = 0
+    for row in range(0, len(grey), STRIP_ROWS):
+        strip = above(grey[row : row + STRIP_ROWS], level)
+        if strips and not (strips[-1][-1].any() and strip[0].any()):
+            contours += _follow(strips, top)
+            strips = []
+        if not strips:
+            top = row
+        strips.append(strip)
+    contours += _follow(strips, top)
+    return contours
+
+
+def _follow(strips: list[NDArray[np.uint8]], top: int) -> Sequence[Contour]:
+    if not any(strip.any() for strip in strips):
+        return []
+    return outer(np.vstack(strips) if len(strips) > 1 else strips[0], (0, top))
+
+
+def outer(mask: NDArray[np.uint8], corner: tuple[int, int]) -> Sequence[Contour]:
+    """Outer contours of a mask whose first pixel is at `corner`."""
+    return cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)[0]
+
+
+def enclosed(
+    patch: NDArray[np.float32], inside: NDArray[np.uint8], corner: tuple[int, int], level: float
+) -> list[Contour]:
+    """Outer contours of the islands above a level in the holes of what a contour encloses.
+
+    Parameters are the patch, the mask and the corner that `cut_out` returns without a margin.
+    """
+    contours, family = cv2.findContours(
+        above(patch, level) & inside, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=corner
+    )
+    # The last entry of a contour's family is its parent, which only holes have.
+    pieces = [c for c, relatives in zip(contours, family[0], strict=True) if relatives[3] < 0]
+    # The piece as large as the patch is the one that encloses the others.
+    size = (*corner, *patch.shape[::-1])
+    return [piece for piece in pieces if tuple(cv2.boundingRect(piece)) != size]
+
+
+def filled_area(contour: Contour) -> float:
+    """Number of pixels that a contour encloses, its own and those of holes included."""
+    # Pick's theorem: the contour runs through the centres of the outermost pixels.
+    if len(contour) == 1:
+        return 1.0
+    return float(cv2.contourArea(contour)) + len(contour) / 2 + 1
+
+
+def cut_out(
+    scene: Foreground, contour: Contour, box: Box, margin: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[int, int]]:
+    """What is about a contour.
+
+    Parameters
+    ----------
+    scene : Foreground
+    contour : (n, 1, 2) int32
+    box : (u, v, width, height)
+        That of the contour.
+    margin : int
+        By how many px the patch is larger on each side, as far as the window goes.
+
+    Returns
+    -------
+    patch : (h, w) float32
+        Signal in the box and its margin.
+    inside : (h, w) uint8
+        1 where the contour encloses the patch.
+    corner : (u, v)
+        Where the first pixel of the patch is.
+    """
+    u, v, width, height = box
+    u0, v0 = max(u - margin, 0), max(v - margin, 0)
+    grey = scene.grey[v0 : v + height + margin, u0 : u + width + margin]
+    patch = grey.astype(np.float32) - np.float32(scene.zero)
+    inside = np.zeros(patch.shape, np.uint8)
+    cv2.drawContours(inside, [contour], 0, 1, cv2.FILLED, offset=(-u0, -v0))
+    return patch, inside, (u0, v0)
+
+
+def on_border(scene: Foreground, box: Box) -> bool:
+    """Whether the box of a contour reaches the border of the window, which may have cut it."""
+    u, v, width, height = box
+    rows, columns = scene.grey.shape
+    return bool(u == 0 or v == 0 or u + width == columns or v + height == rows)
+
+
+def neighbours(contours: Sequence[Contour]) -> list[list[Contour]]:
+    """Groups of contours that nearly touch: perhaps the parts of one broken rim."""
+    groups: list[list[Contour]] = []
+    for contour in contours:
+        apart, together = [], [contour]
+        for group in groups:
+            if any(_near(contour, other) for other in group):
+                together += group
+            else:
+                apart.append(group)
+        groups = [*apart, together]
+    return groups
+
+
+def _near(a: Contour, b: Contour) -> bool:
+    """Whether the gap between two contours is small beside them."""
+    ua, va, wa, ha = cv2.boundingRect(a)
+    ub, vb, wb, hb = cv2.boundingRect(b)
+    gap = GAP_SHARE * min(max(wa, ha), max(wb, hb)) + GAP_PX
+    if max(ua - ub - wb, ub - ua - wa, va - vb - hb, vb - va - ha) > gap:
+        return False
+    # Some points of each are enough: between them a contour comes closer by half a step.
+    steps = [max(len(contour) // CONTOUR_SAMPLES, 1) for contour in (a, b)]
+    between = a[:: steps[0]].astype(np.float32) - b[:: steps[1], 0].astype(np.float32)
+    return bool((between**2).sum(axis=-1).min() <= (gap + max(steps) / 2) ** 2)

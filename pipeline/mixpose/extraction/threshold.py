@@ -1,0 +1,196 @@
+"""What is foreground: the image without its background, and the level above which it counts.
+
+Everything here looks for bright features; dark ones are bright in the turned-over image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.extraction.background import Grey, background_tiles, noise_of, spread_out
+from mixpose.extraction.options import ExtractOptions
+from mixpose.records import Image
+
+Window: TypeAlias = tuple[int, int, int, int]
+
+RULES = ("auto", "otsu", "local")
+# How much is looked at around a window to know its background.
+LEAST_MARGIN_PX = 64
+
+# Rows that are worked on at once, where a second whole frame would only cost memory.
+STRIP_ROWS = 64
+
+# Detection level of "auto" and "local": above the noise, and above what is faint beside the
+# brightest thing in view (reflections, lens flare, dimly lit surroundings).
+NOISE_FACTOR = 5.0
+FAINT_SHARE = 0.08
+
+# What the peak of a small blob must exceed, as nothing else is known of it.
+PEAK_NOISE_FACTOR = 8.0
+PEAK_SHARE = 0.2
+
+# "local" compares with the mean of a box of this share of the shorter side of the window.
+LOCAL_BOX_SHARE = 1 / 8
+
+
+@dataclass(frozen=True)
+class Foreground:
+    """A window of an image, made ready to look for bright features.
+
+    The signal is what is brighter than the background: ``grey - zero``.
+
+    Attributes
+    ----------
+    grey : (H, W) uint8, uint16 or float32
+        Grey values, features bright.
+    zero : float
+        Grey value of the background; 0 where it is taken out of `grey` already, or where the
+        user gave the level.
+    level : float
+        A pixel whose signal is above this level belongs to a feature.
+    noise : float
+        Standard deviation of a background pixel.
+    least_peak : float
+        Signal that a small feature must reach to count.
+    judged : bool
+        Whether features must stand out to count.  False where the level is the user's (or
+        Otsu's): then all that is above it counts.
+    """
+
+    grey: Grey
+    zero: float
+    level: float
+    noise: float
+    least_peak: float
+    judged: bool
+
+
+def above(signal: Grey, level: float) -> NDArray[np.uint8]:
+    """Pixels of a signal that are above a level: (H, W) uint8 of zeros and ones."""
+    if signal.dtype == np.float32:
+        return np.asarray(signal > np.float32(level)).view(np.uint8)
+    # An integer is above a level when it is above the whole number below that level; NumPy
+    # does not compare unsigned integers with numbers out of their range.
+    whole = math.floor(level)
+    if whole < 0:
+        return np.ones(signal.shape, np.uint8)
+    return np.asarray(signal > min(whole, _highest(signal))).view(np.uint8)
+
+
+def foreground(image: Image, options: ExtractOptions, window: Window) -> Foreground:
+    """Take the background out of a window and choose the level for its features.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, uint16 or float32
+    options : ExtractOptions
+        `polarity` and `threshold` matter here.
+    window : (u0, v0, u1, v1)
+        Non-empty box inside the image, u1 and v1 exclusive.
+    """
+    bright, inner, threshold = _bright(image, options, window)
+    noise = noise_of(bright)
+    if threshold in ("auto", "local"):
+        grey, zero = _without_background(bright, noise, local=threshold == "local")
+        grey = grey[inner]
+        peak = _peak(grey) - zero
+        level = max(NOISE_FACTOR * noise, FAINT_SHARE * peak)
+        least_peak = max(PEAK_NOISE_FACTOR * noise, PEAK_SHARE * peak)
+        return Foreground(grey, zero, level, noise, least_peak, judged=True)
+    level = _otsu(bright[inner]) if isinstance(threshold, str) else threshold
+    return Foreground(bright[inner], 0.0, level, noise, 0.0, judged=False)
+
+
+def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDArray[np.float32]:
+    """Grey values of the features in a window without the background; zero elsewhere.
+
+    Parameters are those of `foreground`.
+
+    Returns
+    -------
+    (v1 - v0, u1 - u0) float32
+    """
+    found = foreground(image, options, window)
+    grey, zero = found.grey, found.zero
+    if not found.judged:
+        bright, inner, _ = _bright(image, options, window)
+        grey, zero = _without_background(bright, found.noise, local=False)
+        grey = grey[inner]
+    values = np.zeros(grey.shape, np.float32)
+    # Strips without features are left alone: most of a frame has none.
+    for rows in (slice(row, row + STRIP_ROWS) for row in range(0, len(grey), STRIP_ROWS)):
+        mask = above(found.grey[rows], found.zero + found.level)
+        if mask.any():
+            signal = grey[rows].astype(np.float32) - np.float32(zero)
+            values[rows] = np.maximum(signal, 0) * mask
+    return values
+
+
+def _bright(
+    image: Image, options: ExtractOptions, window: Window
+) -> tuple[Grey, tuple[slice, slice], str | float]:
+    """Surroundings of a window with features bright, the window in them, and the threshold.
+
+    Features may fill a window that is drawn tightly about them, so the background is looked
+    for in its surroundings too.
+    """
+    u0, v0, u1, v1 = window
+    height, width = image.shape
+    u_margin, v_margin = (max(side // 2, LEAST_MARGIN_PX) for side in (u1 - u0, v1 - v0))
+    left, top = max(u0 - u_margin, 0), max(v0 - v_margin, 0)
+    near = image[top : min(v1 + v_margin, height), left : min(u1 + u_margin, width)]
+    inner = np.s_[v0 - top : v1 - top, u0 - left : u1 - left]
+    if options.polarity == "bright":
+        return near, inner, options.threshold
+    # Turned over within the range of the type, so that unsigned integers stay what they are.
+    highest = _highest(near)
+    threshold = options.threshold
+    if not isinstance(threshold, str):
+        # "Below t" is "above highest - t"; a whole level itself belongs to neither.
+        threshold = highest - threshold
+    return near.dtype.type(highest) - near, inner, threshold
+
+
+def _highest(grey: Grey) -> int | float:
+    """Upper end of the range of an integer type; the highest value of a float image."""
+    if grey.dtype == np.float32:
+        return float(grey.max())
+    return 255 if grey.dtype == np.uint8 else 65535
+
+
+def _without_background(bright: Grey, noise: float, *, local: bool) -> tuple[Grey, float]:
+    """Grey values with an even background, and the grey value of that."""
+    if local:
+        side = max(round(min(bright.shape) * LOCAL_BOX_SHARE), 3) // 2 * 2 + 1
+        return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side))), 0.0
+    tiles = background_tiles(bright)
+    if float(tiles.max()) - float(tiles.min()) <= 2 * noise:
+        # Even already, the common case of dark frames: work on the whole frame is spared.
+        return bright, float(np.median(tiles))
+    background = spread_out(tiles, bright)
+    return cv2.subtract(bright, background, dst=background), 0.0
+
+
+def _peak(grey: Grey) -> float:
+    """Highest grey value that a pixel shares with its neighbour: a hot pixel is no peak."""
+    if grey.shape[1] < 2:
+        return float(grey.max())
+    strips = (grey[row : row + STRIP_ROWS] for row in range(0, len(grey), STRIP_ROWS))
+    return max(float(cv2.min(strip[:, :-1], strip[:, 1:]).max()) for strip in strips)
+
+
+def _otsu(bright: Grey) -> float:
+    if bright.dtype != np.float32:
+        return float(cv2.threshold(bright, 0, 1, cv2.THRESH_OTSU)[0])
+    # OpenCV has Otsu's rule for integers: 65536 steps are as good as floats.
+    low, high = float(bright.min()), float(bright.max())
+    if low == high:
+        return high
+    step = (high - low) / 65535
+    return low + step * _otsu(((bright - np.float32(low)) / np.float32(step)).astype(np.uint16))

@@ -1,0 +1,12 @@
+"""Frames: raw recordings as streams, joined by frame number.
+
+`open_source` finds and opens what a session names; `pair` joins the sources of all sensors.
+"""
+
+from mixpose.frames.images import read_image
+from mixpose.frames.opening import open_source
+from mixpose.frames.pairing import pair
+from mixpose.frames.prefetch import prefetch
+from mixpose.frames.source import Source, SourceSpec
+
+__all__ = ["Source", "SourceSpec", "open_source", "pair", "prefetch", "read_image"]

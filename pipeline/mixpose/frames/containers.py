@@ -1,0 +1,114 @@
+"""Whether a video file is whole, told from its outermost structure.
+
+A decoder reads a truncated file as far as it goes and reports its end like any other.  How many
+frames a container promises does not tell either: some only estimate it, and a trimmed MP4 still
+counts the frames that its edit list hides.  But AVI, MP4 and Matroska files state the sizes of
+their outermost parts, and these must fit into the file.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import BinaryIO, Literal, TypeAlias
+
+Container: TypeAlias = Literal["avi", "mp4", "matroska"]
+
+_MP4_BOXES = frozenset(
+    b"ftyp moov mdat free skip wide moof mfra sidx styp uuid meta udta pnot prft emsg PICT".split()
+)
+_EBML_HEADER = b"\x1a\x45\xdf\xa3"
+# Writers pad and count differently; frames are never this small.
+_SLACK_BYTES = 8
+
+
+def container_of(path: Path) -> Container | None:
+    """Kind of container by content; None for any other.  OSError if it cannot be read."""
+    with path.open("rb") as file:
+        head = file.read(12)
+    if head[:4] == b"RIFF" and head[8:] == b"AVI ":
+        return "avi"
+    if head[4:8] in _MP4_BOXES:
+        return "mp4"
+    if head[:4] == _EBML_HEADER:
+        return "matroska"
+    return None
+
+
+def missing_bytes(path: Path) -> int:
+    """How many bytes a video file lacks of those that its outermost parts promise.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    int
+        0 for a whole file, and for one whose structure does not say.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    """
+    container = container_of(path)
+    with path.open("rb") as file:
+        size = file.seek(0, os.SEEK_END)
+        if container == "avi":
+            end = _riff_end(file, size)
+        elif container == "mp4":
+            end = _mp4_end(file, size)
+        elif container == "matroska":
+            end = _matroska_end(file)
+        else:
+            return 0
+    missing = end - size
+    return missing if missing > _SLACK_BYTES else 0
+
+
+def _riff_end(file: BinaryIO, size: int) -> int:
+    """End of the last RIFF part; long AVI files have several (OpenDML)."""
+    at = 0
+    while at + 8 <= size:
+        file.seek(at)
+        head = file.read(8)
+        length = int.from_bytes(head[4:], "little")
+        # Recorders that were cut off leave a size of 0, streams one of all ones.
+        if head[:4] != b"RIFF" or length in (0, 2**32 - 1):
+            break
+        at += 8 + length + length % 2
+    return at
+
+
+def _mp4_end(file: BinaryIO, size: int) -> int:
+    """End of the last box (ISO/IEC 14496-12, section 4.2); what is no box counts as padding."""
+    at = 0
+    while at + 8 <= size:
+        file.seek(at)
+        head = file.read(16)
+        length = int.from_bytes(head[:4])
+        if length == 1:
+            length = int.from_bytes(head[8:])
+        if head[4:8] not in _MP4_BOXES or length < 8:  # 0 means up to the end of the file
+            break
+        at += length
+    return at
+
+
+def _matroska_end(file: BinaryIO) -> int:
+    """End of the segment that follows the EBML header (RFC 8794); 0 where its size is unknown."""
+    at = 0
+    for _ in ("header", "segment"):
+        file.seek(at)
+        head = file.read(12)
+        if len(head) < 5 or head[4] == 0:
+            return 0
+        width = 9 - head[4].bit_length()
+        mask = (1 << 7 * width) - 1
+        length = int.from_bytes(head[4 : 4 + width]) & mask
+        if length == mask:
+            return 0
+        at += 4 + width + length
+    return at

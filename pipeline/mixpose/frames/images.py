@@ -1,0 +1,218 @@
+"""Image files as a source: their order, their numbers, and reading them whole or not at all."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, cast
+
+import cv2
+import numpy as np
+
+from mixpose.errors import RecordingError
+from mixpose.frames.quiet import quieten_opencv
+from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.times import Clock
+from mixpose.records import Image, RawFrame
+
+_RASTERS = {".bmp", ".dib", ".pbm", ".pfm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
+_PICTURES = {".avif", ".exr", ".hdr", ".jp2", ".jpe", ".jpeg", ".jpg", ".webp"}
+IMAGE_SUFFIXES = frozenset(_RASTERS | _PICTURES)
+
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+_JPEG_START = b"\xff\xd8\xff"
+_START_OF_SCAN = 0xDA
+_END_OF_IMAGE = b"\xff\xd9"
+
+
+@dataclass(frozen=True)
+class ImageSequence:
+    """Images of one camera, by ascending frame number.
+
+    Attributes
+    ----------
+    paths, numbers : tuple of Path, tuple of int
+        The files and their frame numbers, ascending; at least one.
+    resolution : (width, height) or None
+        Size of every image in px; None means that of the first one read.
+    clock : callable or None
+        Gives the time of a frame number.
+    """
+
+    kind: ClassVar[SourceKind] = "images"
+    ahead: ClassVar[int] = 3
+
+    paths: tuple[Path, ...]
+    numbers: tuple[int, ...]
+    resolution: tuple[int, int] | None
+    clock: Clock | None
+
+    @property
+    def length(self) -> int:
+        """Number of images."""
+        return len(self.paths)
+
+    @property
+    def first(self) -> int:
+        """Number of the first image."""
+        return self.numbers[0]
+
+    def describe(self) -> str:
+        """One line for people; reads the first image."""
+        image = read_image(self.paths[0])
+        depth = "" if image.dtype == np.uint8 else f" {image.dtype}"
+        plural = "" if self.length == 1 else "s"
+        numbers = numbers_text(self.first, self.numbers[-1], self.length)
+        return f"{self.length} image{plural} {_size_text(_size(image))}{depth}, {numbers}"
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Decode the images whose numbers lie in the range; the others are not even opened."""
+        wanted = selection(start, stop, step, self.first)
+        size, like = self.resolution, "the sensor's resolution"
+        for number, path in zip(self.numbers, self.paths, strict=True):
+            if number not in wanted:
+                continue
+            image = read_image(path)
+            if size is None:
+                size, like = _size(image), path.name
+            if _size(image) != size:
+                raise RecordingError(
+                    f"{path}: found {_size_text(_size(image))} pixels, allowed is "
+                    f"{_size_text(size)} like {like}"
+                )
+            yield RawFrame(number, self.clock(number) if self.clock else None, image)
+
+
+def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) -> ImageSequence:
+    """Images in the given order as a source; they are numbered by `frame_numbers`."""
+    numbers = frame_numbers(paths)
+    order = sorted(range(len(paths)), key=numbers.__getitem__)
+    return ImageSequence(
+        tuple(paths[i] for i in order), tuple(numbers[i] for i in order), spec.resolution, clock
+    )
+
+
+def frame_numbers(paths: Sequence[Path]) -> list[int]:
+    """Frame numbers of images.
+
+    The number that a name without its extension ends in, where every name ends in one and no two
+    are alike; else the place in `paths`, from 0.
+    """
+    endings = [re.search(r"[0-9]+$", path.stem) for path in paths]
+    numbers = [int(ending.group()) for ending in endings if ending]
+    if len(numbers) == len(set(numbers)) == len(paths):
+        return numbers
+    return list(range(len(paths)))
+
+
+def natural_order(paths: Sequence[Path]) -> list[Path]:
+    """Sort paths as people do: numbers inside names by value, so that img9 precedes img10."""
+
+    def key(path: Path) -> tuple[list[str | int], str]:
+        pieces = re.split(r"([0-9]+)", str(path.with_suffix("")))
+        return [int(p) if i % 2 else p for i, p in enumerate(pieces)], str(path)
+
+    return sorted(paths, key=key)
+
+
+def read_image(path: Path) -> Image:
+    """Read one image file as grey values.
+
+    Returns
+    -------
+    (H, W) uint8, uint16 or float32 array
+        Grey values as deep as the file has them.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read, is cut short, damaged or no image, or holds NaN.
+    """
+    quieten_opencv()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    fault = _fault_of(data)
+    if fault is not None:
+        raise RecordingError(f"{path}: {fault}; record or copy it again, or leave it out")
+    try:
+        image = cv2.imdecode(
+            np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        )
+    except cv2.error as error:
+        raise RecordingError(f"{path}: cannot be decoded: {error.err}") from error
+    if image is None:
+        raise RecordingError(
+            f"{path}: no image, damaged or cut short; allowed is what OpenCV reads"
+        )
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        raise RecordingError(
+            f"{path}: found pixels of type {image.dtype}, allowed are uint8, uint16 and float32"
+        )
+    if image.dtype == np.float32 and not np.isfinite(image).all():
+        raise RecordingError(f"{path}: found pixels that are not finite, allowed are numbers")
+    return cast(Image, image)
+
+
+def _fault_of(data: bytes) -> str | None:
+    """What is wrong with the bytes of an image that a decoder may pass over or print about."""
+    if not data:
+        return "the file is empty"
+    if data.startswith(_PNG_START):
+        return _png_fault(data)
+    if data.startswith(_JPEG_START) and not _jpeg_is_whole(data):
+        return "cut short: the JPEG data have no end"
+    return None
+
+
+def _png_fault(data: bytes) -> str | None:
+    """Walk the chunks (PNG specification, section 5) up to IEND; what follows it is harmless."""
+    view = memoryview(data)
+    at = len(_PNG_START)
+    while at + 12 <= len(data):
+        kind_at, content_at = at + 4, at + 8
+        check_at = content_at + int.from_bytes(view[at:kind_at])
+        at = check_at + 4
+        if at > len(data):
+            break
+        kind = data[kind_at:content_at]
+        critical = not kind[0] & 0x20
+        if critical and zlib.crc32(view[kind_at:check_at]) != int.from_bytes(view[check_at:at]):
+            return f"damaged: the checksum of PNG chunk {kind!r} at byte {kind_at - 4} is wrong"
+        if kind == b"IEND":
+            return None
+    return "cut short: the PNG data have no end"
+
+
+def _jpeg_is_whole(data: bytes) -> bool:
+    """Tell whether the end marker follows the first scan.
+
+    The segments before it are stepped over (ITU T.81, annex B), as a preview image inside them
+    has an end marker of its own.
+    """
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == _START_OF_SCAN:
+            return data.rfind(_END_OF_IMAGE, at) >= 0
+        if marker == 0xFF:  # padding
+            at += 1
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4])
+    return False
+
+
+def _size(image: Image) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+def _size_text(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

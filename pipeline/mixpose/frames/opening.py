@@ -1,0 +1,157 @@
+"""From what the session says to the source that reads it.
+
+A new kind of source is one file with its class, one line in `_OPENERS` and one rule in
+`_recognise`.  A camera by its index would be recognised there, beside the streams.
+"""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mixpose.errors import RecordingError, SessionError
+from mixpose.frames.csv_rows import csv_rows
+from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
+from mixpose.frames.profiles import open_profiles
+from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
+from mixpose.frames.tables import open_table
+from mixpose.frames.times import Clock, clock_of
+from mixpose.frames.video import open_video
+
+# A scheme has two letters or more; one letter is a drive.
+_STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
+
+_OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
+    "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
+    "video": lambda spec, places, clock: open_video(spec, places[0], clock),
+    "detections": lambda spec, places, clock: open_table(spec, Path(places[0]), clock),
+    "profiles": lambda spec, places, clock: open_profiles(spec, Path(places[0]), clock),
+}
+
+_FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
+    "camera": (
+        {"images", "video", "detections"},
+        "images, a video or a .csv table of detections with columns u,v",
+    ),
+    "lateration": (
+        {"detections", "profiles"},
+        "a .csv table of detections with a column range, or range profiles (.npy or .csv)",
+    ),
+}
+
+
+def open_source(spec: SourceSpec) -> Source:
+    """Find the recording of a sensor and open it, without reading more than its beginning.
+
+    Raises
+    ------
+    SessionError
+        If the options of the source contradict each other, or do not fit the recording.
+    RecordingError
+        If there is no such recording or its beginning cannot be read.
+    """
+    clock = clock_of(spec)
+    source = spec.source
+    if not isinstance(source, str) and len(source) == 1:
+        source = source[0]
+    try:
+        kind, places = _recognise(spec, source)
+    except OSError as error:
+        raise RecordingError(
+            f"{error.filename}: cannot be read: {error.strerror}; source of {spec.sensor!r}"
+        ) from error
+    kinds, text = _FIT_FOR[spec.kind]
+    if kind not in kinds:
+        raise SessionError(
+            f"sensor {spec.sensor!r}: source: found {kind} ({places[0]}), a {spec.kind} sensor "
+            f"reads {text}"
+        )
+    return _OPENERS[kind](spec, places, clock)
+
+
+def _recognise(spec: SourceSpec, source: str | tuple[str, ...]) -> tuple[SourceKind, list[str]]:
+    """Kind of a source, and the files or the address it is read from."""
+    if isinstance(source, str) and _STREAM.match(source):
+        return "video", [source]
+    kind, paths = _recognise_files(spec, source)
+    return kind, [str(path) for path in paths]
+
+
+def _recognise_files(
+    spec: SourceSpec, source: str | tuple[str, ...]
+) -> tuple[SourceKind, list[Path]]:
+    if not isinstance(source, str):
+        return "images", _listed(spec, source)
+    path = spec.base / source
+    if source and path.is_dir():
+        return "images", _images_in(path)
+    if path.is_file():
+        return _kind_of_file(spec, path), [path]
+    return _matches(spec, source)
+
+
+def _listed(spec: SourceSpec, source: Sequence[str]) -> list[Path]:
+    """Files of a list, in its own order."""
+    if not source:
+        raise SessionError(f"sensor {spec.sensor!r}: source: found an empty list of images")
+    paths = [spec.base / name for name in source]
+    for path in paths:
+        if not path.is_file():
+            raise RecordingError(f"{path}: no such file, named in the source of {spec.sensor!r}")
+    return paths
+
+
+def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
+    """Files that a glob matches: the images among them, else a single other file."""
+    path = spec.base / pattern
+    # Unlike Path.glob, this one takes absolute patterns.
+    matches = glob.glob(pattern, root_dir=spec.base, recursive=True)  # noqa: PTH207
+    found = [spec.base / match for match in matches]
+    files = [match for match in found if match.is_file()]
+    images = [file for file in files if _is_image(file)]
+    if images:
+        return "images", natural_order(images)
+    if len(files) == 1:
+        return _kind_of_file(spec, files[0]), files
+    if files:
+        raise RecordingError(
+            f"{path}: matches {len(files)} files and none is an image (the first is "
+            f"{min(files).name}); allowed are images or one other file"
+        )
+    raise RecordingError(f"{path}: no such file, and nothing matches; source of {spec.sensor!r}")
+
+
+def _images_in(folder: Path) -> list[Path]:
+    images = [path for path in folder.iterdir() if _is_image(path) and path.is_file()]
+    if not images:
+        raise RecordingError(f"{folder}: no images in this folder")
+    return natural_order(images)
+
+
+def _is_image(path: Path) -> bool:
+    # Copies by macOS leave ._name.png beside name.png, which are no images.
+    return path.suffix.casefold() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def _kind_of_file(spec: SourceSpec, path: Path) -> SourceKind:
+    suffix = path.suffix.casefold()
+    if suffix in IMAGE_SUFFIXES:
+        return "images"
+    if suffix == ".npy":
+        return "profiles"
+    if suffix != ".csv":
+        return "video"
+    if spec.kind == "lateration" and _all_numbers(path):
+        return "profiles"
+    return "detections"
+
+
+def _all_numbers(path: Path) -> bool:
+    """Tell whether the first row is a profile rather than a header."""
+    _, cells = next(csv_rows(path), (0, []))
+    try:
+        return bool([float(cell) for cell in cells])
+    except ValueError:
+        return False

@@ -1,0 +1,73 @@
+"""Frames of several sensors, joined by their numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack
+
+from mixpose.frames.prefetch import prefetch
+from mixpose.frames.source import Source, selection
+from mixpose.records import FrameSet, RawFrame
+
+
+def pair(
+    sources: Mapping[str, Source],
+    start: int | None = None,
+    stop: int | None = None,
+    step: int = 1,
+) -> Generator[FrameSet, None, None]:
+    """Join the frames of all sources by number, ascending.
+
+    A number that some sources lack yields a set without them.  Of each source only a few frames
+    are in memory, decoded ahead in a thread of its own where that pays; the threads end with
+    this generator.
+
+    Parameters
+    ----------
+    sources : mapping of str to Source
+        Sources by sensor name; the order counts, see Returns.
+    start, stop, step : int
+        Numbers to read, like those of `range`.  Without `start` the first number there is.
+
+    Returns
+    -------
+    generator of FrameSet
+        The time of a set is that of the first sensor, in the order of `sources`, that has one.
+
+    Raises
+    ------
+    SessionError
+        At once, if `step` is less than 1.
+    RecordingError
+        In place of the first set that a source cannot be read for.
+    """
+    firsts = [source.first for source in sources.values()]
+    first = min((number for number in firsts if number is not None), default=0)
+    return _join(sources, selection(start, stop, step, first))
+
+
+def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, None, None]:
+    with ExitStack() as stack:
+        streams = {sensor: _stream(source, wanted) for sensor, source in sources.items()}
+        for stream in streams.values():
+            stack.callback(stream.close)
+        heads = {sensor: next(stream, None) for sensor, stream in streams.items()}
+        while waiting := [head.number for head in heads.values() if head is not None]:
+            number = min(waiting)
+            frames = {
+                sensor: head
+                for sensor, head in heads.items()
+                if head is not None and head.number == number
+            }
+            yield FrameSet(number, _time(frames), frames)
+            for sensor in frames:
+                heads[sensor] = next(streams[sensor], None)
+
+
+def _stream(source: Source, wanted: range) -> Generator[RawFrame, None, None]:
+    frames = source.frames(wanted.start, wanted.stop, wanted.step)
+    return prefetch(frames, source.ahead) if source.ahead else frames
+
+
+def _time(frames: Mapping[str, RawFrame]) -> float | None:
+    return next((frame.time_s for frame in frames.values() if frame.time_s is not None), None)

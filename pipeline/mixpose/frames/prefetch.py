@@ -1,0 +1,76 @@
+"""Read ahead: an iterator that works in a thread while its consumer works on the last item."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Item(Generic[T]):
+    value: T
+
+
+@dataclass(frozen=True)
+class _End:
+    error: BaseException | None
+
+
+def prefetch(items: Iterator[T], depth: int = 3) -> Generator[T, None, None]:
+    """Yield `items` in order while a worker thread fetches the next ones.
+
+    Pays where fetching releases the interpreter lock, as decoding images does.  The thread starts
+    with the first ``next`` and has ended when this generator is exhausted, closed or collected;
+    `items` is advanced, and closed if it can be, in that thread only.
+
+    Parameters
+    ----------
+    items : iterator
+        What to read; an exception it raises comes out in its place, after the items before it.
+    depth : int
+        Most items that wait; one more may be on its way.
+    """
+    waiting: queue.Queue[_Item[T] | _End] = queue.Queue(maxsize=max(depth, 1))
+    stop = threading.Event()
+    worker = threading.Thread(
+        target=_fetch, args=(items, waiting, stop), name="mixpose-prefetch", daemon=True
+    )
+    worker.start()
+    try:
+        while isinstance(entry := waiting.get(), _Item):
+            yield entry.value
+        if entry.error is not None:
+            raise entry.error
+    finally:
+        stop.set()
+        # A worker that waits to put its item gets room here; it puts no more after that one.
+        with contextlib.suppress(queue.Empty):
+            while True:
+                waiting.get_nowait()
+        # The garbage collector may close this generator in the worker's own thread.
+        if worker is not threading.current_thread():
+            worker.join()
+
+
+def _fetch(
+    items: Iterator[T], waiting: queue.Queue[_Item[T] | _End], stop: threading.Event
+) -> None:
+    """Move items to the queue until they end, fail or `stop` is set."""
+    error: BaseException | None = None
+    try:
+        with contextlib.ExitStack() as closing:
+            closing.callback(getattr(items, "close", lambda: None))
+            for item in items:
+                waiting.put(_Item(item))
+                if stop.is_set():
+                    break
+    except BaseException as caught:  # whatever it is, it belongs to the consumer
+        error = caught
+    if not stop.is_set():
+        waiting.put(_End(error))

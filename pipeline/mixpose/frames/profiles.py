@@ -1,0 +1,181 @@
+"""Range profiles as a source: a signal over range, a row per frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.errors import RecordingError, SessionError
+from mixpose.frames.csv_rows import csv_rows, finite
+from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.times import Clock
+from mixpose.records import GridPattern, RawFrame
+
+
+@dataclass(frozen=True)
+class RangeProfiles:
+    """Range profiles of one sensor, numbered from 0.
+
+    Attributes
+    ----------
+    path : Path
+        ``.npy`` (frames x bins), of which only the rows in use are in memory; or ``.csv`` without
+        a header, a row per frame.
+    range_min, bin_size : float
+        Range of the first bin and distance from bin to bin, in length units.
+    clock : callable or None
+        Gives the time of a frame number.
+    bins : int
+        Number of bins in each profile.
+    """
+
+    kind: ClassVar[SourceKind] = "profiles"
+    ahead: ClassVar[int] = 0
+
+    path: Path
+    range_min: float
+    bin_size: float
+    clock: Clock | None
+    bins: int
+
+    @cached_property
+    def length(self) -> int:
+        """Number of profiles, also of those that a file cut short lacks."""
+        if _is_npy(self.path):
+            return _map_npy(self.path)[1]
+        with self.path.open("rb") as file:
+            return sum(1 for line in file if not line.isspace())
+
+    @property
+    def first(self) -> int | None:
+        """Number of the first profile; None if there is none."""
+        return 0 if self.bins else None
+
+    def describe(self) -> str:
+        """One line for people."""
+        if not self.bins:
+            return "0 range profiles"
+        reach = self.range_min + (self.bins - 1) * self.bin_size
+        plural = "" if self.length == 1 else "s"
+        return (
+            f"{self.length} range profile{plural} of {self.bins} bins from {self.range_min:g} to "
+            f"{reach:g}, {numbers_text(0, self.length - 1, self.length)}"
+        )
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Read the profiles in the range; the others are not converted."""
+        wanted = selection(start, stop, step, self.first)
+        rows = _npy_rows if _is_npy(self.path) else _csv_rows
+        for number, values in rows(self.path, wanted):
+            time_s = None if self.clock is None else self.clock(number)
+            pattern = GridPattern(values[None], np.array([self.range_min]), self.bin_size)
+            yield RawFrame(number, time_s, pattern)
+
+
+def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangeProfiles:
+    """Open a file of range profiles and learn its shape.
+
+    Raises
+    ------
+    SessionError
+        If `range_min` or `bin_size` is not given or makes no grid.
+    RecordingError
+        If the file is no array of frames x bins.
+    """
+    range_min = _option(spec, "range_min", spec.range_min)
+    bin_size = _option(spec, "bin_size", spec.bin_size)
+    if bin_size <= 0:
+        raise SessionError(
+            f"sensor {spec.sensor!r}: bin_size: found {bin_size:g}, allowed is above 0"
+        )
+    if _is_npy(path):
+        bins = _map_npy(path)[2]
+    else:
+        bins = len(next(csv_rows(path), (0, []))[1])
+    return RangeProfiles(path, range_min, bin_size, clock, bins)
+
+
+def _option(spec: SourceSpec, key: str, value: float | None) -> float:
+    if value is None:
+        raise SessionError(f"sensor {spec.sensor!r}: {key} is missing; range profiles need it")
+    if not math.isfinite(value):
+        raise SessionError(
+            f"sensor {spec.sensor!r}: {key}: found {value}, allowed is a finite number"
+        )
+    return float(value)
+
+
+def _is_npy(path: Path) -> bool:
+    return path.suffix.casefold() == ".npy"
+
+
+def _map_npy(path: Path) -> tuple[NDArray[Any], int, int]:
+    """Map the rows that the file holds; how many it promises; and its bins."""
+    try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, by_columns, dtype = read_header(file)
+            offset = file.tell()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError) as error:
+        raise RecordingError(f"{path}: not a .npy file or cut short") from error
+    if len(shape) != 2 or by_columns or dtype.kind not in "fiu" or 0 in shape:
+        order = " by columns" if by_columns else ""
+        raise RecordingError(
+            f"{path}: found {dtype} of shape {shape}{order}, allowed are numbers in the shape "
+            f"(frames, bins), row by row"
+        )
+    promised, bins = shape
+    held = (path.stat().st_size - offset) // (bins * dtype.itemsize)
+    if held == 0:
+        raise RecordingError(f"{path}: cut short: profile 0 is not whole")
+    rows = np.memmap(path, dtype=dtype, mode="r", offset=offset, shape=(min(held, promised), bins))
+    return rows, promised, bins
+
+
+def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    rows, promised, _ = _map_npy(path)
+    for number in wanted:
+        if number >= promised:
+            return
+        if number < 0:
+            continue
+        if number >= len(rows):
+            raise RecordingError(
+                f"{path}: cut short: {len(rows)} of the {promised} profiles that it promises are "
+                f"whole, from 0"
+            )
+        with np.errstate(over="ignore"):
+            values = rows[number].astype(np.float32)
+        if not np.isfinite(values).all():
+            at = int(np.argmin(np.isfinite(values)))
+            raise RecordingError(
+                f"{path}: frame {number}, bin {at}: found {rows[number, at]}, allowed are finite "
+                f"numbers"
+            )
+        yield number, values
+
+
+def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    for number, (line, cells) in enumerate(csv_rows(path)):
+        if line != number + 1:
+            raise RecordingError(f"{path}, line {number + 1}: blank; there must be a row per frame")
+        if number >= wanted.stop:
+            return
+        if number in wanted:
+            values = [finite(cell, path, line, f"bin {at}") for at, cell in enumerate(cells)]
+            yield number, np.array(values, dtype=np.float32)

@@ -1,0 +1,118 @@
+"""What a source of raw frames is: the user's words for it and what it can do."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, TypeAlias
+
+from mixpose.errors import SessionError
+from mixpose.records import RawFrame
+
+SensorKind: TypeAlias = Literal["camera", "lateration"]
+SourceKind: TypeAlias = Literal["images", "video", "detections", "profiles"]
+
+# Frame numbers come from file names, which hold at most 255 digits.
+_BEYOND_ALL_NUMBERS = 10**256
+
+
+@dataclass(frozen=True)
+class SourceSpec:
+    """What the session says about the recording of one sensor.
+
+    Attributes
+    ----------
+    sensor : str
+        Name of the sensor; only for messages.
+    source : str or tuple of str
+        A glob, a folder, a file or a stream's address (with ``://``); or a list of images.
+    base : Path
+        Folder that relative paths start from.
+    kind : {"camera", "lateration"}
+        What the sensor measures.
+    resolution : (width, height) or None
+        Size of every image in px; None means like the first one.
+    times : Path or None
+        Table ``frame,time_s`` that gives frames their times.
+    fps : float or None
+        Frames per second: the time of frame n is n / fps.
+    range_min, bin_size : float or None
+        Range of the first bin of a profile and distance from bin to bin, in length units.
+    """
+
+    sensor: str
+    source: str | tuple[str, ...]
+    base: Path
+    kind: SensorKind
+    resolution: tuple[int, int] | None = None
+    times: Path | None = None
+    fps: float | None = None
+    range_min: float | None = None
+    bin_size: float | None = None
+
+
+class Source(Protocol):
+    """A recording of one sensor, read as a stream; `frames` may be called any number of times."""
+
+    @property
+    def kind(self) -> SourceKind:
+        """What the recording consists of."""
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames; None where only reading to the end would tell."""
+
+    @property
+    def first(self) -> int | None:
+        """Number of the first frame; None if there is none."""
+
+    @property
+    def ahead(self) -> int:
+        """How many frames are worth decoding ahead in a thread; 0 where reading is cheap."""
+
+    def describe(self) -> str:
+        """One line for people: what, how many, which numbers."""
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Frames by ascending number, those of ``range(start, stop, step)`` only.
+
+        Skipped frames are not decoded.  Without `start` the range begins at the first frame.
+
+        Raises
+        ------
+        RecordingError
+            In place of the first frame that cannot be read.
+        """
+
+
+def selection(start: int | None, stop: int | None, step: int, first: int | None) -> range:
+    """Frame numbers to read, as a range.
+
+    Parameters
+    ----------
+    start, stop, step : int
+        Like those of `range`; without `start` it begins at `first`, without `stop` it is open.
+    first : int or None
+        Number of the first frame there is.
+
+    Raises
+    ------
+    SessionError
+        If `step` is less than 1.
+    """
+    if step < 1:
+        raise SessionError(f"step: found {step}, allowed is a whole number from 1")
+    if start is None:
+        start = 0 if first is None else first
+    return range(start, _BEYOND_ALL_NUMBERS if stop is None else stop, step)
+
+
+def numbers_text(first: int, last: int, count: int) -> str:
+    """Frame numbers for people: ``frames 1-12``, ``frames 0-5 with gaps``."""
+    if count == 1:
+        return f"frame {first}"
+    gaps = "" if last - first + 1 == count else " with gaps"
+    return f"frames {first}-{last}{gaps}"

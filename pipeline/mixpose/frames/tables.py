@@ -1,0 +1,218 @@
+"""Tables of detections as a source: points without labels, several to a frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import ClassVar, NoReturn, TypeAlias
+
+import numpy as np
+
+from mixpose.errors import RecordingError
+from mixpose.frames.csv_rows import csv_rows, finite, header, whole
+from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.times import Clock
+from mixpose.records import Floats, PointPattern, RawFrame
+
+_COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
+
+# Frame number or time, line in the file, cells.
+_Row: TypeAlias = tuple[float, int, list[str]]
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What one look through a table tells."""
+
+    in_order: bool
+    rows: int
+    frames: int
+    first: int | None
+    last: int | None
+
+
+@dataclass(frozen=True)
+class DetectionTable:
+    """Detections of one sensor, a row each.
+
+    A table whose frames ascend is streamed, whatever its length.  One with its rows in another
+    order is read whole and sorted.
+
+    Attributes
+    ----------
+    path : Path
+        The CSV file.
+    columns : tuple of str
+        Its header: ``frame`` or ``time_s`` or both, the coordinates, perhaps ``weight``.
+    coordinates : tuple of str
+        Names of the columns that make up a point, in order.
+    clock : callable or None
+        Gives the time of a frame number; None means the times in the table.
+    """
+
+    kind: ClassVar[SourceKind] = "detections"
+    ahead: ClassVar[int] = 0
+
+    path: Path
+    columns: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    clock: Clock | None
+
+    @property
+    def length(self) -> int:
+        """Number of frames with a row."""
+        return self._contents.frames
+
+    @property
+    def first(self) -> int | None:
+        """Number of the first frame; None for a table without rows."""
+        return self._contents.first
+
+    @property
+    def _is_numbered(self) -> bool:
+        return "frame" in self.columns
+
+    def describe(self) -> str:
+        """One line for people."""
+        contents = self._contents
+        if contents.first is None or contents.last is None:
+            return "0 detections"
+        numbers = numbers_text(contents.first, contents.last, contents.frames)
+        return f"{contents.rows} detections, {numbers}"
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Group the rows to frames; skipped frames are not converted.
+
+        The time of a frame is that of its earliest detection.  A row of weight 0 says no more
+        than that its frame exists.
+        """
+        wanted = selection(start, stop, step, self.first)
+        rows: Iterator[_Row] = self._rows()
+        if not self._contents.in_order:
+            rows = iter(sorted(rows, key=itemgetter(0)))
+        for place, (key, group) in enumerate(groupby(rows, key=itemgetter(0))):
+            number = int(key) if self._is_numbered else place
+            if number >= wanted.stop:
+                return
+            if number in wanted:
+                yield self._frame(number, group)
+
+    def _frame(self, number: int, rows: Iterator[_Row]) -> RawFrame:
+        """Convert the rows of one frame."""
+        group = list(rows)
+        try:
+            values = np.array([[float(cell) for cell in cells] for _, _, cells in group])
+        except ValueError:
+            self._complain(group)
+        if not np.isfinite(values).all():
+            self._complain(group)
+        points = values[:, [self.columns.index(name) for name in self.coordinates]]
+        weights = self._column("weight", values)
+        if weights is None:
+            pattern = PointPattern(points, np.ones(len(points)))
+        elif (weights < 0).any():
+            self._complain(group)
+        else:
+            pattern = PointPattern(points[weights > 0], weights[weights > 0])
+        times = self._column("time_s", values)
+        time_s = None if times is None else float(times.min())
+        if self.clock is not None:
+            time_s = self.clock(number)
+        return RawFrame(number, time_s, pattern)
+
+    def _column(self, name: str, values: Floats) -> Floats | None:
+        return values[:, self.columns.index(name)] if name in self.columns else None
+
+    def _complain(self, rows: list[_Row]) -> NoReturn:
+        """Find the cell among the rows of a frame that is not as it should be."""
+        for _, line, cells in rows:
+            for name, cell in zip(self.columns, cells, strict=True):
+                value = finite(cell, self.path, line, name)
+                if name == "weight" and value < 0:
+                    raise RecordingError(
+                        f"{self.path}, line {line}: weight: found {value:g}, allowed is 0 or more"
+                    )
+        raise AssertionError("complained about rows that are as they should be")
+
+    def _rows(self) -> Iterator[_Row]:
+        """Rows of the file with what their frame goes by: its number, else its time."""
+        rows = csv_rows(self.path)
+        next(rows, None)
+        at = self.columns.index("frame" if self._is_numbered else "time_s")
+        if self._is_numbered:
+            for line, cells in rows:
+                yield whole(cells[at], self.path, line, "frame"), line, cells
+        else:
+            for line, cells in rows:
+                yield finite(cells[at], self.path, line, "time_s"), line, cells
+
+    @cached_property
+    def _contents(self) -> _Contents:
+        """Look through the table once, up to the first row that cannot be read."""
+        rows = frames = 0
+        first = last = None
+        in_order = True
+        with suppress(RecordingError):  # `frames` comes to it too, after the frames before it
+            for key, _, _ in self._rows():
+                in_order = last is None or key >= last
+                if not in_order:
+                    break
+                if key != last:
+                    frames += 1
+                first = key if first is None else first
+                last = key
+                rows += 1
+        if not in_order:
+            by_key = Counter(key for key, _, _ in self._rows())
+            rows, frames, first, last = by_key.total(), len(by_key), min(by_key), max(by_key)
+        if first is None or last is None:
+            return _Contents(in_order, 0, 0, None, None)
+        if not self._is_numbered:
+            first, last = 0, frames - 1
+        return _Contents(in_order, rows, frames, int(first), int(last))
+
+
+def open_table(spec: SourceSpec, path: Path, clock: Clock | None) -> DetectionTable:
+    """Read the header of a table of detections.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be read or its header names other columns than it may.
+    """
+    coordinates = _COORDINATES[spec.kind]
+    _, cells = next(csv_rows(path), (0, []))
+    columns = header(cells)
+    fault = _header_fault(columns, coordinates)
+    if fault is not None:
+        raise RecordingError(
+            f"{path}, line 1: {fault}; the header of a {spec.kind} table is frame or time_s or "
+            f"both, then {','.join(coordinates)}, optionally weight"
+        )
+    return DetectionTable(path, columns, coordinates, clock)
+
+
+def _header_fault(columns: Sequence[str], coordinates: Sequence[str]) -> str | None:
+    """What is wrong with a header."""
+    if not columns:
+        return "the file is empty"
+    allowed = {"frame", "time_s", *coordinates, "weight"}
+    unknown = [column for column in columns if column not in allowed]
+    missing = [column for column in coordinates if column not in columns]
+    if unknown:
+        return f"found column {unknown[0]!r}"
+    if missing:
+        return f"column {missing[0]!r} is missing"
+    if len(set(columns)) != len(columns):
+        return "a column comes twice"
+    if "frame" not in columns and "time_s" not in columns:
+        return "found neither frame nor time_s"
+    return None

@@ -1,0 +1,229 @@
+"""Video files and streams as a source."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, cast
+
+import cv2
+import numpy as np
+
+from mixpose.errors import RecordingError
+from mixpose.frames.containers import container_of, missing_bytes
+from mixpose.frames.quiet import quieten_opencv
+from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
+from mixpose.frames.times import Clock
+from mixpose.records import Image, RawFrame
+
+# Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
+_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video, numbered from 0.
+
+    Attributes
+    ----------
+    address : str
+        Path of the file, or address of a stream (with ``://``).
+    resolution : (width, height) or None
+        Size that every frame must have, in px.
+    clock : callable or None
+        Gives the time of a frame number; None means the times that the video holds.
+    size : (width, height) or None
+        Size that the container states; None for a stream, which is not opened in advance.
+    promised : int or None
+        Number of frames that the container states or lets expect.
+    missing : int
+        Bytes that the file lacks; see `missing_bytes`.
+    """
+
+    kind: ClassVar[SourceKind] = "video"
+    ahead: ClassVar[int] = 3
+    first: ClassVar[int] = 0
+
+    address: str
+    resolution: tuple[int, int] | None
+    clock: Clock | None
+    size: tuple[int, int] | None
+    promised: int | None
+    missing: int
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames that the container promises."""
+        return self.promised
+
+    def describe(self) -> str:
+        """One line for people."""
+        if self.size is None:
+            return f"video stream {self.address}"
+        size = f"video {self.size[0]}x{self.size[1]}"
+        if self.promised is None:
+            return f"{size}, frames from 0"
+        return f"{size}, {numbers_text(0, self.promised - 1, self.promised)}"
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Decode the frames in the range; those between are passed over, not converted.
+
+        Raises
+        ------
+        RecordingError
+            After the frames that can be read: if the file is cut short or frames are lost.
+            The last frame of a file that is cut short may be half a frame and is left out.
+        """
+        wanted = selection(start, stop, step, self.first)
+        with _opened(self.address) as capture:
+            number = 0
+            time_s = None
+            held: RawFrame | None = None
+            while number < wanted.stop or held is not None:
+                if not capture.grab():
+                    self._check_end(capture, number, time_s)
+                    return
+                if held is not None:
+                    yield held
+                    held = None
+                time_s = _time(capture, number, time_s)
+                if number in wanted:
+                    frame = self._frame(capture, number, time_s)
+                    if self.missing:
+                        held = frame
+                    else:
+                        yield frame
+                number += 1
+
+    def _frame(self, capture: cv2.VideoCapture, number: int, time_s: float | None) -> RawFrame:
+        """Convert the grabbed frame."""
+        found, image = capture.retrieve()
+        if not found or image is None:
+            raise RecordingError(f"{self.address}: frame {number} cannot be decoded")
+        if image.ndim == 3:
+            code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+            image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image, code)
+        expected = self.resolution or self.size
+        height, width = image.shape
+        if expected is not None and (width, height) != expected:
+            raise RecordingError(
+                f"{self.address}: frame {number} has {width}x{height} pixels, "
+                f"allowed is {expected[0]}x{expected[1]}"
+            )
+        if self.clock is not None:
+            time_s = self.clock(number)
+        return RawFrame(number, time_s, cast(Image, image))
+
+    def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
+        """Complain where the video ends after `count` frames but should not."""
+        if self.missing:
+            raise RecordingError(
+                f"{self.address}: cut short, {self.missing} bytes are missing; "
+                f"{self._reached(count - 1)}"
+            )
+        lost = self.size is not None and count == 0
+        if lost or self._ends_early(capture, count, last_time_s):
+            raise RecordingError(f"{self.address}: damaged or cut short; {self._reached(count)}")
+
+    def _reached(self, count: int) -> str:
+        """How far reading got."""
+        promised = f" of the {self.promised} that it promises" if self.promised else ""
+        which = f"only {numbers_text(0, count - 1, count)}" if count > 0 else "no frame"
+        return f"{which}{promised} could be read"
+
+    def _ends_early(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> bool:
+        """Tell a lost end from a promise that was only an estimate.
+
+        Whole MP4 and Matroska files may hold fewer frames than FFmpeg counts (edit lists, varying
+        rates).  In other containers the *time* of the last frame tells: it is kept by a varying
+        rate, but not where frames are lost.
+        """
+        fps = capture.get(cv2.CAP_PROP_FPS)
+        promised = self.promised or 0
+        if count >= promised or last_time_s is None or not _positive(fps):
+            return False
+        container = container_of(Path(self.address))
+        if container in ("mp4", "matroska"):
+            return False
+        duration = promised / fps
+        slack = 0.5 / fps if container == "avi" else max(0.5, 0.02 * duration)
+        return last_time_s + 1 / fps < duration - slack
+
+
+def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
+    """Open a video to learn its size and length; an address with ``://`` is left for later.
+
+    Raises
+    ------
+    RecordingError
+        If it does not open.
+    """
+    if "://" in address:
+        return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)
+    with _opened(address) as capture:
+        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    if spec.resolution is not None and spec.resolution != (width, height):
+        raise RecordingError(
+            f"{address}: found {width}x{height} pixels, allowed is "
+            f"{spec.resolution[0]}x{spec.resolution[1]} like the sensor's resolution"
+        )
+    promised = int(count) if math.isfinite(count) and count >= 1 else None
+    try:
+        missing = missing_bytes(Path(address))
+    except OSError as error:
+        raise RecordingError(f"{address}: cannot be read: {error.strerror}") from error
+    return Video(address, spec.resolution, clock, (width, height), promised, missing)
+
+
+@contextmanager
+def _opened(address: str) -> Iterator[cv2.VideoCapture]:
+    """A capture that is released at the end; grey videos keep their depth."""
+    quieten_opencv()
+    capture = cv2.VideoCapture(address)
+    try:
+        if not capture.isOpened():
+            raise RecordingError(_unopened(address))
+        tag = np.int32(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).tobytes()
+        if tag in _GREY_FORMATS:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        yield capture
+    finally:
+        capture.release()
+
+
+def _unopened(address: str) -> str:
+    """Why a video does not open, as far as that can be told."""
+    if "://" in address:
+        return f"{address}: the stream does not open"
+    try:
+        container, cut = container_of(Path(address)), missing_bytes(Path(address))
+    except OSError as error:
+        return f"{address}: cannot be read: {error.strerror}"
+    if cut:
+        return f"{address}: cut short, {cut} bytes are missing: frame 0 cannot be read"
+    if container:
+        return f"{address}: damaged or cut short: frame 0 cannot be read"
+    return (
+        f"{address}: opens neither as an image nor as a video; allowed are images, videos, "
+        f".csv tables and .npy profiles"
+    )
+
+
+def _time(capture: cv2.VideoCapture, number: int, before: float | None) -> float | None:
+    """Time of the grabbed frame in s: its own, or by the rate where it has none that grows."""
+    own = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+    if math.isfinite(own) and (number == 0 or before is None or own > before):
+        return own
+    fps = capture.get(cv2.CAP_PROP_FPS)
+    return number / fps if _positive(fps) else None
+
+
+def _positive(value: float) -> bool:
+    return math.isfinite(value) and value > 0

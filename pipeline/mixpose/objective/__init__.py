@@ -1,0 +1,23 @@
+"""Objectives of the pose: the matched one, the paper's, and the product of independent ones."""
+
+from __future__ import annotations
+
+from mixpose.objective.base import Objective, Quadratic, View, pose_jacobian
+from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
+from mixpose.objective.matched import MatchedObjective, matched_objective
+from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
+
+__all__ = [
+    "OBJECTIVES",
+    "IndependentObjective",
+    "MatchedObjective",
+    "Objective",
+    "ObjectiveName",
+    "PaperObjective",
+    "Quadratic",
+    "View",
+    "build_objective",
+    "matched_objective",
+    "pose_jacobian",
+    "sampled_terms",
+]

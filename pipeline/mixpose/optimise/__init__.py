@@ -1,0 +1,7 @@
+"""Optimisers: they know a function of a few numbers and never see an image."""
+
+from __future__ import annotations
+
+from mixpose.optimise.newton import Ascent, NewtonOptions, ascend
+
+__all__ = ["Ascent", "NewtonOptions", "ascend"]

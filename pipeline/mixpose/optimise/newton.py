@@ -1,0 +1,133 @@
+"""Damped Newton ascent on a function of a few numbers.
+
+Knows neither images nor poses: the caller gives a second-order model at a state and says how a
+step moves the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+_STUCK = 1e9  # damping at which steps no longer move anything
+State = TypeVar("State")
+
+
+class Model(Protocol):
+    """Second-order model: value + gᵀδ − ½ δᵀCδ with C positive semidefinite."""
+
+    @property
+    def value(self) -> float:
+        """Value at the state."""
+        ...
+
+    @property
+    def gradient(self) -> Floats:
+        """Gradient (n,)."""
+        ...
+
+    @property
+    def curvature(self) -> Floats:
+        """C (n, n)."""
+        ...
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """When to stop and how to damp.
+
+    Attributes
+    ----------
+    iterations : int
+        Most evaluations of the model.
+    tolerance : float
+        Stop when a step is expected to gain less than this share of the value.
+    damping : float
+        First Levenberg-Marquardt damping, as a share of the curvature's diagonal.
+    value_error : float
+        Relative error of values, as from interpolation.  Gains below it cannot be seen in the
+        value; there a step is good when less gain is left after it: the zero of the gradient is
+        sought, which interpolation does not move.
+    """
+
+    iterations: int = 30
+    tolerance: float = 1e-12
+    damping: float = 1e-4
+    value_error: float = 0.0
+
+
+@dataclass(frozen=True)
+class Ascent(Generic[State]):
+    """Where an ascent ended."""
+
+    state: State
+    value: float
+    converged: bool
+    iterations: int
+
+
+def ascend(
+    model: Callable[[State], Model],
+    move: Callable[[State, Floats], State],
+    start: State,
+    free: NDArray[np.bool_],
+    options: NewtonOptions = NewtonOptions(),
+) -> Ascent[State]:
+    """Climb to a maximum near the start.
+
+    Parameters
+    ----------
+    model : callable
+        Second-order model at a state.
+    move : callable
+        State reached by a step (n,).
+    start : state
+    free : (n,) bool
+        Directions that may change.
+    options : NewtonOptions
+
+    Returns
+    -------
+    Ascent
+        The best state seen; `converged` is false when the iterations ran out.
+    """
+    state, here, damping = start, model(start), options.damping
+    step, gain = _step(here, free, damping)
+    for iteration in range(1, options.iterations):
+        if gain <= options.tolerance * abs(here.value):
+            return Ascent(state, here.value, True, iteration)
+        candidate = move(state, step)
+        there = model(candidate)
+        next_damping = max(damping / 10, 1e-9)
+        next_step, next_gain = _step(there, free, next_damping)
+        close = gain <= options.value_error * abs(here.value)
+        if there.value > here.value or (close and next_gain < gain):
+            state, here, damping, step, gain = candidate, there, next_damping, next_step, next_gain
+            continue
+        damping *= 10
+        if damping > _STUCK:
+            return Ascent(state, here.value, close, iteration)
+        step, gain = _step(here, free, damping)
+    return Ascent(state, here.value, False, options.iterations)
+
+
+def _step(here: Model, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
+    """Damped Newton step and the gain that the model expects of it."""
+    C = here.curvature[np.ix_(free, free)]
+    g = here.gradient[free]
+    diagonal = np.diag(C).copy()
+    # a direction without curvature must not make the system singular
+    floor = max(float(diagonal.max(initial=0.0)) * 1e-12, np.finfo(np.float64).tiny)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, floor))
+    A = C * scale[:, None] * scale + damping * np.eye(len(g))
+    A += 1e-12 * np.eye(len(g))
+    partial = scale * np.linalg.solve(A, scale * g)
+    step = np.zeros(len(free))
+    step[free] = partial
+    gain = float(g @ partial - 0.5 * partial @ C @ partial)
+    return step, gain

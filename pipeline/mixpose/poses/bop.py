@@ -1,0 +1,66 @@
+"""BOP result tables: ``scene_id,im_id,obj_id,score,R,t,time``; the BOP toolkit opens them.
+
+https://bop.felk.cvut.cz/challenges/bop-challenge-2020/#howtoparticipate
+"""
+
+from __future__ import annotations
+
+from typing import TextIO
+
+from mixpose.poses.header import UNITS_PER_METRE, Header
+from mixpose.poses.plain import plain, pose_of, require_finite
+from mixpose.records import Estimate
+
+COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
+
+
+class BopWriter:
+    """Writes one row per frame that has a pose; lost frames are left out.
+
+    R (row by row) and t (mm) map object to *world* coordinates.  The toolkit takes them for
+    object to camera, so let the camera be the world where its scores are wanted.  `time` is how
+    long the estimate took in seconds, as BOP has it, or -1 where that was not measured.  BOP
+    numbers its objects: the first name that occurs is 1, the next 2.
+
+    Parameters
+    ----------
+    stream : text stream
+        Stays open; it belongs to the caller.
+    header : Header
+    scene_id : int
+        Written into every row.
+    """
+
+    def __init__(self, stream: TextIO, header: Header, *, scene_id: int = 0) -> None:
+        self._stream = stream
+        self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
+        self._scene_id = scene_id
+        self._obj_ids: dict[str, int] = {}
+        self._stream.write(COLUMNS + "\n")
+        self._stream.flush()
+
+    def write(self, estimate: Estimate) -> None:
+        """Write the row of one frame and flush it."""
+        require_finite(estimate)
+        obj_id = self._obj_ids.setdefault(estimate.object, len(self._obj_ids) + 1)
+        T = pose_of(estimate)
+        if T is None:
+            return
+        R = plain(T[:3, :3].ravel())
+        t_mm = plain(T[:3, 3] * self._mm_per_unit)
+        seconds = estimate.latency_ms / 1000.0 if estimate.latency_ms > 0 else -1.0
+        cells = (
+            str(self._scene_id),
+            str(estimate.frame),
+            str(obj_id),
+            repr(plain(estimate.score)),
+            " ".join(map(repr, R)),
+            " ".join(map(repr, t_mm)),
+            repr(plain(seconds)),
+        )
+        self._stream.write(",".join(cells) + "\n")
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Flush; the stream stays open."""
+        self._stream.flush()

@@ -1,0 +1,128 @@
+"""A flat CSV table of poses: one row per frame, for spreadsheets and data frames."""
+
+from __future__ import annotations
+
+import csv
+from typing import Any, TextIO
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose import rigid
+from mixpose.poses.header import Header
+from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
+from mixpose.records import Estimate
+
+_UPPER = np.triu_indices(6)
+
+FRAME_COLUMNS = ("frame", "time_s", "object", "status", "unit")
+POSE_COLUMNS = (
+    *("tx", "ty", "tz", "qx", "qy", "qz", "qw"),
+    *("rotvec_x", "rotvec_y", "rotvec_z"),  # radians
+)
+COVARIANCE_COLUMNS = tuple(
+    f"cov_{rigid.TWIST_NAMES[i]}_{rigid.TWIST_NAMES[j]}" for i, j in zip(*_UPPER)
+)
+SENSOR_COLUMNS = ("used", "explained", "rms")
+
+
+class CsvWriter:
+    """Writes one row per frame; what a frame does not have is an empty cell.
+
+    Columns: frame, time_s, object, status, unit; the pose as position, quaternion and rotation
+    vector; the upper triangle of its covariance, row by row, ``cov_<a>_<b>`` in the axes of
+    `mixpose.rigid`; score; ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each
+    sensor; latency_ms.
+
+    Parameters
+    ----------
+    stream : text stream
+        Stays open; it belongs to the caller.
+    header : Header
+        Its `sensors` give the sensor columns; where there are none, the first frame does.
+    """
+
+    def __init__(self, stream: TextIO, header: Header) -> None:
+        self._stream = stream
+        self._rows = csv.writer(stream, lineterminator="\n")
+        self._unit = header.unit
+        self._sensors: tuple[str, ...] | None = None
+        if header.sensors:
+            self._write_columns(header.sensors)
+
+    def write(self, estimate: Estimate) -> None:
+        """Write the row of one frame and flush it.
+
+        Raises
+        ------
+        ValueError
+            If the frame reports on a sensor that has no columns.
+        """
+        require_finite(estimate)
+        if self._sensors is None:
+            self._write_columns(tuple(estimate.sensors))
+        unknown = set(estimate.sensors) - set(self._sensors or ())
+        if unknown:
+            raise ValueError(f"frame {estimate.frame}: no columns for sensors {sorted(unknown)}")
+        row = [
+            estimate.frame,
+            plain_or_none(estimate.time_s),
+            estimate.object,
+            estimate.status,
+            self._unit,
+            *_pose_cells(estimate),
+            plain(estimate.score),
+            *self._sensor_cells(estimate),
+            plain(estimate.latency_ms),
+        ]
+        self._rows.writerow(row)  # csv writes None as an empty cell and floats by repr
+        self._stream.flush()
+
+    def close(self) -> None:
+        """Write the column names if no row did, and flush; the stream stays open."""
+        if self._sensors is None:
+            self._write_columns(())
+        self._stream.flush()
+
+    def _write_columns(self, sensors: tuple[str, ...]) -> None:
+        self._sensors = sensors
+        of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
+        self._rows.writerow(
+            [
+                *FRAME_COLUMNS,
+                *POSE_COLUMNS,
+                *COVARIANCE_COLUMNS,
+                "score",
+                *of_sensors,
+                "latency_ms",
+            ]
+        )
+        self._stream.flush()
+
+    def _sensor_cells(self, estimate: Estimate) -> list[Any]:
+        cells: list[Any] = []
+        for name in self._sensors or ():
+            report = estimate.sensors.get(name)
+            if report is None:
+                cells += [None] * len(SENSOR_COLUMNS)
+                continue
+            cells += [
+                "true" if report.used else "false",
+                plain_or_none(report.explained),
+                plain_or_none(report.rms),
+            ]
+        return cells
+
+
+def _pose_cells(estimate: Estimate) -> list[Any]:
+    """Cells of the pose and its covariance; empty where there is none."""
+    T = pose_of(estimate)
+    if T is None:
+        return [None] * (len(POSE_COLUMNS) + len(COVARIANCE_COLUMNS))
+    turn = rigid.quaternion_xyzw(T)
+    numbers = np.concatenate([T[:3, 3], turn, Rotation.from_quat(turn).as_rotvec()])
+    cells: list[Any] = plain(numbers)
+    if estimate.covariance is None:
+        return cells + [None] * len(COVARIANCE_COLUMNS)
+    upper: list[Any] = plain(estimate.covariance[_UPPER])
+    return cells + upper

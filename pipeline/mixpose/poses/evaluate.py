@@ -1,0 +1,374 @@
+"""Poses against the truth, modulo the object's symmetries.
+
+Which right answer a pose is held against
+    A frame may have several right answers: several lines in the truth file, and each of them
+    times every symmetry S of the object, ``T_truth @ S``.  The pose is held against the one that
+    is nearest in *rotation*.  Position could not tell: where the symmetry axis passes through the
+    object's origin, all answers share one position; and where it passes beside the origin (a
+    board measured from its corner), the answers' positions differ just because their rotations
+    do, so that a small turn of a long object could tip the balance.  A sum of both would need a
+    length that says how many millimetres a degree is worth.  The rotations of a symmetry group
+    differ by many degrees, so the nearest is never in doubt for a pose that is any good.
+    Answers whose rotations are alike (within `TIE_DEG`: marks in a row, taken for their
+    neighbours) differ in position; the nearest of these counts.
+
+Rotation and position errors of a frame belong to the same right answer.  The error is the twist
+that leads from the right answer to the pose, in the order and axes of `mixpose.rigid`; the
+position error is that of the object's origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy.special import chdtri
+
+from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.header import length_ratio
+from mixpose.poses.jsonl import PoseFile, read_poses
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Floats, Hypothesis, Status
+
+TIE_DEG = 0.5
+CONFIDENCE = 0.95
+
+FrameKey: TypeAlias = tuple[int, str]
+
+
+@dataclass(frozen=True)
+class FrameError:
+    """What one frame's pose is worth.
+
+    Attributes
+    ----------
+    status : {"ok", "ambiguous", "lost", "missing"}
+        "missing" where the poses file has no line for a frame of the truth file.
+    twist : (6,) float64 or None
+        From the right answer to the pose, ``(x, y, z, rx, ry, rz)``, lengths and radians.
+    best_twist : (6,) float64 or None
+        The same for the best of an ambiguous frame's hypotheses; the pose is one of them.
+    nees : float or None
+        Normalised estimation error squared; None without a covariance.
+    dimensions : int
+        Directions in which the covariance lets the pose err; what `nees` is expected to be.
+    """
+
+    frame: int
+    object: str
+    status: Status | Literal["missing"]
+    twist: Floats | None = None
+    best_twist: Floats | None = None
+    nees: float | None = None
+    dimensions: int = 0
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How errors spread over frames; `worst_frame` is the frame of the largest one."""
+
+    rms: float
+    median: float
+    p95: float
+    max: float
+    worst_frame: int
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Whether the covariances tell the truth, over "ok" frames that have one.
+
+    Attributes
+    ----------
+    frames : int
+    nees_per_dimension : float
+        Mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they
+        promise too much.
+    inside_95 : float
+        Share of frames whose truth lies inside the 95 % ellipsoid.
+    """
+
+    frames: int
+    nees_per_dimension: float
+    inside_95: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The outcome of an evaluation.
+
+    Attributes
+    ----------
+    unit : str or None
+        Unit of lengths; None where neither file says it.
+    frames : int
+        Frames of the truth file: the sum of the four counts that follow.
+    ok, ambiguous, lost, missing : int
+        By status; "missing" frames have no line in the poses file.
+    without_truth : int
+        Pose lines that the truth file says nothing about; they count nowhere else.
+    rotation_deg, translation : Spread or None
+        Over frames with a pose, "ambiguous" ones included; None without such a frame.
+    per_axis_rms : mapping or None
+        RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`;
+        lengths and degrees.
+    best_rotation_deg, best_translation : Spread or None
+        Over ambiguous frames: the error of the best hypothesis.
+    nees : Consistency or None
+        None where no "ok" frame has a covariance.
+    """
+
+    unit: str | None
+    frames: int
+    ok: int
+    ambiguous: int
+    lost: int
+    missing: int
+    without_truth: int
+    rotation_deg: Spread | None
+    translation: Spread | None
+    per_axis_rms: Mapping[str, float] | None
+    best_rotation_deg: Spread | None
+    best_translation: Spread | None
+    nees: Consistency | None
+
+
+def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
+    """Compare a poses file with a truth file; see `evaluate`."""
+    return evaluate(read_poses(poses), read_poses(truth))
+
+
+def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
+    """Compare poses with the truth.
+
+    Errors are given in the unit of the poses; a file that states no unit is taken to be in
+    that of the other.
+
+    Raises
+    ------
+    RecordingError
+        If the truth holds no pose, the files have no object in common, or a frame stands twice
+        in the poses.
+    """
+    errors = errors_to_truth(poses, truth)
+    compared = {(error.frame, error.object) for error in errors}
+    with_pose = [error for error in errors if error.twist is not None]
+    twists = [(error.frame, error.twist) for error in with_pose if error.twist is not None]
+    best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
+    counts = {
+        status: sum(error.status == status for error in errors)
+        for status in ("ok", "ambiguous", "lost", "missing")
+    }
+    rotation_deg, translation = _spreads(twists)
+    best_rotation_deg, best_translation = _spreads(best)
+    return Evaluation(
+        unit=poses.unit or truth.unit,
+        frames=len(errors),
+        **counts,
+        without_truth=sum((line.frame, line.object) not in compared for line in poses.poses),
+        rotation_deg=rotation_deg,
+        translation=translation,
+        per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
+        best_rotation_deg=best_rotation_deg,
+        best_translation=best_translation,
+        nees=_consistency([error for error in with_pose if error.status == "ok"]),
+    )
+
+
+def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
+    """Compare poses with the truth frame by frame.
+
+    Truth lines without a pose say nothing and are passed over.  Symmetries of an object are those
+    that the truth's header names; if it names none, those of the poses' header.
+
+    Returns
+    -------
+    tuple of FrameError
+        One per frame and object of the truth, in its order, in the unit of the poses.
+
+    Raises
+    ------
+    RecordingError
+        As `evaluate`.
+    """
+    unit = poses.unit or truth.unit
+    truth = _in_unit(truth, unit)
+    symmetries = {**poses.symmetries, **truth.symmetries}
+    answers: dict[FrameKey, list[Floats]] = {}
+    for line in truth.poses:
+        if line.T_world_object is not None:
+            answers.setdefault((line.frame, line.object), []).append(line.T_world_object)
+    lines = _by_frame(poses)
+    _check_comparable(poses, truth, {name for _, name in answers})
+    return tuple(
+        _frame_error(key, lines.get(key), _right_answers(found, symmetries.get(key[1])))
+        for key, found in answers.items()
+    )
+
+
+def _by_frame(poses: PoseFile) -> dict[FrameKey, PoseLine]:
+    lines: dict[FrameKey, PoseLine] = {}
+    for line in poses.poses:
+        earlier = lines.setdefault((line.frame, line.object), line)
+        if earlier is not line:
+            raise RecordingError(
+                f"{poses.path}:{line.line}: frame {line.frame} of {line.object!r} stands in line "
+                f"{earlier.line} already; poses have one line per frame (only truth has several)"
+            )
+    return lines
+
+
+def _check_comparable(poses: PoseFile, truth: PoseFile, true_objects: set[str]) -> None:
+    if not true_objects:
+        raise RecordingError(f"{truth.path}: holds no pose, so there is nothing to compare with")
+    objects = {line.object for line in poses.poses}
+    if objects and not objects & true_objects:
+        raise RecordingError(
+            f"{poses.path}: holds poses of {_names(objects)}, but {truth.path} of "
+            f"{_names(true_objects)}; the object's name must be the same in both"
+        )
+
+
+def _names(objects: set[str]) -> str:
+    return ", ".join(repr(name) for name in sorted(objects))
+
+
+def _in_unit(file: PoseFile, unit: str | None) -> PoseFile:
+    """The same motions with their lengths in another unit, if the file states its own."""
+    if unit is None or file.unit is None or file.unit == unit:
+        return file
+    ratio = length_ratio(file.unit, unit)
+
+    def scaled(T: Floats) -> Floats:
+        return rigid.from_parts(T[..., :3, :3], T[..., :3, 3] * ratio)
+
+    twist_scale = np.array([ratio] * 3 + [1.0] * 3)
+    lines = tuple(
+        replace(
+            line,
+            T_world_object=None if line.T_world_object is None else scaled(line.T_world_object),
+            covariance=(
+                None
+                if line.covariance is None
+                else line.covariance * twist_scale[:, None] * twist_scale
+            ),
+            hypotheses=tuple(
+                Hypothesis(scaled(rival.T_world_object), rival.weight) for rival in line.hypotheses
+            ),
+        )
+        for line in file.poses
+    )
+    symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}
+    return replace(file, poses=lines, unit=unit, symmetries=symmetries)
+
+
+def _right_answers(truths: Sequence[Floats], symmetries: Floats | None) -> Floats:
+    """Every right answer (n, 4, 4): each truth times each symmetry, the identity included."""
+    motions = np.eye(4)[None]
+    if symmetries is not None:
+        motions = np.concatenate([motions, symmetries])
+    return (np.stack([*truths])[:, None] @ motions).reshape(-1, 4, 4)
+
+
+def _frame_error(key: FrameKey, line: PoseLine | None, answers: Floats) -> FrameError:
+    frame, name = key
+    if line is None:
+        return FrameError(frame, name, "missing")
+    if line.T_world_object is None:
+        return FrameError(frame, name, line.status)
+    twist = _nearest_twist(answers, line.T_world_object[None])
+    best_twist = None
+    if line.status == "ambiguous":
+        rivals = [line.T_world_object, *(rival.T_world_object for rival in line.hypotheses)]
+        best_twist = _nearest_twist(answers, np.stack(rivals))
+    nees, dimensions = None, 0
+    if line.covariance is not None:
+        nees, dimensions = normalised_error_squared(twist, line.covariance)
+    return FrameError(frame, name, line.status, twist, best_twist, nees, dimensions)
+
+
+def _nearest_twist(answers: Floats, poses: Floats) -> Floats:
+    """The smallest error (6,) between answers (n, 4, 4) and poses (k, 4, 4)."""
+    twists = rigid.twist_between(answers[:, None], poses[None]).reshape(-1, 6)
+    angle_deg = np.degrees(np.linalg.norm(twists[:, 3:], axis=1))
+    distance = np.linalg.norm(twists[:, :3], axis=1)
+    tied = np.flatnonzero(angle_deg <= angle_deg.min() + TIE_DEG)
+    nearest: Floats = twists[tied[np.argmin(distance[tied])]]
+    return nearest
+
+
+def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
+    """Mahalanobis distance squared of an error, and its number of dimensions.
+
+    Only directions that the covariance leaves free count: an axis that is held at the start pose
+    has no variance, and its error no measure.
+
+    Parameters
+    ----------
+    twist : (6,) array
+    covariance : (6, 6) array
+
+    Returns
+    -------
+    nees : float or None
+        None if the covariance leaves no direction free.
+    dimensions : int
+        Rank of the covariance.
+    """
+    variance = np.diag(covariance)
+    kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)
+    free = np.flatnonzero(variance > 1e-12 * kind)
+    scale = np.sqrt(variance[free])
+    correlation = covariance[np.ix_(free, free)] / scale[:, None] / scale
+    values, vectors = np.linalg.eigh(correlation)
+    kept = values > 1e-9
+    along = vectors.T @ (twist[free] / scale)
+    dimensions = int(kept.sum())
+    if not dimensions:
+        return None, 0
+    return float(np.sum(along[kept] ** 2 / values[kept])), dimensions
+
+
+def _spreads(twists: Sequence[tuple[int, Floats]]) -> tuple[Spread | None, Spread | None]:
+    """Spread of the angles in degrees and of the distances of errors, by frame number."""
+    if not twists:
+        return None, None
+    frames = [frame for frame, _ in twists]
+    values = np.stack([twist for _, twist in twists])
+    angle_deg = np.degrees(np.linalg.norm(values[:, 3:], axis=1))
+    return _spread(frames, angle_deg), _spread(frames, np.linalg.norm(values[:, :3], axis=1))
+
+
+def _spread(frames: Sequence[int], values: Floats) -> Spread:
+    return Spread(
+        rms=float(np.sqrt(np.mean(values**2))),
+        median=float(np.median(values)),
+        p95=float(np.percentile(values, 95)),
+        max=float(values.max()),
+        worst_frame=frames[int(np.argmax(values))],
+    )
+
+
+def _per_axis_rms(twists: Sequence[Floats]) -> dict[str, float] | None:
+    if not twists:
+        return None
+    rms = np.sqrt(np.mean(np.stack(twists) ** 2, axis=0))
+    rms[3:] = np.degrees(rms[3:])
+    return dict(zip(rigid.TWIST_NAMES, rms.tolist()))
+
+
+def _consistency(errors: Sequence[FrameError]) -> Consistency | None:
+    measured = [(error.nees, error.dimensions) for error in errors if error.nees is not None]
+    if not measured:
+        return None
+    nees, dimensions = np.array(measured, dtype=np.float64).T
+    limits = chdtri(dimensions, 1.0 - CONFIDENCE)
+    return Consistency(
+        frames=len(measured),
+        nees_per_dimension=float(np.mean(nees / dimensions)),
+        inside_95=float(np.mean(nees <= limits)),
+    )

@@ -1,0 +1,51 @@
+"""What a poses file says about itself, and the units it may use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mixpose.records import Floats
+
+FORMAT = "mixpose-poses"
+VERSION = 1
+COVARIANCE = "x y z rx ry rz, world axes, unit^2 and rad^2"
+
+# Whole numbers, so that dividing by them rounds once: 1500 mm are 1.5 m exactly.
+UNITS_PER_METRE: Mapping[str, float] = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "um": 1e6}
+
+
+@dataclass(frozen=True)
+class Header:
+    """The facts that hold for every pose of a run.
+
+    Attributes
+    ----------
+    unit : str
+        "m", "cm", "mm" or "um": the unit of every length in the file.
+    session : str or None
+        Path of the session file; None where there is none.
+    session_sha256 : str or None
+        SHA-256 of the session file, in hexadecimal.
+    mixpose : str
+        Version of mixpose that made the poses.
+    seed : int
+    symmetries : mapping of object name to (n, 4, 4) array
+        Motions T_object_object that map the object's features onto themselves, identity included.
+    sensors : tuple of str
+        Names of all sensors of the session, in its order.  Only the CSV table needs them, for
+        its columns; they are not written into JSON lines.
+    """
+
+    unit: str
+    session: str | None
+    session_sha256: str | None
+    mixpose: str
+    seed: int
+    symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
+    sensors: tuple[str, ...] = ()
+
+
+def length_ratio(from_unit: str, to_unit: str) -> float:
+    """Length of one `from_unit` in `to_unit`; 1000 from "m" to "mm"."""
+    return UNITS_PER_METRE[to_unit] / UNITS_PER_METRE[from_unit]

@@ -1,0 +1,262 @@
+"""Poses as JSON lines: the writer, the reader, and where an interrupted run goes on."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, TextIO
+
+from mixpose import rigid
+from mixpose.errors import RecordingError, SessionError
+from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
+from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
+from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
+from mixpose.records import Estimate, Floats
+
+
+class JsonlWriter:
+    """Writes a header line and a line per frame.
+
+    Lines are ASCII (other characters are escaped), so that the bytes depend on no locale.
+
+    Parameters
+    ----------
+    stream : text stream
+        Stays open; it belongs to the caller.
+    header : Header
+    resume : bool
+        Go on in a file that has its header already.
+    """
+
+    def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
+        self._stream = stream
+        if not resume:
+            self._write_line(_header_line(header))
+
+    def write(self, estimate: Estimate) -> None:
+        """Write the line of one frame and flush it.
+
+        Raises
+        ------
+        ValueError
+            If the estimate holds a value that is not finite.
+        """
+        require_finite(estimate)
+        self._write_line(_pose_line(estimate))
+
+    def close(self) -> None:
+        """Flush; the stream stays open."""
+        self._stream.flush()
+
+    def _write_line(self, line: Mapping[str, Any]) -> None:
+        # One call for the whole line: an interruption rarely leaves half of it.
+        self._stream.write(json.dumps(line, allow_nan=False) + "\n")
+        self._stream.flush()
+
+
+def _header_line(header: Header) -> dict[str, Any]:
+    return {
+        "type": "header",
+        "format": FORMAT,
+        "version": VERSION,
+        "unit": header.unit,
+        "covariance": COVARIANCE,
+        "session": header.session,
+        "session_sha256": header.session_sha256,
+        "mixpose": header.mixpose,
+        "seed": header.seed,
+        "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
+    }
+
+
+def _pose_line(estimate: Estimate) -> dict[str, Any]:
+    T = pose_of(estimate)
+    covariance = estimate.covariance if T is not None else None
+    turn = None if T is None else rigid.quaternion_xyzw(T)
+    return {
+        "type": "pose",
+        "frame": int(estimate.frame),  # NumPy integers are no JSON
+        "time_s": plain_or_none(estimate.time_s),
+        "object": estimate.object,
+        "status": estimate.status,
+        "T_world_object": plain_or_none(T),
+        "quaternion_xyzw": plain_or_none(turn),
+        "covariance": plain_or_none(covariance),
+        "score": plain(estimate.score),
+        "sensors": {
+            name: {
+                "used": bool(report.used),
+                "explained": plain_or_none(report.explained),
+                "rms": plain_or_none(report.rms),
+            }
+            for name, report in estimate.sensors.items()
+        },
+        "hypotheses": [
+            {
+                "T_world_object": plain(rival.T_world_object),
+                "weight": plain(rival.weight),
+            }
+            for rival in estimate.hypotheses
+        ],
+        "latency_ms": plain(estimate.latency_ms),
+    }
+
+
+@dataclass(frozen=True)
+class PoseFile:
+    """A poses or truth file.
+
+    Attributes
+    ----------
+    path : Path
+    header : mapping
+        The header line as it stands; empty where the file has none.
+    poses : tuple of PoseLine
+        In the order of the file.
+    unit : str or None
+        Unit of all lengths; None where no header says it.
+    symmetries : mapping of object name to (n, 4, 4) array
+        In the unit of the file.
+    """
+
+    path: Path
+    header: Mapping[str, Any]
+    poses: tuple[PoseLine, ...]
+    unit: str | None = None
+    symmetries: Mapping[str, Floats] = field(default_factory=dict)
+
+
+def read_poses(path: str | Path) -> PoseFile:
+    """Read a poses or truth file.
+
+    A line needs `frame`, `object` and `T_world_object`; everything else, the header included,
+    may be left out, and unknown keys are passed over.
+
+    Raises
+    ------
+    RecordingError
+        With file and line, if the file or a line of it is not as the format says, a last line
+        cut off by an interruption included.
+    """
+    path = Path(path)
+    return _parse(path, _read_bytes(path))
+
+
+def resume_point(path: str | Path, header: Header) -> int | None:
+    """Find the frame that an interrupted run wrote last, and drop a half-written line after it.
+
+    Parameters
+    ----------
+    path : path
+        What the interrupted run wrote.
+    header : Header
+        Header of the run that is to go on.
+
+    Returns
+    -------
+    int or None
+        Number of the last whole frame; the caller appends with ``JsonlWriter(..., resume=True)``.
+        None where no frame is whole or no file is there: the caller writes the file afresh.
+
+    Raises
+    ------
+    SessionError
+        If the file is of another session, seed, unit or version of mixpose.
+    RecordingError
+        If the file is not a poses file; it is left as it is.
+    """
+    path = Path(path)
+    if not path.exists():
+        return None
+    data = _read_bytes(path)
+    whole = data.rfind(b"\n") + 1
+    beginning = b'{"type": "header"'
+    if not whole and data[: len(beginning)] != beginning[: len(data)]:
+        raise RecordingError(f"{path}: not a poses file, so no run can go on in it")
+    so_far = _parse(path, data[:whole])
+    if so_far.header or so_far.poses:
+        _check_same_run(path, so_far.header, header)
+    if not so_far.poses:
+        return None
+    if whole < len(data):
+        try:
+            with path.open("r+b") as stream:
+                stream.truncate(whole)
+        except OSError as error:
+            raise RecordingError(f"{path}: {error.strerror}, so no run can go on in it") from error
+    return so_far.poses[-1].frame
+
+
+def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:
+    line = _header_line(wanted)
+    for key in ("session_sha256", "unit", "seed", "mixpose"):
+        if found.get(key) != line[key]:
+            raise SessionError(
+                f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
+                f"{line[key]!r}; leave out --resume to start afresh, or name another file with -o"
+            )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+def _parse(path: Path, data: bytes) -> PoseFile:
+    """Parse a file; every error names the line."""
+    header: Mapping[str, Any] = {}
+    unit: str | None = None
+    symmetries: Mapping[str, Floats] = {}
+    poses: list[PoseLine] = []
+    is_first = True
+    for number, values in _lines(path, data):
+        where = f"{path}:{number}"
+        kind = values.get("type", "pose")
+        if kind == "header":
+            if not is_first:
+                raise RecordingError(f"{where}: a header after the first line; one file, one run")
+            header = values
+            unit, symmetries = parse_header(values, where)
+        elif kind == "pose":
+            poses.append(parse_pose(values, where, number))
+        else:
+            raise RecordingError(f"{where}: type is {kind!r}; allowed are 'header' and 'pose'")
+        is_first = False
+    return PoseFile(path, header, tuple(poses), unit, symmetries)
+
+
+def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
+    """The JSON objects of a file with their line numbers, from 1; empty lines are skipped."""
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        number = data.count(b"\n", 0, error.start) + 1
+        raise RecordingError(f"{path}:{number}: not UTF-8 text, so not a poses file") from error
+    lines = text.split("\n")
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            values = json.loads(line, parse_constant=_refuse_constant)
+        except (ValueError, RecursionError) as error:
+            what = "not JSON; a poses file holds one JSON object per line"
+            if isinstance(error, _NotFiniteError):
+                what = str(error)
+            elif number == len(lines):
+                what = "the last line is cut off; finish the run with --resume or delete the line"
+            raise RecordingError(f"{path}:{number}: {what}") from error
+        if not isinstance(values, dict):
+            raise RecordingError(f"{path}:{number}: not a JSON object; a line is {{...}}")
+        yield number, values
+
+
+class _NotFiniteError(ValueError):
+    """A number that JSON does not have."""
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise _NotFiniteError(f"{name} is not allowed; every number must be finite")

@@ -1,0 +1,198 @@
+"""The lines of a poses file, checked on the way in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.header import FORMAT, UNITS_PER_METRE, VERSION
+from mixpose.records import Floats, Hypothesis, SensorReport, Status
+
+# Files by other people round their rotations to a few digits.
+RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class PoseLine:
+    """A pose line as read; the fields are those of `mixpose.records.Estimate`.
+
+    Attributes
+    ----------
+    line : int
+        Where it stands in the file, from 1.
+    score : float or None
+        None where the line has none.
+    """
+
+    line: int
+    frame: int
+    time_s: float | None
+    object: str
+    status: Status
+    T_world_object: Floats | None
+    covariance: Floats | None
+    score: float | None
+    sensors: Mapping[str, SensorReport]
+    hypotheses: tuple[Hypothesis, ...]
+    latency_ms: float | None
+
+
+_Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
+_Matrix4 = Annotated[list[_Row4], Field(min_length=4, max_length=4)]
+_Row6 = Annotated[list[float], Field(min_length=6, max_length=6)]
+_Matrix6 = Annotated[list[_Row6], Field(min_length=6, max_length=6)]
+
+
+class _Line(BaseModel):
+    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
+
+
+class _Hypothesis(_Line):
+    T_world_object: _Matrix4
+    weight: float
+
+
+class _Sensor(_Line):
+    used: bool = True
+    explained: float | None = None
+    rms: float | None = None
+
+
+class _Pose(_Line):
+    frame: int
+    object: str
+    time_s: float | None = None
+    status: Status = "ok"
+    T_world_object: _Matrix4 | None = None
+    covariance: _Matrix6 | None = None
+    score: float | None = None
+    sensors: dict[str, _Sensor] = {}
+    hypotheses: list[_Hypothesis] = []
+    latency_ms: float | None = None
+
+
+class _Header(_Line):
+    format: str = FORMAT
+    version: int = VERSION
+    unit: str | None = None
+    symmetries: dict[str, list[_Matrix4]] = {}
+
+
+_Checked = TypeVar("_Checked", bound=_Line)
+
+
+def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
+    """Check the JSON object of a pose line.
+
+    Parameters
+    ----------
+    values : mapping
+    where : str
+        ``file:line``, for messages.
+    line : int
+        Number of the line, from 1.
+
+    Raises
+    ------
+    RecordingError
+    """
+    pose = _checked(_Pose, values, where)
+    matrix = pose.T_world_object
+    T = None if matrix is None else _motion(matrix, f"{where}: T_world_object")
+    if (T is None) != (pose.status == "lost"):
+        found = "null or missing" if T is None else "given"
+        raise RecordingError(
+            f"{where}: T_world_object is {found} while status is {pose.status!r}; it is null "
+            "where the status is 'lost' and a 4x4 matrix otherwise"
+        )
+    return PoseLine(
+        line=line,
+        frame=pose.frame,
+        time_s=pose.time_s,
+        object=pose.object,
+        status=pose.status,
+        T_world_object=T,
+        covariance=_covariance(pose.covariance, where),
+        score=pose.score,
+        sensors={
+            name: SensorReport(report.used, report.explained, report.rms)
+            for name, report in pose.sensors.items()
+        },
+        hypotheses=tuple(
+            Hypothesis(_motion(rival.T_world_object, f"{where}: hypotheses"), rival.weight)
+            for rival in pose.hypotheses
+        ),
+        latency_ms=pose.latency_ms,
+    )
+
+
+def parse_header(values: Mapping[str, Any], where: str) -> tuple[str | None, dict[str, Floats]]:
+    """Check the JSON object of a header line and return its unit and symmetries.
+
+    Raises
+    ------
+    RecordingError
+    """
+    header = _checked(_Header, values, where)
+    if header.format != FORMAT:
+        raise RecordingError(f"{where}: format is {header.format!r}; allowed is {FORMAT!r}")
+    if header.version != VERSION:
+        raise RecordingError(
+            f"{where}: version {header.version} of {FORMAT}; this mixpose reads version {VERSION}"
+        )
+    if header.unit is not None and header.unit not in UNITS_PER_METRE:
+        allowed = ", ".join(map(repr, UNITS_PER_METRE))
+        raise RecordingError(f"{where}: unit is {header.unit!r}; allowed are {allowed}")
+    symmetries = {}
+    for name, matrices in header.symmetries.items():
+        motions = [_motion(matrix, f"{where}: symmetries.{name}") for matrix in matrices]
+        symmetries[name] = np.stack([*motions]) if motions else np.eye(4)[None]
+    return header.unit, symmetries
+
+
+def _checked(model: type[_Checked], values: Mapping[str, Any], where: str) -> _Checked:
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(map(str, first["loc"]))
+        if first["type"] == "missing":
+            raise RecordingError(f"{where}: {key} is missing") from error
+        found = repr(first["input"])
+        found = found if len(found) <= 60 else found[:57] + "..."
+        raise RecordingError(f"{where}: {key} is {found}; {first['msg'].lower()}") from error
+    except OverflowError as error:
+        raise RecordingError(f"{where}: a number is too large") from error
+
+
+def _motion(matrix: list[list[float]], what: str) -> Floats:
+    T = np.array(matrix, dtype=np.float64)
+    with np.errstate(all="ignore"):  # a rotation of huge numbers overflows, then is refused
+        is_motion = rigid.is_rigid(T, RIGID_TOLERANCE)
+    if not is_motion:
+        raise RecordingError(f"{what} is not a rotation and a translation within {RIGID_TOLERANCE}")
+    return T
+
+
+def _covariance(matrix: list[list[float]] | None, where: str) -> Floats | None:
+    if matrix is None:
+        return None
+    covariance = np.array(matrix, dtype=np.float64)
+    variances = np.diag(covariance)
+    if np.all(variances >= 0):
+        # Lengths and angles stand side by side, so judge the entries against their own scales.
+        scale = np.sqrt(np.where(variances > 0, variances, 1.0))
+        correlation = covariance / scale[:, None] / scale
+        if (
+            np.all(np.abs(correlation) < 1 + 1e-6)
+            and np.allclose(correlation, correlation.T, atol=1e-6)
+            and np.linalg.eigvalsh(correlation)[0] > -1e-6
+        ):
+            return covariance
+    raise RecordingError(f"{where}: covariance is not symmetric and positive semi-definite")

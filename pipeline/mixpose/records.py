@@ -1,0 +1,135 @@
+"""The frozen records that pass from stage to stage.
+
+    frames -> FrameSet -> extraction -> Pattern (g0) -> density (g) -> estimator -> Estimate
+
+Sensor coordinates y are what the sensor measures: pixels (u right, v down, pixel centres at
+integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a range m = 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Image: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PointPattern:
+    """Feature pattern g0 as a sum of weighted points.
+
+    Attributes
+    ----------
+    points : (M, m) float64
+        Feature positions in sensor coordinates.
+    weights : (M,) float64
+        Positive weight of each point; 1 for a plain detection.
+    """
+
+    points: Floats
+    weights: Floats
+
+
+@dataclass(frozen=True)
+class GridPattern:
+    """Feature pattern g0 as values on a regular grid: grey values or a range profile.
+
+    Attributes
+    ----------
+    values : (H, W) float32
+        Non-negative values after extraction; a range profile has H = 1.
+    origin : (m,) float64
+        Sensor coordinates of ``values[0, 0]``, u first.
+    step : float
+        Sensor units from one grid point to the next.
+    """
+
+    values: NDArray[np.float32]
+    origin: Floats
+    step: float
+
+
+Pattern: TypeAlias = PointPattern | GridPattern
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """What one sensor recorded at one moment.
+
+    `data` is an image (H, W) of a camera, or a pattern where the source holds detections
+    (`PointPattern`) or range profiles (`GridPattern`) already.
+    """
+
+    number: int
+    time_s: float | None
+    data: Image | Pattern
+
+
+@dataclass(frozen=True)
+class FrameSet:
+    """The frames of one number, by sensor name; a sensor without a frame is left out."""
+
+    number: int
+    time_s: float | None
+    frames: Mapping[str, RawFrame]
+
+
+@dataclass(frozen=True)
+class SensorReport:
+    """How one sensor took part in an estimate.
+
+    Attributes
+    ----------
+    used : bool
+        Whether the sensor had a frame with features in it.
+    explained : float or None
+        Share of the sensor's feature density that the pose accounts for, 0 to 1.
+    rms : float or None
+        Residual of the explained features, px or length units.
+    """
+
+    used: bool
+    explained: float | None = None
+    rms: float | None = None
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose that explains a frame, with its share of belief among its rivals."""
+
+    T_world_object: Floats
+    weight: float
+
+
+Status: TypeAlias = Literal["ok", "ambiguous", "lost"]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The pose of one frame; the fields of a pose line.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64 or None
+        None when the status is "lost".
+    covariance : (6, 6) float64 or None
+        In the order and axes of `mixpose.rigid`, squared lengths and radians.
+    score : float
+        0 to 1: how well the predicted densities meet the observed ones, over all sensors.
+    """
+
+    frame: int
+    time_s: float | None
+    object: str
+    status: Status
+    T_world_object: Floats | None
+    covariance: Floats | None
+    score: float
+    sensors: Mapping[str, SensorReport]
+    hypotheses: tuple[Hypothesis, ...] = ()
+    latency_ms: float = field(default=0.0, compare=False)

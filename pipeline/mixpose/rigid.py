@@ -1,0 +1,121 @@
+"""Rigid motions: the conventions of mixpose, stated once.
+
+* `T_a_b` is a 4x4 float64 matrix that maps coordinates in frame b to frame a:
+  ``x_a = T_a_b @ x_b``.  A pose is ``T_world_object``.  (The paper writes R(z + w): t = R w.)
+* Quaternions are ``(x, y, z, w)``, unit length, with w >= 0.
+* A small motion (twist) is ``(x, y, z, rx, ry, rz)`` in *world axes*, lengths then radians,
+  as in ROS PoseWithCovariance: ``t <- t + (x, y, z)``, ``R <- exp([rx, ry, rz]) R``.  The turn
+  is about the object's origin.  Covariances, gradients and curvatures use this order.
+* Everything broadcasts over leading axes.
+
+Rotations themselves are `scipy.spatial.transform.Rotation`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Floats = NDArray[np.float64]
+
+TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def transform(T_a_b: Floats, points_b: Floats) -> Floats:
+    """Map points to another frame.
+
+    Parameters
+    ----------
+    T_a_b : (..., 4, 4) array
+        Rigid motions; leading axes broadcast against those of the points.
+    points_b : (..., n, 3) array
+        Points in frame b.
+
+    Returns
+    -------
+    (..., n, 3) array
+        The points in frame a.
+    """
+    return points_b @ np.swapaxes(T_a_b[..., :3, :3], -1, -2) + T_a_b[..., None, :3, 3]
+
+
+def from_parts(rotation: ArrayLike, translation: ArrayLike) -> Floats:
+    """Assemble 4x4 motions from rotation matrices (..., 3, 3) and translations (..., 3)."""
+    rotation = np.asarray(rotation, dtype=np.float64)
+    translation = np.asarray(translation, dtype=np.float64)
+    shape = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    T = np.zeros((*shape, 4, 4))
+    T[..., :3, :3] = rotation
+    T[..., :3, 3] = translation
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> Floats:
+    """Assemble 4x4 motions from rotation vectors (..., 3) in radians and translations (..., 3)."""
+    return from_parts(rotation_matrix(rotation_vector), translation)
+
+
+def rotation_matrix(rotation_vector: ArrayLike) -> Floats:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    vectors = np.asarray(rotation_vector, dtype=np.float64)
+    matrices = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    return np.asarray(matrices, dtype=np.float64).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def inverse(T_a_b: Floats) -> Floats:
+    """The motion back: T_b_a of shape (..., 4, 4)."""
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    return from_parts(R_b_a, -np.einsum("...ij,...j->...i", R_b_a, T_a_b[..., :3, 3]))
+
+
+def perturb(T_world_object: Floats, twist: Floats) -> Floats:
+    """Move a pose by twists in world axes.
+
+    Parameters
+    ----------
+    T_world_object : (..., 4, 4) array
+    twist : (..., 6) array
+        ``(x, y, z, rx, ry, rz)``, lengths and radians.
+    """
+    rotation = rotation_matrix(twist[..., 3:]) @ T_world_object[..., :3, :3]
+    return from_parts(rotation, T_world_object[..., :3, 3] + twist[..., :3])
+
+
+def twist_between(T_from: Floats, T_to: Floats) -> Floats:
+    """The twist (..., 6) with ``perturb(T_from, twist) == T_to``."""
+    R_difference = T_to[..., :3, :3] @ np.swapaxes(T_from[..., :3, :3], -1, -2)
+    vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
+    shift = T_to[..., :3, 3] - T_from[..., :3, 3]
+    return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
+
+
+def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
+    """Angle in degrees (...,) of the rotation that leads from one pose to the other."""
+    angle = np.linalg.norm(twist_between(T_a, T_b)[..., 3:], axis=-1)
+    return np.asarray(np.degrees(angle), dtype=np.float64)
+
+
+def quaternion_xyzw(T_a_b: Floats) -> Floats:
+    """Unit quaternion (4,), (x, y, z, w) with w >= 0, of one motion."""
+    return np.asarray(Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True), dtype=np.float64)
+
+
+def is_rigid(T: Floats, tolerance: float = 1e-4) -> bool:
+    """Whether a 4x4 matrix is a rotation and a translation, within a tolerance on each entry."""
+    T = np.asarray(T, dtype=np.float64)
+    return bool(
+        T.shape == (4, 4)
+        and np.all(np.isfinite(T))
+        and np.allclose(T[3], [0, 0, 0, 1], atol=tolerance)
+        and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=tolerance)
+        and np.linalg.det(T[:3, :3]) > 0
+    )
+
+
+def nearest_rigid(T: Floats) -> Floats:
+    """The rigid motion nearest to a 4x4 matrix whose rotation carries rounding errors."""
+    U, _, Vt = np.linalg.svd(np.asarray(T, dtype=np.float64)[:3, :3])
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return from_parts(R, np.asarray(T, dtype=np.float64)[:3, 3])

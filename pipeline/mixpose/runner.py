@@ -1,0 +1,183 @@
+"""A whole run: session in, estimates out, one frame after the other."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.density import Observation
+from mixpose.errors import SessionError
+from mixpose.estimation import Track, Tracker
+from mixpose.extraction import extract
+from mixpose.frames import Source, SourceSpec, open_source, pair
+from mixpose.objective import View
+from mixpose.records import (
+    Estimate,
+    FrameSet,
+    GridPattern,
+    Pattern,
+    PointPattern,
+    RawFrame,
+    SensorReport,
+)
+
+if TYPE_CHECKING:
+    from mixpose.session import SensorSetup, Session
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which frames of a recording are estimated, as by `range`: numbers, `stop` excluded."""
+
+    start: int | None = None
+    stop: int | None = None
+    step: int = 1
+
+
+def run(
+    session: Session,
+    *,
+    sources: Mapping[str, str] | None = None,
+    selection: Selection = Selection(),
+    T_start: Floats | None = None,
+) -> Generator[Estimate, None, None]:
+    """Estimate the pose of every frame of a recording.
+
+    Parameters
+    ----------
+    session : Session
+    sources : mapping of str to str or None
+        Recordings that replace those of the session, by sensor name; relative to the working
+        directory.
+    selection : Selection
+    T_start : (4, 4) array or None
+        Pose to begin at in place of the session's ``[start]``.
+
+    Yields
+    ------
+    Estimate
+        As soon as each frame is done, by ascending frame number.
+
+    Raises
+    ------
+    SessionError
+        If the session has no start, or names no source for a sensor.
+    RecordingError
+        In place of the first frame that cannot be read.
+    """
+    tracker, track = begin(session, T_start)
+    opened = open_sources(session, sources or {})
+    frames = pair(opened, selection.start, selection.stop, selection.step)
+    return _estimates(session, tracker, track, frames)
+
+
+def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
+    """The tracker of a session and its track before the first frame."""
+    if T_start is None:
+        if session.start is None:
+            raise SessionError(
+                f"{session.path}: start: found none, a start is needed: add [start] with "
+                "T_world_object near the first frame's pose"
+            )
+        T_start = session.start.T_world_object
+    start = session.start
+    tracker = Tracker.create(
+        session.body,
+        session.estimator,
+        rotation_deg=start.rotation_deg if start else None,
+        distance=start.distance if start else None,
+    )
+    return tracker, tracker.begin(T_start)
+
+
+def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
+    """Open the recordings of all sensors.
+
+    Raises
+    ------
+    SessionError
+        If a replaced sensor is not in the session, or a sensor has no source.
+    RecordingError
+        If a recording cannot be opened.
+    """
+    names = [setup.name for setup in session.sensors]
+    for name in replaced:
+        if name not in names:
+            raise SessionError(f"--source {name}=...: no such sensor, allowed: {', '.join(names)}")
+    return {
+        setup.name: open_source(source_spec(session, setup, replaced.get(setup.name)))
+        for setup in session.sensors
+    }
+
+
+def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> SourceSpec:
+    """What the frames of a sensor are read from."""
+    if replaced is None and not setup.source:
+        raise SessionError(
+            f"{session.path}: sensor {setup.name!r}: source: found none, name the recording here "
+            f"or with --source {setup.name}=PATH"
+        )
+    return SourceSpec(
+        sensor=setup.name,
+        source=setup.source if replaced is None else replaced,
+        base=session.folder if replaced is None else Path(),
+        kind="lateration" if setup.model == "lateration" else "camera",
+        resolution=setup.resolution,
+        times=setup.times,
+        fps=setup.fps,
+        range_min=setup.range_min,
+        bin_size=setup.bin_size,
+    )
+
+
+def _estimates(
+    session: Session, tracker: Tracker, track: Track, frames: Generator[FrameSet, None, None]
+) -> Generator[Estimate, None, None]:
+    with closing(frames):
+        for frame_set in frames:
+            began = time.perf_counter()
+            views = observe(session, frame_set)
+            track, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
+            estimate = _with_silent_sensors(estimate, session.sensors)
+            yield replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def observe(session: Session, frame_set: FrameSet) -> list[View]:
+    """Extract the features of every sensor that has a frame."""
+    return [
+        View(setup.name, setup.sensor, observation_of(session, setup, frame_set.frames[setup.name]))
+        for setup in session.sensors
+        if setup.name in frame_set.frames
+    ]
+
+
+def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
+    """The feature pattern of one sensor's frame, with the width of its features."""
+    options = setup.extract
+    pattern: Pattern
+    if isinstance(frame.data, PointPattern):
+        return Observation(frame.data, options.sigma)
+    if isinstance(frame.data, GridPattern):
+        # noise may take a profile below zero; cutting that off would leave a floor of noise
+        pattern = frame.data
+    else:
+        pattern = extract(frame.data, options, base=session.folder)
+    if isinstance(pattern, PointPattern):
+        return Observation(pattern, options.sigma)
+    width = float(np.hypot(options.sigma, options.spot_sigma))
+    return Observation(pattern, width, intrinsic=options.spot_sigma)
+
+
+def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:
+    """Reports for all sensors in the session's order, also for those without a frame."""
+    reports = {s.name: estimate.sensors.get(s.name, SensorReport(False)) for s in setups}
+    return replace(estimate, sensors=reports)

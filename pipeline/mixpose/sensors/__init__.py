@@ -1,0 +1,29 @@
+"""Sensors: from world points to sensor coordinates, with Jacobians.
+
+A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
+"""
+
+from __future__ import annotations
+
+from mixpose.sensors.base import OUTSIDE, Sensor
+from mixpose.sensors.fisheye import FisheyeCamera
+from mixpose.sensors.lateration import RangeSensor
+from mixpose.sensors.parallel import ParallelBeam
+from mixpose.sensors.pinhole import PinholeCamera
+
+SENSOR_MODELS: dict[str, type[Sensor]] = {
+    "pinhole": PinholeCamera,
+    "fisheye": FisheyeCamera,
+    "parallel": ParallelBeam,
+    "lateration": RangeSensor,
+}
+
+__all__ = [
+    "OUTSIDE",
+    "SENSOR_MODELS",
+    "FisheyeCamera",
+    "ParallelBeam",
+    "PinholeCamera",
+    "RangeSensor",
+    "Sensor",
+]

@@ -1,0 +1,81 @@
+"""What every sensor is: a map from world points to what it measures, with its Jacobian.
+
+Conventions
+-----------
+* Sensor coordinates y have m numbers: pixels (u right, v down, pixel centres at integers) for
+  cameras, one length for ranges.
+* A sensor's frame looks along +z, x right, y down (OpenCV); ``x_sensor = T_sensor_world x_world``.
+* A point that the sensor cannot measure (behind the camera, outside the image, where the lens
+  model no longer holds) is marked invisible, its coordinates are `OUTSIDE` and its Jacobian is
+  zero: finite everywhere, on no sensor, and without pull on the pose.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+OUTSIDE = -1.0e6
+
+
+@runtime_checkable
+class Sensor(Protocol):
+    """A calibrated sensor: geometry only, no frames and no name."""
+
+    @property
+    def dimension(self) -> int:
+        """m, the number of sensor coordinates."""
+        ...
+
+    @property
+    def unit(self) -> Literal["px", "length"]:
+        """What the sensor coordinates count."""
+        ...
+
+    @property
+    def lower(self) -> Floats:
+        """Smallest measurable coordinates (m,); minus infinity where unknown."""
+        ...
+
+    @property
+    def upper(self) -> Floats:
+        """Largest measurable coordinates (m,); infinity where unknown."""
+        ...
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Map world points (..., 3) to sensor coordinates (..., m) and a visibility mask (...)."""
+        ...
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `project`, with the Jacobian (..., m, 3) by world coordinates in between."""
+        ...
+
+    def towards(self, points_world: Floats) -> Floats:
+        """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
+        ...
+
+
+def image_bounds(resolution: tuple[int, int] | None) -> tuple[Floats, Floats]:
+    """Corners of an image (width, height) in pixel coordinates; infinite where unknown."""
+    if resolution is None:
+        return np.full(2, -np.inf), np.full(2, np.inf)
+    return np.full(2, -0.5), np.asarray(resolution, dtype=np.float64) - 0.5
+
+
+def within(y: Floats, lower: Floats, upper: Floats) -> Mask:
+    """Whether coordinates (..., m) lie inside the bounds (m,)."""
+    return np.asarray(np.all((y >= lower) & (y <= upper), axis=-1))
+
+
+def hide(y: Floats, visible: Mask, J: Floats | None = None) -> None:
+    """Overwrite what is not visible, in place: coordinates `OUTSIDE`, Jacobian zero."""
+    if visible.all():
+        return
+    y[~visible] = OUTSIDE
+    if J is not None:
+        J[~visible] = 0.0

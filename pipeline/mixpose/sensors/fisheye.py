@@ -1,0 +1,113 @@
+"""The equidistant fisheye camera (Kannala-Brandt, as in OpenCV's `cv2.fisheye`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+
+_WIDEST = np.pi / 2  # as cv2.fisheye, which divides by depth; points beside the camera are dropped
+
+
+@dataclass(frozen=True)
+class FisheyeCamera:
+    """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
+
+    Parameters
+    ----------
+    camera_matrix : (3, 3) array
+    distortion : (4,) array
+        k1 to k4; empty for none.
+    resolution : (int, int) or None
+        Width and height in px; None leaves the image unbounded.
+    T_sensor_world : (4, 4) array
+
+    Raises
+    ------
+    ValueError
+        If `distortion` has neither 0 nor 4 numbers.
+    """
+
+    camera_matrix: Floats
+    distortion: Floats = field(default_factory=lambda: np.zeros(4))
+    resolution: tuple[int, int] | None = None
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    lower: Floats = field(init=False, repr=False)
+    upper: Floats = field(init=False, repr=False)
+    theta_limit: float = field(init=False, repr=False)
+
+    dimension = 2
+    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        distortion = np.asarray(self.distortion, dtype=np.float64).ravel()
+        if distortion.size not in (0, 4):
+            raise ValueError(f"{distortion.size} distortion coefficients, a fisheye camera has 4")
+        distortion = np.zeros(4) if distortion.size == 0 else distortion
+        object.__setattr__(self, "distortion", distortion)
+        for name in ("camera_matrix", "T_sensor_world"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        lower, upper = image_bounds(self.resolution)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        theta = np.linspace(0, _WIDEST, 2001)
+        bad = ~(np.diff(self._radius(theta)[0]) > 0)
+        object.__setattr__(
+            self, "theta_limit", float(theta[bad.argmax()]) if bad.any() else _WIDEST
+        )
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        y, _, visible = self._map(points_world, want_jacobian=False)
+        return y, visible
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        y, J, visible = self._map(points_world, want_jacobian=True)
+        assert J is not None
+        return y, J, visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
+        centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
+        return np.asarray(centre - points_world)
+
+    def _radius(self, theta: Floats) -> tuple[Floats, Floats]:
+        k1, k2, k3, k4 = self.distortion
+        t2 = theta * theta
+        radius = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        return np.asarray(radius), np.asarray(slope)
+
+    def _map(
+        self, points_world: Floats, *, want_jacobian: bool
+    ) -> tuple[Floats, Floats | None, Mask]:
+        R = self.T_sensor_world[:3, :3]
+        points = points_world @ R.T + self.T_sensor_world[:3, 3]
+        xy, z = points[..., :2], points[..., 2]
+        rho = np.hypot(xy[..., 0], xy[..., 1])
+        theta = np.arctan2(rho, z)
+        visible = theta < self.theta_limit
+        radius, slope = self._radius(theta)
+        # on the axis radius/rho tends to 1/z, and the direction of xy does not matter
+        on_axis = rho < 1e-12 * np.maximum(np.abs(z), 1e-300)
+        safe_rho = np.where(on_axis, 1.0, rho)
+        scale = np.where(on_axis, 1.0 / np.where(z == 0, 1.0, z), radius / safe_rho)
+        K = self.camera_matrix[:2, :2]
+        y = (xy * scale[..., None]) @ K.T + self.camera_matrix[:2, 2]
+        visible &= within(y, self.lower, self.upper)
+        J = None
+        if want_jacobian:
+            direction = xy / safe_rho[..., None]
+            distance2 = np.maximum(rho * rho + z * z, 1e-300)
+            along = (slope * z / distance2 - scale)[..., None, None]
+            by_sensor = np.empty((*xy.shape, 3))
+            by_sensor[..., :2] = along * direction[..., :, None] * direction[..., None, :]
+            by_sensor[..., :2] += scale[..., None, None] * np.eye(2)
+            by_sensor[..., 2] = direction * (-slope * rho / distance2)[..., None]
+            J = K @ by_sensor @ R
+        hide(y, visible, J)
+        return y, J, np.asarray(visible)

@@ -1,0 +1,61 @@
+"""The range sensor (lateration): distance from a fixed position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from mixpose.sensors.base import Floats, Mask, hide, within
+
+
+@dataclass(frozen=True)
+class RangeSensor:
+    """Measures distances: range = ‖x_world − position‖ + range_bias.
+
+    Parameters
+    ----------
+    position : (3,) array
+        The lateration source γ_l in the world.
+    range_bias : float
+        Constant part of every reading, in length units.
+    range_limits : (float, float) or None
+        Smallest and largest reading; None for no limits.
+    """
+
+    position: Floats
+    range_bias: float = 0.0
+    range_limits: tuple[float, float] | None = None
+    lower: Floats = field(init=False, repr=False)
+    upper: Floats = field(init=False, repr=False)
+
+    dimension = 1
+    unit: Literal["px", "length"] = field(default="length", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))
+        low, high = self.range_limits or (-np.inf, np.inf)
+        object.__setattr__(self, "lower", np.array([low], dtype=np.float64))
+        object.__setattr__(self, "upper", np.array([high], dtype=np.float64))
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Ranges (..., 1) of world points (..., 3), and which of them lie within the limits."""
+        y = np.linalg.norm(points_world - self.position, axis=-1, keepdims=True) + self.range_bias
+        visible = within(y, self.lower, self.upper)
+        hide(y, visible)
+        return np.asarray(y), visible
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `project`, with the Jacobian (..., 1, 3), the unit vector to the point, between."""
+        away = points_world - self.position
+        distance = np.linalg.norm(away, axis=-1, keepdims=True)
+        y = distance + self.range_bias
+        J = (away / np.maximum(distance, np.finfo(np.float64).tiny))[..., None, :]
+        visible = within(y, self.lower, self.upper)
+        hide(y, visible, J)
+        return np.asarray(y), np.asarray(J), visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """Vectors (..., 3) from world points (..., 3) to the lateration source."""
+        return np.asarray(self.position - points_world)

@@ -1,0 +1,64 @@
+"""The parallel-beam camera (orthographic), as in the paper's systems 1 and 2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+
+
+@dataclass(frozen=True)
+class ParallelBeam:
+    """A camera without perspective: pixel = (x_s, y_s) / pixel_size + principal_point.
+
+    Parameters
+    ----------
+    pixel_size : float
+        Length per px.
+    principal_point : (2,) array
+        Pixel where the sensor's origin projects.
+    resolution : (int, int) or None
+        Width and height in px; None leaves the image unbounded.
+    T_sensor_world : (4, 4) array
+        The paper's rotated projections are ``x_s = cos γ x + sin γ y, y_s = z``.
+    """
+
+    pixel_size: float
+    principal_point: Floats
+    resolution: tuple[int, int] | None = None
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    lower: Floats = field(init=False, repr=False)
+    upper: Floats = field(init=False, repr=False)
+
+    dimension = 2
+    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("principal_point", "T_sensor_world"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        lower, upper = image_bounds(self.resolution)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        T = self.T_sensor_world
+        y = (points_world @ T[:2, :3].T + T[:2, 3]) / self.pixel_size + self.principal_point
+        visible = within(y, self.lower, self.upper)
+        hide(y, visible)
+        return y, visible
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        y, visible = self.project(points_world)
+        J = np.empty((*y.shape, 3))
+        J[...] = self.T_sensor_world[:2, :3] / self.pixel_size
+        hide(y, visible, J)
+        return y, J, visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """Unit vectors (..., 3) against the beam, the same for all world points (..., 3)."""
+        return np.broadcast_to(-self.T_sensor_world[2, :3], points_world.shape)

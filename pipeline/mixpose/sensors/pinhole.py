@@ -1,0 +1,102 @@
+"""The pinhole camera with OpenCV's lens distortion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.sensors.distortion import LensDistortion
+
+NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A perspective camera.
+
+    Parameters
+    ----------
+    camera_matrix : (3, 3) array
+        ``[[fx, skew, cx], [0, fy, cy], [0, 0, 1]]`` in px.
+    distortion : (k,) array
+        0, 4, 5, 8, 12 or 14 OpenCV coefficients.
+    resolution : (int, int) or None
+        Width and height in px; None leaves the image unbounded.
+    T_sensor_world : (4, 4) array
+
+    Raises
+    ------
+    ValueError
+        If the number of distortion coefficients is not one of OpenCV's.
+    """
+
+    camera_matrix: Floats
+    distortion: Floats = field(default_factory=lambda: np.zeros(0))
+    resolution: tuple[int, int] | None = None
+    T_sensor_world: Floats = field(default_factory=lambda: np.eye(4))
+    lower: Floats = field(init=False, repr=False)
+    upper: Floats = field(init=False, repr=False)
+    lens: LensDistortion | None = field(init=False, repr=False)
+
+    dimension = 2
+    unit: Literal["px", "length"] = field(default="px", init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        _freeze_camera(self, self.camera_matrix, self.distortion, self.T_sensor_world)
+        lower, upper = image_bounds(self.resolution)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        object.__setattr__(self, "lens", LensDistortion.from_coefficients(self.distortion))
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
+        xy, _, visible = self._normalised(points_world)
+        y = (self.lens.apply(xy) if self.lens else xy) @ self.camera_matrix[:2, :2].T
+        y += self.camera_matrix[:2, 2]
+        visible &= within(y, self.lower, self.upper)
+        hide(y, visible)
+        return y, visible
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `project`, with the Jacobian (..., 2, 3) in px per length in between."""
+        xy, inverse_depth, visible = self._normalised(points_world)
+        y, D = xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))
+        if self.lens:
+            y, D = self.lens.apply(xy), self.lens.derivative(xy)
+        y = y @ self.camera_matrix[:2, :2].T + self.camera_matrix[:2, 2]
+        R = self.T_sensor_world[:3, :3]
+        normalised_by_world = (R[:2] - xy[..., :, None] * R[2]) * inverse_depth[..., None, None]
+        J = self.camera_matrix[:2, :2] @ D @ normalised_by_world
+        visible &= within(y, self.lower, self.upper)
+        hide(y, visible, J)
+        return y, J, visible
+
+    def towards(self, points_world: Floats) -> Floats:
+        """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
+        centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
+        return np.asarray(centre - points_world)
+
+    def _normalised(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        points = points_world @ self.T_sensor_world[:3, :3].T + self.T_sensor_world[:3, 3]
+        visible = points[..., 2] > NEAREST
+        inverse_depth = 1.0 / np.where(visible, points[..., 2], 1.0)
+        xy = points[..., :2] * inverse_depth[..., None]
+        if self.lens and np.isfinite(self.lens.radius_limit):
+            inside = (xy * xy).sum(-1) < self.lens.radius_limit**2
+            visible &= inside
+            # polynomials of huge radii overflow; hidden points are overwritten anyway
+            xy = np.where(visible[..., None], xy, 0.0)
+        return xy, inverse_depth, np.asarray(visible)
+
+
+def _freeze_camera(camera: object, matrix: ArrayLike, distortion: ArrayLike, T: ArrayLike) -> None:
+    for name, value in (
+        ("camera_matrix", matrix),
+        ("distortion", distortion),
+        ("T_sensor_world", T),
+    ):
+        object.__setattr__(camera, name, np.asarray(value, dtype=np.float64))

@@ -1,0 +1,8 @@
+"""The session file: one TOML file that holds a whole set-up."""
+
+from __future__ import annotations
+
+from mixpose.session.reader import load_session
+from mixpose.session.setup import SensorSetup, Session, Start
+
+__all__ = ["SensorSetup", "Session", "Start", "load_session"]

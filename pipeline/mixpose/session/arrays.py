@@ -1,0 +1,73 @@
+"""Values of the session file, as TOML gives them, to arrays of finite numbers."""
+
+from __future__ import annotations
+
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from mixpose.rigid import Floats
+from mixpose.session.messages import BadKeyError, found
+
+RESOLUTION_FORM = "[width, height], two positive integers"
+
+LARGEST = 1e100  # squares and products of larger numbers would overflow to infinity unseen
+_WIDEST = 1_000_000  # px; more than any image library reads
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value is a finite number to reckon with (true and false are none)."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64
+
+
+def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
+    """Read nested lists of numbers.
+
+    Parameters
+    ----------
+    value : object
+        What the file holds.
+    shape : tuple of int or None
+        Length of the list at each depth; None for any length but zero.
+    allowed : str
+        What to tell the user is allowed.
+
+    Returns
+    -------
+    float64 array of that shape
+
+    Raises
+    ------
+    BadKeyError
+        Pointing at the first entry that does not fit.
+    """
+    if not shape:
+        if not is_number(value):
+            raise BadKeyError(found(value, f"a finite number, as part of {allowed}"))
+        return np.float64(value)  # type: ignore[return-value]
+    length, inner = shape[0], shape[1:]
+    if not isinstance(value, list) or not value or (length is not None and len(value) != length):
+        raise BadKeyError(found(value, allowed))
+    rows = []
+    for i, item in enumerate(value):
+        try:
+            rows.append(numbers(item, inner, allowed))
+        except BadKeyError as problem:
+            raise BadKeyError(problem.text, i, *problem.key) from problem
+    return np.array(rows, dtype=np.float64)
+
+
+def resolution(value: Any) -> tuple[int, int]:
+    """Read the width and height of an image in px.
+
+    Raises
+    ------
+    BadKeyError
+    """
+    match value:
+        case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
+            if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
+                return width, height
+    raise BadKeyError(found(value, RESOLUTION_FORM))

@@ -1,0 +1,194 @@
+"""From ``[object]`` to the body: points, segments, their spread and their normals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose.body import Body, Feature, PointFeature, SegmentFeature
+from mixpose.rigid import Floats
+from mixpose.session.arrays import is_number, numbers
+from mixpose.session.markers import Markers, read_markers
+from mixpose.session.messages import BadKeyError, found, in_file, show, under
+from mixpose.session.schema import ObjectTable
+
+FEWEST_FEATURES = 3
+
+_SIGMA = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
+_SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
+
+
+def build_body(table: ObjectTable, folder: Path) -> Body:
+    """Build the object model; points come first, then segments.
+
+    Parameters
+    ----------
+    table : ObjectTable
+    folder : Path
+        What the marker file's path is relative to.
+
+    Raises
+    ------
+    BadKeyError
+        If there are fewer than three features, or spread or normals do not fit them.
+    """
+    markers = _markers(table, folder)
+    points = np.zeros((0, 3)) if markers is None else markers.points
+    segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
+    count = len(points) + len(segments)
+    if count < FEWEST_FEATURES:
+        key = "file" if table.file is not None else "points"
+        if table.segments is not None:
+            key = "segments"
+        raise BadKeyError(
+            f"found {count} feature{'s' * (count != 1)}; allowed: at least three points and "
+            "segments together",
+            key,
+        )
+    for i, (start, end) in enumerate(segments):
+        if np.array_equal(start, end):
+            raise BadKeyError(
+                "found a segment without length; allowed: two different ends", "segments", i
+            )
+    spreads = _spreads(table, markers, count)
+    features: list[Feature] = [PointFeature(z, C) for z, C in zip(points, spreads)]
+    features += [SegmentFeature(a, b, C) for (a, b), C in zip(segments, spreads[len(points) :])]
+    return Body(table.name, tuple(features), _normals(table.normals, count))
+
+
+def _markers(table: ObjectTable, folder: Path) -> Markers | None:
+    if table.file is not None:
+        if table.points is not None:
+            raise BadKeyError("stands beside points; allowed: one of the two", "file")
+        with under("file"):
+            return read_markers(folder / table.file)
+    if table.points is not None:
+        return Markers(table.points, None)
+    if table.segments is None:
+        raise BadKeyError('missing; allowed: points, file = "markers.csv" or segments', "points")
+    return None
+
+
+def _spreads(table: ObjectTable, markers: Markers | None, count: int) -> Floats:
+    """Covariances (N, 3, 3) of all features."""
+    if markers is None or markers.sigma is None:
+        with under("sigma"):
+            return covariances(0.0 if table.sigma is None else table.sigma, count)
+    if table.sigma is not None:
+        raise BadKeyError(f"stands beside the sigma columns of {table.file}; drop one", "sigma")
+    with under("file"), in_file(str(table.file)), under("sigma"):
+        own = _one_each(markers.sigma)
+    # segments have no row in the table: they are exact
+    return np.concatenate([own, np.zeros((count - len(own), 3, 3))])
+
+
+def covariances(sigma: Any, count: int) -> Floats:
+    """Read the key ``sigma`` as one covariance per feature.
+
+    Where three features leave it open, a list of three numbers is [sx, sy, sz] for all of them,
+    and three lists of three numbers are a covariance for all of them.
+
+    Parameters
+    ----------
+    sigma : object
+        A number σ, [σx, σy, σz], a 3x3 covariance, or a list with one of these per feature.
+    count : int
+        N.
+
+    Returns
+    -------
+    (N, 3, 3) float64 array
+
+    Raises
+    ------
+    BadKeyError
+    """
+    if _is_single(sigma):
+        _check_ambiguous(sigma, count)
+        return np.repeat(_covariance(sigma)[None], count, axis=0)
+    if not isinstance(sigma, list) or not sigma:
+        raise BadKeyError(found(sigma, _SIGMA))
+    if len(sigma) != count:
+        text = f"found {len(sigma)} items for {count} features"
+        raise BadKeyError(f"{text}; allowed: {_SIGMA}")
+    return _one_each(sigma)
+
+
+def _is_single(sigma: Any) -> bool:
+    """Whether this is one spread, right or wrong, and not a list with one per feature."""
+    if not isinstance(sigma, list):
+        return True
+    lists = [item for item in sigma if isinstance(item, list)]
+    if len(sigma) != 3 or not lists:
+        return len(sigma) == 3
+    return len(lists) == 3 and not any(isinstance(x, list) for item in lists for x in item)
+
+
+def _check_ambiguous(sigma: Any, count: int) -> None:
+    """Three times the same [s, s, s] for three features is hardly meant as a covariance."""
+    if count != 3 or not isinstance(sigma, list) or not isinstance(sigma[0], list):
+        return
+    entries = [entry for row in sigma for entry in row]
+    if len(entries) == 9 and is_number(entries[0]) and entries == [entries[0]] * 9 != [0] * 9:
+        raise BadKeyError(
+            f"{show(sigma)} may be a covariance or one [sx, sy, sz] per feature; for the latter "
+            f"write sigma = {show(entries[0])}"
+        )
+
+
+def _one_each(sigma: list[Any]) -> Floats:
+    spreads = []
+    for i, item in enumerate(sigma):
+        with under(i):
+            spreads.append(_covariance(item))
+    return np.array(spreads)
+
+
+def _covariance(sigma: Any) -> Floats:
+    """One spread, in any of its forms, as a covariance (3, 3)."""
+    if is_number(sigma):
+        sigma = [sigma] * 3
+    elif not isinstance(sigma, list):
+        raise BadKeyError(found(sigma, _SIGMA))
+    if any(isinstance(item, list) for item in sigma):
+        return _positive(numbers(sigma, (3, 3), "a 3x3 covariance, [sx, sy, sz] or a number"))
+    deviations = numbers(sigma, (3,), "three numbers [sx, sy, sz], a 3x3 covariance or a number")
+    if (deviations < 0).any():
+        raise BadKeyError(f"found {deviations.min():g}; allowed: at least 0, and 0 for exact")
+    return np.diag(deviations**2)
+
+
+def _positive(covariance: Floats) -> Floats:
+    scale = np.abs(covariance).max()
+    if np.abs(covariance - covariance.T).max() > _SYMMETRY * scale:
+        raise BadKeyError(
+            "found a matrix that is not symmetric; allowed: a 3x3 covariance (for one "
+            "[sx, sy, sz] per feature of three features, write three covariances)"
+        )
+    covariance = (covariance + covariance.T) / 2
+    smallest = float(np.linalg.eigvalsh(covariance).min())
+    if smallest < -_SYMMETRY * scale:
+        raise BadKeyError(
+            f"found a matrix with the eigenvalue {smallest:.3g}; allowed: a covariance, none of "
+            "whose eigenvalues is negative"
+        )
+    return covariance
+
+
+def _normals(normals: Floats | None, count: int) -> Floats | None:
+    """Unit normals (N, 3)."""
+    if normals is None:
+        return None
+    if len(normals) != count:
+        raise BadKeyError(
+            f"found {len(normals)} normals for {count} features; allowed: one per feature, points "
+            "first and then segments",
+            "normals",
+        )
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    for i, length in enumerate(lengths):
+        if not length > 0:
+            raise BadKeyError("found a normal of length 0; allowed: any other", "normals", i)
+    return np.asarray(normals / lengths)

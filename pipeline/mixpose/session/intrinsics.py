@@ -1,0 +1,89 @@
+"""Camera matrix and distortion: what is allowed, wherever they were read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from mixpose.rigid import Floats
+from mixpose.session.arrays import numbers
+from mixpose.session.messages import BadKeyError, found
+
+CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
+
+MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+DISTORTION_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """What a calibration says about a camera.
+
+    Attributes
+    ----------
+    camera_matrix : (3, 3) float64
+    distortion : (k,) float64
+        OpenCV's order; empty for none.
+    resolution : (int, int) or None
+        Width and height in px; None where the calibration does not say.
+    model : {"pinhole", "fisheye"} or None
+        The kind of camera; None where the calibration does not say.
+    """
+
+    camera_matrix: Floats
+    distortion: Floats
+    resolution: tuple[int, int] | None = None
+    model: CameraModel | None = None
+
+
+def camera_matrix(value: Any) -> Floats:
+    """Read a camera matrix, three rows or nine numbers, and see that it can be one.
+
+    Raises
+    ------
+    BadKeyError
+    """
+    if isinstance(value, list) and len(value) == 9:
+        K = numbers(value, (9,), f"nine numbers, {MATRIX_FORM} row by row").reshape(3, 3)
+    else:
+        K = numbers(value, (3, 3), MATRIX_FORM)
+    if not np.allclose(K[2], [0, 0, 1], rtol=0, atol=1e-9) or K[1, 0] != 0:
+        turned = np.allclose(K[:, 2], [0, 0, 1], rtol=0, atol=1e-9)
+        hint = "; transpose it" if turned and not np.allclose(K[2, :2], 0) else ""
+        raise BadKeyError(found(K.tolist(), MATRIX_FORM) + hint)
+    for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
+        if not focal > 0:
+            raise BadKeyError(
+                f"found the focal length {axis} = {focal:g}; allowed: greater than 0, in px"
+            )
+    return K
+
+
+def distortion(value: Any, model: str) -> Floats:
+    """Read distortion coefficients, as a list or as a matrix of one row or column.
+
+    Raises
+    ------
+    BadKeyError
+        If a camera of this model cannot have that many.
+    """
+    flat = _flatten(value) if isinstance(value, list) else value
+    if flat is None or flat == []:
+        return np.zeros(0)
+    counts = DISTORTION_COUNTS[model]
+    allowed = f"{' or '.join(map(str, counts))} numbers for model {model}, or none at all"
+    coefficients = numbers(flat, (None,), allowed)
+    if coefficients.size not in counts:
+        raise BadKeyError(f"found {coefficients.size} coefficients; allowed: {allowed}")
+    return coefficients
+
+
+def _flatten(value: list[Any]) -> list[Any]:
+    """Flatten a matrix of one row or one column; leave anything else as it is."""
+    if len(value) == 1 and isinstance(value[0], list):
+        return value[0]
+    if value and all(isinstance(item, list) and len(item) == 1 for item in value):
+        return [item[0] for item in value]
+    return value

@@ -1,0 +1,88 @@
+"""Rigid motions as a session file writes them: a matrix, or a rotation with a translation."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose.rigid import Floats, from_parts, is_rigid, nearest_rigid
+from mixpose.session.messages import BadKeyError, one_of
+from mixpose.session.schema import Placement
+
+# A rotation written with four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4.
+ROUNDING = 2e-4
+# Scaling a quaternion to length 1 leaves its rotation as it is, so three decimals will do.
+_QUATERNION_LENGTH = 2e-3
+
+_ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg")
+
+
+def read_motion(table: Placement, matrix_key: str) -> Floats | None:
+    """Read the one form of a rigid motion that a table holds.
+
+    Parameters
+    ----------
+    table : Placement
+    matrix_key : str
+        Key of the 4x4 form: "T_world_object" or "T_sensor_world".
+
+    Returns
+    -------
+    (4, 4) float64 array, exactly rigid, or None if the table holds no form at all
+
+    Raises
+    ------
+    BadKeyError
+        If there are two forms, half a form, or a matrix that is no rigid motion.
+    """
+    known = [key for key in _ROTATIONS if key in type(table).model_fields]
+    rotations = [key for key in known if getattr(table, key) is not None]
+    matrix = getattr(table, matrix_key)
+    given = [matrix_key] * (matrix is not None) + rotations
+    if len(given) > 1:
+        raise BadKeyError(f"stands beside {given[0]}; allowed: one of the two", given[1])
+    if matrix is not None:
+        if table.translation is not None:
+            raise BadKeyError(f"stands beside {matrix_key}, which holds one too", "translation")
+        return rigid(matrix, matrix_key)
+    if not rotations:
+        if table.translation is not None:
+            raise BadKeyError(
+                f"stands without a rotation; add one of {one_of(known)}", "translation"
+            )
+        return None
+    if table.translation is None:
+        raise BadKeyError("missing; a rotation needs translation = [x, y, z]", "translation")
+    rotation = _rotation(rotations[0], getattr(table, rotations[0]))
+    return from_parts(rotation.as_matrix(), table.translation)
+
+
+def rigid(matrix: Floats, key: str) -> Floats:
+    """Rid a 4x4 matrix of rounding errors, or say why it is no rigid motion."""
+    if is_rigid(matrix, ROUNDING):
+        return nearest_rigid(matrix)
+    R = matrix[:3, :3]
+    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=ROUNDING):
+        reason = "its last row is not [0, 0, 0, 1]"
+        if np.allclose(matrix[:, 3], [0, 0, 0, 1], atol=ROUNDING):
+            reason += " but its last column is: transpose it"
+    elif not np.allclose(R @ R.T, np.eye(3), atol=ROUNDING):
+        error = np.abs(R @ R.T - np.eye(3)).max()
+        reason = f"its rows are not orthonormal, R Rᵀ misses the identity by {error:.2g}"
+    else:
+        reason = "it mirrors, its determinant is -1"
+    raise BadKeyError(
+        f"found no rigid motion: {reason}; allowed: a rotation and a translation", key
+    )
+
+
+def _rotation(key: str, values: Floats) -> Rotation:
+    if key == "rotation_vector":
+        return Rotation.from_rotvec(values)
+    if key == "euler_xyz_deg":
+        # about the fixed axes, x first, as the paper's R3 R2 R1
+        return Rotation.from_euler("xyz", values, degrees=True)
+    length = float(np.linalg.norm(values))
+    if abs(length - 1) > _QUATERNION_LENGTH:
+        raise BadKeyError(f"found a quaternion of length {length:.6g}; allowed: length 1", key)
+    return Rotation.from_quat(values)

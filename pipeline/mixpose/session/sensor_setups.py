@@ -1,0 +1,154 @@
+"""From a ``[[sensor]]`` table to the sensor and its frames' source."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose.extraction.options import ExtractOptions
+from mixpose.rigid import Floats
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.session.calibration import read_calibration
+from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
+from mixpose.session.messages import BadKeyError, under
+from mixpose.session.motion import read_motion
+from mixpose.session.schema import (
+    AnySensorTable,
+    CameraTable,
+    ExtractTable,
+    LaterationTable,
+    ParallelTable,
+    PlacedTable,
+)
+from mixpose.session.setup import SensorSetup
+
+
+def build_sensors(
+    tables: list[AnySensorTable], defaults: ExtractTable, folder: Path
+) -> tuple[SensorSetup, ...]:
+    """Build all sensors of a session.
+
+    Parameters
+    ----------
+    tables : list of sensor tables
+    defaults : ExtractTable
+        ``[extract]``.
+    folder : Path
+        What paths are relative to.
+
+    Raises
+    ------
+    BadKeyError
+    """
+    with under("extract"):
+        merge_extract(defaults, None)
+    setups: list[SensorSetup] = []
+    for i, table in enumerate(tables):
+        with under("sensor", i):
+            twins = [j for j, setup in enumerate(setups) if setup.name == table.name]
+            if twins:
+                raise BadKeyError(
+                    f'found "{table.name}", the name of sensor[{twins[0]}] too; allowed: a name '
+                    "of its own for each sensor",
+                    "name",
+                )
+            setups.append(_build_sensor(table, defaults, folder))
+    return tuple(setups)
+
+
+def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOptions:
+    """Put a sensor's own extraction keys over the defaults of all sensors.
+
+    Raises
+    ------
+    BadKeyError
+        If the largest area is not above the smallest.
+    """
+    given = _keys_given(defaults) | ({} if own is None else _keys_given(own))
+    options = ExtractOptions(**given)
+    if options.max_area is not None and options.max_area <= options.min_area:
+        raise BadKeyError(
+            f"found {options.max_area:g}; allowed: more than min_area, which is "
+            f"{options.min_area:g}",
+            "max_area",
+        )
+    return options
+
+
+def _keys_given(table: ExtractTable) -> dict[str, Any]:
+    return {key: getattr(table, key) for key in table.model_fields_set}
+
+
+def _build_sensor(table: AnySensorTable, defaults: ExtractTable, folder: Path) -> SensorSetup:
+    if table.times is not None and table.fps is not None:
+        raise BadKeyError("stands beside times; allowed: one of the two", "fps")
+    resolution: tuple[int, int] | None = None
+    sensor: Sensor
+    match table:
+        case CameraTable():
+            sensor = _camera(table, folder)
+            resolution = sensor.resolution
+        case ParallelTable():
+            resolution = table.resolution
+            sensor = ParallelBeam(
+                table.pixel_size, table.principal_point, resolution, _T_sensor_world(table)
+            )
+        case LaterationTable():
+            _check_profile(table)
+            # the far end of a profile is known only when its bins are counted
+            sensor = RangeSensor(table.position, table.range_bias)
+    with under("extract"):
+        extract = merge_extract(defaults, table.extract)
+    return SensorSetup(
+        name=table.name,
+        model=table.model,
+        sensor=sensor,
+        source=table.source,
+        times=None if table.times is None else folder / table.times,
+        fps=table.fps,
+        extract=extract,
+        range_min=getattr(table, "range_min", None),
+        bin_size=getattr(table, "bin_size", None),
+        resolution=resolution,
+    )
+
+
+def _camera(table: CameraTable, folder: Path) -> PinholeCamera | FisheyeCamera:
+    intrinsics = _intrinsics(table, folder)
+    resolution = table.resolution or intrinsics.resolution
+    if resolution and intrinsics.resolution and resolution != intrinsics.resolution:
+        raise BadKeyError(
+            f"found {list(resolution)}, but the calibration says "
+            f"{list(intrinsics.resolution)}; allowed: the same, or leave it out",
+            "resolution",
+        )
+    kind = PinholeCamera if table.model == "pinhole" else FisheyeCamera
+    return kind(intrinsics.camera_matrix, intrinsics.distortion, resolution, _T_sensor_world(table))
+
+
+def _intrinsics(table: CameraTable, folder: Path) -> Intrinsics:
+    if table.calibration is not None:
+        for key in ("camera_matrix", "distortion"):
+            if getattr(table, key) is not None:
+                raise BadKeyError("stands beside calibration; allowed: one of the two", key)
+        with under("calibration"):
+            return read_calibration(table.calibration, folder, table.model)
+    if table.camera_matrix is None:
+        raise BadKeyError(f"missing; allowed: {MATRIX_FORM}, or calibration", "camera_matrix")
+    with under("camera_matrix"):
+        K = camera_matrix(table.camera_matrix.tolist())
+    with under("distortion"):
+        return Intrinsics(K, distortion(table.distortion, table.model))
+
+
+def _T_sensor_world(table: PlacedTable) -> Floats:
+    T = read_motion(table, "T_sensor_world")
+    return np.eye(4) if T is None else T
+
+
+def _check_profile(table: LaterationTable) -> None:
+    if (table.range_min is None) != (table.bin_size is None):
+        missing = "range_min" if table.range_min is None else "bin_size"
+        raise BadKeyError("missing; a profile needs range_min and bin_size", missing)

@@ -1,0 +1,111 @@
+"""What a session file says, checked and frozen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+from mixpose.body import Body
+from mixpose.estimation.options import EstimatorOptions
+from mixpose.extraction.options import ExtractOptions
+from mixpose.rigid import Floats
+from mixpose.sensors import Sensor
+
+Unit: TypeAlias = Literal["m", "cm", "mm", "um"]
+
+METRES_PER_UNIT: dict[Unit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the object is at first, ``[start]``.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    rotation_deg : float or None
+        Half-width of the search around it in degrees; None where the file gives none.
+    distance : float or None
+        Half-width in length units; None where the file gives none.
+    """
+
+    T_world_object: Floats
+    rotation_deg: float | None = None
+    distance: float | None = None
+
+
+@dataclass(frozen=True)
+class SensorSetup:
+    """One ``[[sensor]]``: its geometry and where its frames come from.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the session.
+    model : {"pinhole", "fisheye", "parallel", "lateration"}
+    sensor : Sensor
+        The calibrated geometry.
+    source : str or tuple of str
+        As written in the file: relative to `Session.folder`.  A tuple where the file has a list;
+        the empty tuple where it names no source, as for a system that is only planned.
+    times : Path or None
+        Table of frame times, relative paths resolved.
+    fps : float or None
+        Frames per second.
+    extract : ExtractOptions
+        ``[extract]`` with what ``[sensor.extract]`` overrides.
+    range_min, bin_size : float or None
+        Range of a profile's first bin and from bin to bin, in length units; both or neither.
+    resolution : (int, int) or None
+        Width and height of a camera's images in px.
+    """
+
+    name: str
+    model: str
+    sensor: Sensor
+    source: str | tuple[str, ...]
+    times: Path | None
+    fps: float | None
+    extract: ExtractOptions
+    range_min: float | None = None
+    bin_size: float | None = None
+    resolution: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Session:
+    """A whole set-up, as read from one session file.
+
+    Attributes
+    ----------
+    path : Path
+        The session file, as it was named.
+    sha256 : str
+        Of the file's bytes, in hexadecimal.
+    unit : {"m", "cm", "mm", "um"}
+        Of every length; nothing is converted on reading.
+    body : Body
+    start : Start or None
+    estimator : EstimatorOptions
+    sensors : tuple of SensorSetup
+        In the order of the file, at least one.
+    """
+
+    path: Path
+    sha256: str
+    unit: Unit
+    body: Body
+    start: Start | None
+    estimator: EstimatorOptions
+    sensors: tuple[SensorSetup, ...]
+
+    @property
+    def folder(self) -> Path:
+        """The folder that paths in the file are relative to."""
+        return self.path.parent
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Length of the session's unit in metres."""
+        return METRES_PER_UNIT[self.unit]

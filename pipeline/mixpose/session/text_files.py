@@ -1,0 +1,40 @@
+"""Reading the text files that a session consists of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mixpose.session.messages import BadKeyError
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file.
+
+    Raises
+    ------
+    BadKeyError
+        If there is no such file or it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise BadKeyError(f"no such file: {path}") from error
+    except OSError as error:
+        raise BadKeyError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:  # a zero byte in the name
+        raise BadKeyError(f"not a file name: {str(path)!r}") from error
+
+
+def as_text(content: bytes) -> str:
+    """Decode UTF-8, with or without the mark that some editors put in front.
+
+    Raises
+    ------
+    BadKeyError
+        Naming the line that is not UTF-8.
+    """
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise BadKeyError(f"not UTF-8 text at line {line}; save the file as UTF-8") from error

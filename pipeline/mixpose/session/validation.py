@@ -1,0 +1,152 @@
+"""Pydantic's findings about a session file, as one problem with one key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails
+
+from mixpose.session.messages import BadKeyError, Key, did_you_mean, found, nearest, one_of
+
+_TAG = "model"  # the key that tells the kinds of sensor apart
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an error sits: its key without pydantic's own steps, its table and its field."""
+
+    key: Key
+    table: type[BaseModel]
+    field: FieldInfo | None
+
+
+def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
+    """Check parsed TOML against the table of the whole file.
+
+    Raises
+    ------
+    BadKeyError
+        The first finding, an unknown key before any other: a misspelt key often is the reason
+        why another is missing.
+    """
+    try:
+        return root.model_validate(data)
+    except ValidationError as error:
+        findings = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    problem = _problem(root, findings[0])
+    if len(findings) > 1:
+        problem = BadKeyError(f"{problem.text} (and {len(findings) - 1} more)", *problem.key)
+    raise problem
+
+
+def _problem(root: type[BaseModel], finding: ErrorDetails) -> BadKeyError:
+    place = _locate(root, finding["loc"])
+    kind, value = finding["type"], finding["input"]
+    allowed = _allowed(place.field)
+    if kind == "extra_forbidden":
+        return BadKeyError(_unknown_key(root, place), *place.key)
+    if kind.startswith("union_tag"):
+        return _tag_problem(place, value)
+    if kind == "missing":
+        return BadKeyError(f"missing; allowed: {allowed}", *place.key)
+    if kind == "value_error":
+        reason = finding["ctx"]["error"]
+        if isinstance(reason, BadKeyError):
+            return BadKeyError(reason.text, *place.key, *reason.key)
+    hint = did_you_mean(value, _literals(place.field)) if kind == "literal_error" else ""
+    return BadKeyError(found(value, allowed or finding["msg"]) + hint, *place.key)
+
+
+def _locate(root: type[BaseModel], loc: tuple[str | int, ...]) -> _Place:
+    """Follow an error's location through the tables, dropping the tags of unions."""
+    key: list[str | int] = []
+    table, field = root, None
+    choices: list[type[BaseModel]] = [root]
+    for step in loc:
+        if isinstance(step, int):
+            key.append(step)
+        elif len(choices) > 1:
+            table = next(t for t in choices if step in _literals(t.model_fields[_TAG]))
+            choices, field = [table], None
+        else:
+            table = choices[0] if choices else table
+            key.append(step)
+            field = table.model_fields.get(step)
+            choices = list(_tables(field.annotation)) if field else []
+    if field is None and len(choices) > 1:
+        table = choices[0]
+    return _Place(tuple(key), table, field)
+
+
+def _tables(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The tables that an annotation names, at any depth."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _tables(part)
+
+
+def _literals(field: FieldInfo | None) -> list[str]:
+    """The words that a field's annotation lists."""
+
+    def words(annotation: Any) -> Iterator[str]:
+        for part in get_args(annotation):
+            if isinstance(part, str):
+                yield part
+            else:
+                yield from words(part)
+
+    return list(words(field.annotation)) if field else []
+
+
+def _allowed(field: FieldInfo | None) -> str:
+    if field is None:
+        return ""
+    carried = (getattr(mark, "description", None) for mark in field.metadata)
+    return field.description or next((text for text in carried if text), "")
+
+
+def _tag_problem(place: _Place, value: Any) -> BadKeyError:
+    """A sensor whose model is unknown or missing: nothing else in it could be checked."""
+    models: list[str] = []
+    keys: set[str] = set()
+    for table in _tables(place.field.annotation if place.field else None):
+        models += _literals(table.model_fields[_TAG])
+        keys |= set(table.model_fields)
+    if _TAG in value:
+        text = found(value[_TAG], one_of(models)) + did_you_mean(value[_TAG], models)
+        return BadKeyError(text, *place.key, _TAG)
+    for key in value:
+        if key not in keys and nearest(key, keys) == _TAG:
+            return BadKeyError(f'unknown key; did you mean "{_TAG}"?', *place.key, key)
+    return BadKeyError(f"missing; allowed: {one_of(models)}", *place.key, _TAG)
+
+
+def _unknown_key(root: type[BaseModel], place: _Place) -> str:
+    """Suggest the nearest key of the same table, else say where the key is at home."""
+    key, known = str(place.key[-1]), list(place.table.model_fields)
+    homes = dict.fromkeys(path for path, table in _all_tables(root) if key in table.model_fields)
+    # a key that is right elsewhere is more likely misplaced than misspelt
+    close = nearest(key, known, cutoff=0.8) if homes else nearest(key, known)
+    if close:
+        return f'unknown key; did you mean "{close}"?'
+    home = f"; it is a key of {' and '.join(homes)}" if homes else ""
+    return f"unknown key{home}; allowed here: {', '.join(known)}"
+
+
+def _all_tables(
+    table: type[BaseModel], path: str = "the top of the file"
+) -> Iterator[tuple[str, type[BaseModel]]]:
+    yield path, table
+    for key, field in table.model_fields.items():
+        inside = list(_tables(field.annotation))
+        for inner in inside:
+            if len(inside) > 1:
+                name = f"[[{key}]] of model {' or '.join(_literals(inner.model_fields[_TAG]))}"
+            else:
+                name = f"[{key}]"
+            yield from _all_tables(inner, name)

@@ -1,0 +1,149 @@
+"""Where a body is simulated if the session names no start: in view of its sensors.
+
+With several cameras that is where they look together; with one camera, in front of it where the
+body fills about a quarter of the image; among range sensors, beside their middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body
+from mixpose.errors import SessionError
+from mixpose.rigid import Floats, from_parts
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
+from mixpose.session import SensorSetup, Session
+from mixpose.simulation.draws import Purpose, generator
+from mixpose.simulation.sighting import facing
+
+_SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
+_SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob
+_ORIENTATIONS = 64
+
+
+def central_pose(session: Session, seed: int) -> Floats:
+    """T_world_object (4, 4) that a simulated motion swings about.
+
+    That is ``[start]`` where the session has one.  Else the place follows from the sensors, and
+    the orientation is drawn by chance: the one of several that shows most features.
+
+    Raises
+    ------
+    SessionError
+        If no sensor sees any feature of the body there.
+    """
+    if session.start is not None:
+        T = session.start.T_world_object
+        if count_seen(session, T) == 0:
+            raise SessionError(
+                f"{session.path}: start: no sensor sees a feature of the object there; place the "
+                "object in view of the sensors"
+            )
+        return T
+    pivot = pivot_of(session.body)
+    rng = generator(seed, Purpose.ORIENTATION)
+    rotations = Rotation.random(_ORIENTATIONS, rng=rng).as_matrix()
+    poses = [from_parts(R, place - R @ pivot) for place in _places(session) for R in rotations]
+    counts = [count_seen(session, T) for T in poses]
+    best = int(np.argmax(counts))
+    if counts[best] == 0:
+        raise SessionError(
+            f"{session.path}: start: missing, and no place was found where a sensor sees the "
+            "object; add [start] with T_world_object"
+        )
+    return poses[best]
+
+
+def pivot_of(body: Body) -> Floats:
+    """The point that a simulated body turns about: the middle of its features (3,)."""
+    return np.asarray(body.means.mean(axis=0))
+
+
+def count_seen(session: Session, T_world_object: Floats) -> int:
+    """How many features are in view, summed over the sensors."""
+    body = session.body
+    points = body.means @ T_world_object[:3, :3].T + T_world_object[:3, 3]
+    seen = 0
+    for setup in session.sensors:
+        visible = setup.sensor.project(points)[1] & facing(setup.sensor, body, T_world_object)
+        seen += int(visible.sum())
+    return seen
+
+
+def _places(session: Session) -> list[Floats]:
+    """Candidates for the pivot's place in the world, the most natural one first."""
+    radius = session.body.radius
+    all_rays = [_ray(setup, radius) for setup in session.sensors]
+    rays = [ray for ray in all_rays if ray is not None]
+    if not rays:
+        return [_beside_ranges(session)]
+    origin = np.mean([ray.origin for ray in rays], axis=0)
+    direction = np.mean([ray.direction for ray in rays], axis=0)
+    ahead = origin + direction * float(np.mean([ray.distance or 0.0 for ray in rays]))
+    meeting = _meeting_point(rays)
+    if meeting is not None and all(ray.suits(meeting) for ray in rays):
+        return [meeting, ahead]
+    return [ahead]
+
+
+@dataclass(frozen=True)
+class _Ray:
+    """The line of sight through the middle of a camera's image.
+
+    `distance` is where the body fills its share of the image; None for a parallel beam, where it
+    does so everywhere or nowhere.
+    """
+
+    origin: Floats
+    direction: Floats
+    distance: float | None
+
+    def suits(self, place: Floats) -> bool:
+        """Whether the body is in front there, and neither too near nor too small."""
+        if self.distance is None:
+            return True
+        depth = float((place - self.origin) @ self.direction)
+        farthest = _SIDE_FILLED / _SIDE_VISIBLE * self.distance
+        return 0.5 * self.distance <= depth <= farthest
+
+
+def _ray(setup: SensorSetup, radius: float) -> _Ray | None:
+    sensor = setup.sensor
+    size = np.asarray(setup.resolution, dtype=np.float64)
+    middle = (size - 1) / 2
+    if isinstance(sensor, ParallelBeam):
+        R, t = sensor.T_sensor_world[:3, :3], sensor.T_sensor_world[:3, 3]
+        offset = np.append((middle - sensor.principal_point) * sensor.pixel_size, 0.0)
+        return _Ray(R.T @ (offset - t), R[2], None)
+    if isinstance(sensor, PinholeCamera | FisheyeCamera):
+        R, t = sensor.T_sensor_world[:3, :3], sensor.T_sensor_world[:3, 3]
+        K = sensor.camera_matrix
+        sight = np.append((middle - K[:2, 2]) / K.diagonal()[:2], 1.0)
+        distance = 2 * radius * K[0, 0] / (_SIDE_FILLED * size.min())
+        return _Ray(-R.T @ t, R.T @ sight / np.linalg.norm(sight), float(distance))
+    return None
+
+
+def _meeting_point(rays: list[_Ray]) -> Floats | None:
+    """The point (3,) nearest to all rays; None where they are about parallel."""
+    across = [np.eye(3) - np.outer(ray.direction, ray.direction) for ray in rays]
+    total = np.sum(across, axis=0)
+    if np.linalg.eigvalsh(total)[0] < 1e-3 * len(rays):
+        return None
+    return np.asarray(np.linalg.solve(total, sum(A @ r.origin for A, r in zip(across, rays))))
+
+
+def _beside_ranges(session: Session) -> Floats:
+    """Beside the plane of the range sensors: within it, ranges would not tell one side."""
+    positions = np.array(
+        [s.sensor.position for s in session.sensors if isinstance(s.sensor, RangeSensor)]
+    )
+    nearest = max((s.range_min or 0.0 for s in session.sensors), default=0.0)
+    centred = positions - positions.mean(axis=0)
+    spread = float(np.sqrt((centred**2).sum(axis=1).mean()))
+    aside = max(spread / 2, nearest + 5 * session.body.radius)
+    _, _, axes = np.linalg.svd(centred, full_matrices=True)
+    return np.asarray(positions.mean(axis=0) + aside * axes[2])

@@ -1,0 +1,213 @@
+"""What a recording needs to know of each sensor: its view of the body and its writer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import ceil
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.errors import SessionError
+from mixpose.records import Floats
+from mixpose.session import SensorSetup, Session
+from mixpose.simulation.draws import Purpose, generator
+from mixpose.simulation.motion import Motion
+from mixpose.simulation.naming import SourceFiles
+from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.render import ImageFormat, ProfileFormat
+from mixpose.simulation.sighting import View, brightness_levels
+from mixpose.simulation.writers import (
+    DetectionWriter,
+    ImageWriter,
+    ProfileWriter,
+    SensorWriter,
+    VideoWriter,
+)
+
+_LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
+_TABLE_SPACING_PX = 2.0
+_SPOT_SIGMA_PX = 1.6
+_PEAK_BINS = 1.5  # standard deviation of a peak, where nothing says it
+_PEAK_REACH = 5.0  # standard deviations of a peak that still fit into a profile
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One sensor of a recording.
+
+    Attributes
+    ----------
+    files : SourceFiles
+    view : View
+    options : SimulationOptions
+        As they hold for this sensor.
+    open : callable
+        Takes the recording's folder and starts to write there.
+    """
+
+    files: SourceFiles
+    view: View
+    options: SimulationOptions
+    open: Callable[[Path], SensorWriter]
+
+
+def check_setup(session: Session) -> None:
+    """See that every sensor states what drawing needs.
+
+    Raises
+    ------
+    SessionError
+        If a camera has no resolution, or looks for something else than spots.
+    """
+    for setup in session.sensors:
+        where = f"{session.path}: sensor {setup.name!r}"
+        if setup.extract.method == "corners":
+            raise SessionError(
+                f'{where}: extract.method: found "corners"; simulate draws spots, which "blobs" '
+                'and "intensity" find'
+            )
+        if setup.sensor.dimension == 2 and setup.resolution is None:
+            raise SessionError(
+                f"{where}: resolution: missing; simulate needs [width, height] in px"
+            )
+
+
+def plan_channel(
+    setup: SensorSetup,
+    files: SourceFiles,
+    body: Body,
+    motion: Motion,
+    options: SimulationOptions,
+    *,
+    fps: float,
+    index: int,
+) -> Channel:
+    """Prepare one sensor.
+
+    Parameters
+    ----------
+    setup : SensorSetup
+        Of a session that `check_setup` has passed.
+    files : SourceFiles
+    body : Body
+    motion : Motion
+    options : SimulationOptions
+    fps : float
+        Frames per second.
+    index : int
+        The sensor's place in the session, which keys its random numbers.
+
+    Raises
+    ------
+    SessionError
+        If the sensor cannot be simulated.
+    """
+    if setup.sensor.dimension == 1:
+        return _range_channel(setup, files, body, motion, options, index)
+    assert setup.resolution is not None, "check_setup refuses this"
+    return _camera_channel(setup, files, len(body), options, setup.resolution, fps, index)
+
+
+def _camera_channel(
+    setup: SensorSetup,
+    files: SourceFiles,
+    count: int,
+    options: SimulationOptions,
+    resolution: tuple[int, int],
+    fps: float,
+    index: int,
+) -> Channel:
+    sensor = setup.sensor
+    if files.kind == "detections":
+        view = View(sensor, sensor.lower, sensor.upper, np.ones(count), _TABLE_SPACING_PX)
+        noise, coordinates = options.pixel_noise, ("u", "v")
+        return Channel(
+            files,
+            view,
+            replace(options, brightness_spread=0.0),
+            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
+        )
+    spot_sigma = options.spot_sigma or setup.extract.spot_sigma or _SPOT_SIGMA_PX
+    spacing = _LINE_SPACING * spot_sigma
+    view = View(
+        sensor,
+        sensor.lower,
+        sensor.upper,
+        _levels(count, options, index),
+        spacing,
+        _ridge(spot_sigma, spacing),
+    )
+
+    form = ImageFormat(resolution, spot_sigma, setup.extract.polarity)
+
+    def start(folder: Path) -> SensorWriter:
+        if files.kind == "images":
+            return ImageWriter(files, folder, options, form)
+        return VideoWriter(files, folder, options, form, fps)
+
+    return Channel(files, view, options, start)
+
+
+def _range_channel(
+    setup: SensorSetup,
+    files: SourceFiles,
+    body: Body,
+    motion: Motion,
+    options: SimulationOptions,
+    index: int,
+) -> Channel:
+    nearest, farthest = _ranges(setup, body, motion, options)
+    range_min, bin_size = setup.range_min, setup.bin_size
+    if files.kind == "detections" or range_min is None or bin_size is None:
+        noise = setup.extract.sigma if options.range_noise is None else options.range_noise
+        # lines become detections about as far apart as these are exact
+        view = View(setup.sensor, nearest, farthest, np.ones(len(body)), setup.extract.sigma)
+        return Channel(
+            files,
+            view,
+            replace(options, brightness_spread=0.0),
+            lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=("range",)),
+        )
+    width = options.range_width or setup.extract.spot_sigma or _PEAK_BINS * bin_size
+    bins = ceil((farthest[0] + _PEAK_REACH * width - range_min) / bin_size) + 1
+    if farthest[0] < range_min:
+        raise SessionError(
+            f"sensor {setup.name!r}: range_min: found {range_min:g}; the object is at "
+            f"ranges from {nearest[0]:g} to {farthest[0]:g}"
+        )
+    spacing = _LINE_SPACING * width
+    view = View(
+        setup.sensor,
+        np.maximum(nearest, range_min),
+        farthest,
+        _levels(len(body), options, index),
+        spacing,
+        _ridge(width, spacing),
+    )
+    form = ProfileFormat(bins, range_min, bin_size, width)
+    return Channel(files, view, options, lambda folder: ProfileWriter(files, folder, options, form))
+
+
+def _ranges(
+    setup: SensorSetup, body: Body, motion: Motion, options: SimulationOptions
+) -> tuple[Floats, Floats]:
+    """Bounds (1,), (1,) of the ranges that the moving body can have."""
+    pivot_world = motion.T_world_object[:3, :3] @ motion.pivot + motion.T_world_object[:3, 3]
+    middle, _ = setup.sensor.project(pivot_world)
+    reach = motion.reach + np.linalg.norm(body.nodes.points - motion.pivot, axis=1).max()
+    reach += 4 * body.spread if options.deform else 0.0
+    return np.maximum(middle - reach, 0.0), middle + reach
+
+
+def _levels(count: int, options: SimulationOptions, index: int) -> Floats:
+    """Brightness of the features, the same throughout a recording."""
+    rng = generator(options.seed, Purpose.BRIGHTNESS, index)
+    return brightness_levels(count, options.brightness_spread, rng)
+
+
+def _ridge(sigma: float, spacing: float) -> float:
+    """Brightness of spots this far apart that together are as bright as one spot alone."""
+    return float(spacing / (np.sqrt(2 * np.pi) * sigma))

@@ -1,0 +1,121 @@
+"""How a simulated body moves: smoothly, never the same way twice, and known exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mixpose.rigid import TWIST_NAMES, Floats, from_parts, rotation_matrix
+from mixpose.simulation.draws import Purpose, generator
+
+# A slow swing and a faster, smaller one on top of it, per axis.
+_SHARES = np.array([0.7, 0.3])
+_FREQUENCIES = np.array([[0.6, 1.1], [1.5, 2.3]])  # from, to; in swings per period
+# Every axis begins a little off the centre: near a session's [start], not on it.
+_FIRST = 0.07
+
+
+@dataclass(frozen=True)
+class Swing:
+    """Sums of sinusoids, one sum per world axis.
+
+    Attributes
+    ----------
+    amplitudes, frequencies_hz, phases : (K, 3) float64
+        Of K sinusoids per axis; phases in radians.
+    """
+
+    amplitudes: Floats
+    frequencies_hz: Floats
+    phases: Floats
+
+    def at(self, times_s: Floats) -> Floats:
+        """Values (..., 3) at times (...)."""
+        angles = 2 * np.pi * self.frequencies_hz * np.asarray(times_s)[..., None, None]
+        return np.asarray((self.amplitudes * np.sin(angles + self.phases)).sum(axis=-2))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A body that swings and turns about a central pose.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+        The central pose.
+    pivot : (3,) float64
+        The point of the object, in its own frame, about which it turns.
+    shift : Swing
+        Displacement of the pivot, length units.
+    turn : Swing
+        Rotation vector in world axes, radians.
+    """
+
+    T_world_object: Floats
+    pivot: Floats
+    shift: Swing
+    turn: Swing
+
+    def poses(self, times_s: Floats) -> Floats:
+        """The poses T_world_object (..., 4, 4) at times (...) in seconds."""
+        R_centre, t_centre = self.T_world_object[:3, :3], self.T_world_object[:3, 3]
+        R = rotation_matrix(self.turn.at(times_s)) @ R_centre
+        pivot_world = R_centre @ self.pivot + t_centre + self.shift.at(times_s)
+        return from_parts(R, pivot_world - R @ self.pivot)
+
+    @property
+    def reach(self) -> float:
+        """Farthest that the pivot gets from its central place."""
+        return float(np.linalg.norm(self.shift.amplitudes.sum(axis=0)))
+
+
+def plan_motion(
+    T_world_object: Floats,
+    pivot: Floats,
+    *,
+    translation: float,
+    rotation_deg: float,
+    period_s: float,
+    free: tuple[str, ...] = TWIST_NAMES,
+    seed: int = 0,
+) -> Motion:
+    """Choose a motion about a central pose.
+
+    Parameters
+    ----------
+    T_world_object : (4, 4) array
+        The central pose.
+    pivot : (3,) array
+        Where the object turns about, in its frame.  With fewer than six directions free it turns
+        about its origin instead, as a turn about any other point would move the origin.
+    translation, rotation_deg : float
+        Largest displacement and turn per world axis.
+    period_s : float
+        About the time of one slow swing.
+    free : tuple of str
+        World-frame directions that change, names of `mixpose.rigid.TWIST_NAMES`.
+    seed : int
+    """
+    rng = generator(seed, Purpose.MOTION)
+    is_free = np.array([name in free for name in TWIST_NAMES], dtype=np.float64)
+    if not is_free.all():
+        pivot = np.zeros(3)
+    return Motion(
+        T_world_object=np.asarray(T_world_object, dtype=np.float64),
+        pivot=np.asarray(pivot, dtype=np.float64),
+        shift=_swing(translation * is_free[:3], period_s, rng),
+        turn=_swing(np.radians(rotation_deg) * is_free[3:], period_s, rng),
+    )
+
+
+def _swing(amplitudes: Floats, period_s: float, rng: np.random.Generator) -> Swing:
+    low, high = _FREQUENCIES[:, :1], _FREQUENCIES[:, 1:]
+    first = np.arcsin(_FIRST) * rng.choice([-1.0, 1.0], 3)
+    # rising or falling at first, each sinusoid for itself
+    falling = rng.random((len(_SHARES), 3)) < 0.5
+    return Swing(
+        amplitudes=_SHARES[:, None] * amplitudes,
+        frequencies_hz=(low + (high - low) * rng.random((len(_SHARES), 3))) / period_s,
+        phases=np.where(falling, np.pi - first, first),
+    )

@@ -1,0 +1,317 @@
+"""Which files a simulated recording consists of, so that the session file reads them as it stands.
+
+A glob becomes images with the frame number in place of its last ``*``, a folder is filled with
+numbered images, a list gives its own names, and a video or a table is one file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePosixPath
+from typing import Literal, TypeAlias
+
+from mixpose.errors import SessionError
+from mixpose.frames.images import IMAGE_SUFFIXES, frame_numbers
+from mixpose.session import SensorSetup
+
+Kind: TypeAlias = Literal["images", "video", "profiles", "detections"]
+
+VIDEO_SUFFIXES = (".avi", ".mp4")
+IMAGES_WRITTEN = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+_OTHER_VIDEOS = (".mkv", ".mov", ".m4v", ".webm", ".wmv", ".mpg", ".mpeg", ".h264", ".flv", ".ts")
+_WILD = re.compile(r"\*\*/|\*|\?|\[!?[^\]]+\]")
+_FEWEST_DIGITS = 4
+
+
+@dataclass(frozen=True)
+class SourceFiles:
+    """The files of one sensor, relative to the recording's folder.
+
+    Attributes
+    ----------
+    sensor : str
+        Name of the sensor.
+    kind : {"images", "video", "profiles", "detections"}
+    path : str
+        The one file of a video or table; for images what comes before the frame number.
+    ending : str
+        For images: what comes after the frame number.
+    digits : int
+        For images: how many digits the frame number has at least.
+    listed : dict of int to str
+        For images of a list: the name of each frame.
+    pattern : str
+        The glob that the session reads the images by; empty for all other sources.
+    """
+
+    sensor: str
+    kind: Kind
+    path: str
+    ending: str = ""
+    digits: int = 0
+    listed: dict[int, str] = field(default_factory=dict)
+    pattern: str = ""
+
+    def name(self, number: int) -> str:
+        """The file that holds a frame."""
+        if self.kind != "images":
+            return self.path
+        return self.listed.get(number) or f"{self.path}{number:0{self.digits}d}{self.ending}"
+
+    @property
+    def may_lack_frames(self) -> bool:
+        """Whether a frame may be left out: each of the others says its own number."""
+        if self.kind == "images":
+            return not self.listed and self.ending == PurePosixPath(f"0{self.ending}").suffix
+        return self.kind == "detections"
+
+    @property
+    def counts_from_zero(self) -> bool:
+        """Whether frames are numbered by their place."""
+        return not self.may_lack_frames and not self.listed
+
+    def existing(self, folder: Path) -> Iterator[Path]:
+        """Files that lie in a folder and that the session would read as this source."""
+        if self.pattern:
+            yield from (path for path in folder.glob(self.pattern) if path.is_file())
+        elif self.kind == "images" and not self.listed:
+            found = (folder / self.path).glob("*")
+            yield from (path for path in found if path.suffix.casefold() in IMAGE_SUFFIXES)
+        else:
+            names = self.listed.values() if self.listed else [self.path]
+            yield from (path for path in (folder / name for name in names) if path.is_file())
+
+    def reads(self, name: str) -> bool:
+        """Whether the session would take a file for one of this source."""
+        if self.pattern:
+            return _matches(self.pattern, name)
+        if self.kind == "images" and not self.listed:
+            return str(PurePosixPath(name).parent) == str(PurePosixPath(self.path))
+        return name in (self.listed.values() if self.listed else [self.path])
+
+
+Sources: TypeAlias = Sequence[tuple[SensorSetup, str | tuple[str, ...]]]
+
+
+def plan_files(sources: Sources, frames: int) -> tuple[Sequence[int], tuple[SourceFiles, ...]]:
+    """Choose the files of a recording.
+
+    Parameters
+    ----------
+    sources : sequence of (SensorSetup, str or tuple of str)
+        The sensors with their sources, these inside the recording's folder.
+    frames : int
+        How many frames there are to be.
+
+    Returns
+    -------
+    numbers : sequence of int
+        Frame numbers, ascending: those that lists of images say, else from 0.
+    files : tuple of SourceFiles
+
+    Raises
+    ------
+    SessionError
+        If no files that can be written would be read by these sources.
+    """
+    single = [(setup, _unlisted(source)) for setup, source in sources]
+    numbers = _frame_numbers(single, frames)
+    files = tuple(_source_files(setup, source, numbers) for setup, source in single)
+    for one in files:
+        if one.counts_from_zero and numbers[-1] != frames - 1:
+            raise SessionError(
+                f"{_where(one.sensor)}: counts frames from 0, while a list of images of another "
+                f"sensor has the numbers {numbers[0]} to {numbers[-1]}; use numbered images"
+            )
+    _check_apart(files, numbers[0])
+    return numbers, files
+
+
+def _where(sensor: str) -> str:
+    return f"sensor {sensor!r}: source"
+
+
+def _unlisted(source: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    return source[0] if isinstance(source, tuple) and len(source) == 1 else source
+
+
+def _frame_numbers(sources: Sources, frames: int) -> Sequence[int]:
+    numbers: Sequence[int] = range(frames)
+    found_in = ""
+    for setup, source in sources:
+        names = _image_names(source)
+        if not names or setup.sensor.dimension != 2:
+            continue
+        if len(names) != frames:
+            raise SessionError(
+                f"{_where(setup.name)}: names {len(names)} image{'s' * (len(names) != 1)}; "
+                f'allowed: one per frame ({frames}), or a glob like "{setup.name}*.png"'
+            )
+        own = sorted(frame_numbers([Path(name) for name in names]))
+        if found_in and own != numbers:
+            raise SessionError(
+                f"{_where(setup.name)}: has other frame numbers than that of {found_in!r}; name "
+                "the images of one moment by the same number"
+            )
+        numbers, found_in = own, setup.name
+    return numbers
+
+
+def _image_names(source: str | tuple[str, ...]) -> tuple[str, ...]:
+    """Names of images that the session states one by one."""
+    if isinstance(source, tuple):
+        return source
+    is_image = PurePosixPath(source).suffix.casefold() in IMAGE_SUFFIXES
+    return (source,) if is_image and not _WILD.search(source) else ()
+
+
+def _source_files(
+    setup: SensorSetup, source: str | tuple[str, ...], numbers: Sequence[int]
+) -> SourceFiles:
+    if not source:
+        raise SessionError(
+            f'{_where(setup.name)}: missing; name what is to be written, like "{setup.name}*.png"'
+        )
+    if setup.sensor.dimension == 1:
+        return _range_files(setup, source)
+    files = _camera_files(setup.name, source, numbers)
+    if files.path.casefold().endswith(".mp4") and any(n % 2 for n in setup.resolution or ()):
+        raise SessionError(
+            f"{_where(setup.name)}: found {source!r} for images of {setup.resolution} px; .mp4 "
+            "needs an even width and height, .avi and images do not"
+        )
+    return files
+
+
+def _check_apart(sources: Sequence[SourceFiles], number: int) -> None:
+    for one in sources:
+        for other in sources:
+            if one is not other and other.reads(one.name(number)):
+                raise SessionError(
+                    f"{_where(other.sensor)}: would also read "
+                    f"{one.name(number)} of sensor {one.sensor!r}; give each sensor files of its "
+                    "own"
+                )
+
+
+def _range_files(setup: SensorSetup, source: str | tuple[str, ...]) -> SourceFiles:
+    path = _filled(source) if isinstance(source, str) else ""
+    suffix = PurePosixPath(path).suffix.casefold()
+    if suffix == ".npy" and setup.bin_size is None:
+        raise SessionError(
+            f"sensor {setup.name!r}: bin_size: missing; profiles ({path}) need "
+            "range_min and bin_size"
+        )
+    if suffix == ".npy" or (suffix == ".csv" and setup.bin_size is not None):
+        return SourceFiles(setup.name, "profiles", path)
+    if suffix == ".csv":
+        return SourceFiles(setup.name, "detections", path)
+    raise SessionError(
+        f"{_where(setup.name)}: found {source!r}; allowed for ranges: a .csv table, or profiles "
+        "as .npy or .csv"
+    )
+
+
+def _camera_files(
+    sensor: str, source: str | tuple[str, ...], numbers: Sequence[int]
+) -> SourceFiles:
+    names = _image_names(source)
+    if names:
+        if len(set(names)) != len(names):
+            raise SessionError(f"{_where(sensor)}: names an image twice; allowed: one per frame")
+        for name in names:
+            _check_format(name, sensor)
+        own = frame_numbers([Path(name) for name in names])
+        return SourceFiles(sensor, "images", "", listed=dict(sorted(zip(own, names))))
+    assert isinstance(source, str)
+    suffix = PurePosixPath(source).suffix.casefold()
+    if suffix == ".csv":
+        return SourceFiles(sensor, "detections", _filled(source))
+    if suffix in VIDEO_SUFFIXES:
+        return SourceFiles(sensor, "video", _filled(source))
+    if suffix in _OTHER_VIDEOS or suffix == ".npy" or "://" in source:
+        raise SessionError(
+            f"{_where(sensor)}: found {source!r}; simulate writes images, .avi, .mp4 and .csv"
+        )
+    if _WILD.search(source):
+        return _globbed_images(sensor, source, numbers)
+    digits = max(_FEWEST_DIGITS, len(str(numbers[-1])))
+    return SourceFiles(sensor, "images", source.rstrip("/") + "/", ".png", digits)
+
+
+def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> SourceFiles:
+    head, dot, suffix = pattern.rpartition(".")
+    concrete = pattern
+    if not dot or "/" in suffix:
+        concrete = f"{pattern}.png"
+    elif _WILD.search(suffix):
+        concrete = f"{head}.png"
+    before, after, room = _split_at_number(concrete, sensor)
+    digits = room or max(_FEWEST_DIGITS, len(str(numbers[-1])))
+    if before[-1:].isdigit():  # else cam2 and frame 0001 would be frame 20001
+        before, digits = f"{before}_", room - 1 if room else digits
+    files = SourceFiles(sensor, "images", before, after, digits, pattern=pattern)
+    ends = [numbers[0], numbers[-1]] if len(numbers) > 1 else [numbers[0]]
+    names = [files.name(number) for number in ends]
+    # images that do not end in their number are counted, two of them as 0 and 1
+    read_as = list(range(len(ends))) if files.counts_from_zero else ends
+    if not all(_matches(pattern, name) for name in names) or read_as != frame_numbers(
+        [Path(name) for name in names]
+    ):
+        raise SessionError(
+            f"{_where(sensor)}: found {pattern!r}, which leaves no room for the numbers of "
+            f'{len(numbers)} frames; use a glob like "{sensor}*.png"'
+        )
+    _check_format(names[0], sensor)
+    return files
+
+
+def _split_at_number(pattern: str, sensor: str) -> tuple[str, str, int]:
+    """What stands before and after the number, and how many digits it has room for; 0 for any."""
+    wild = list(_WILD.finditer(pattern))
+    stars = [match for match in wild if match.group() == "*"]
+    if stars:
+        start, end, room = stars[-1].start(), stars[-1].end(), 0
+    else:
+        singles = [match for match in wild if match.group() != "**/"]
+        if not singles:
+            raise SessionError(
+                f'{_where(sensor)}: found {pattern!r}; use a glob like "{sensor}*.png"'
+            )
+        end, start, room = singles[-1].end(), singles[-1].start(), 1
+        for match in reversed(singles[:-1]):
+            if match.end() != start:
+                break
+            start, room = match.start(), room + 1
+    return _filled(pattern[:start]), _filled(pattern[end:]), room
+
+
+def _filled(pattern: str) -> str:
+    """A name that a glob matches, the shortest."""
+
+    def fill(match: re.Match[str]) -> str:
+        text = match.group()
+        if text in ("*", "**/"):
+            return ""
+        return next((c for c in "0a_A1-" if fnmatchcase(c, text)), text[1:2])
+
+    return _WILD.sub(fill, pattern)
+
+
+def _matches(pattern: str, name: str) -> bool:
+    if "**/" in pattern:
+        pattern, name = pattern.rpartition("**/")[2], PurePosixPath(name).name
+    patterns, names = PurePosixPath(pattern).parts, PurePosixPath(name).parts
+    return len(patterns) == len(names) and all(map(fnmatchcase, names, patterns))
+
+
+def _check_format(name: str, sensor: str) -> None:
+    suffix = PurePosixPath(name).suffix
+    if suffix.casefold() not in IMAGES_WRITTEN:
+        raise SessionError(
+            f"{_where(sensor)}: found images {suffix or name!r}; simulate writes "
+            f"{', '.join(IMAGES_WRITTEN)}"
+        )

@@ -1,0 +1,158 @@
+"""The session file of a recording: the user's own, made to stand beside the frames.
+
+It is copied byte for byte, with the files other than frames that it names.  Only a path
+that leads out of its folder is changed, as the recording is to hold all that belongs to it.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, Literal, TypeAlias
+
+from mixpose.errors import SessionError
+from mixpose.session import Session
+
+SESSION_NAME = "session.toml"
+
+Role: TypeAlias = Literal["source", "times", "file"]
+# The container and the key that hold a path, what it is for, and the folder it may move to.
+_Place: TypeAlias = tuple[Any, str | int, Role, str]
+
+
+@dataclass(frozen=True)
+class SessionCopy:
+    """What a recording takes over from a session.
+
+    Attributes
+    ----------
+    content : bytes
+        The session file.
+    sources : tuple of (str or tuple of str)
+        Sources of the sensors in `content`, in order.
+    times : tuple of str
+        Tables of frame times that it names, each once.
+    files : tuple of (Path, str)
+        Marker and calibration files and the user's own extraction: where they are, and their
+        paths in the recording.
+    """
+
+    content: bytes
+    sources: tuple[str | tuple[str, ...], ...]
+    times: tuple[str, ...]
+    files: tuple[tuple[Path, str], ...]
+
+    def write(self, folder: Path) -> None:
+        """Write the session file and the files that it names into a folder."""
+        for origin, name in self.files:
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(origin, target)
+        (folder / SESSION_NAME).write_bytes(self.content)
+
+
+def copy_session(session: Session) -> SessionCopy:
+    """Read a session file for a recording.
+
+    Raises
+    ------
+    SessionError
+        If it cannot be read, or leads out of its folder in a way that cannot be changed.
+    """
+    try:
+        content = session.path.read_bytes()
+        data = tomllib.loads(content.decode("utf-8-sig"))
+    except OSError as error:
+        raise SessionError(f"{session.path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise SessionError(f"{session.path}: changed since it was read; try again") from error
+    moved = _moved(session, data)
+    new_data = copy.deepcopy(data)
+    files: dict[str, Path] = {}
+    times: list[str] = []
+    for container, key, role, _ in _places(new_data):
+        old = container[key]
+        new = container[key] = moved.get(old, old)
+        if role == "file":
+            files[new] = session.folder / old
+        elif role == "times" and new not in times:
+            times.append(new)
+    files.update(_modules(session))
+    if moved:
+        content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
+    sources = [sensor.get("source", "") for sensor in new_data["sensor"]]
+    return SessionCopy(
+        content=content,
+        sources=tuple(tuple(s) if isinstance(s, list) else s for s in sources),
+        times=tuple(times),
+        files=tuple((origin, name) for name, origin in files.items()),
+    )
+
+
+def _modules(session: Session) -> dict[str, Path]:
+    """Python modules beside the session file that ``method = "module:function"`` names."""
+    methods = {setup.extract.method for setup in session.sensors}
+    names = [f"{m.partition(':')[0].replace('.', '/')}.py" for m in sorted(methods) if ":" in m]
+    return {name: session.folder / name for name in names if (session.folder / name).is_file()}
+
+
+def _places(data: dict[str, Any]) -> Iterator[_Place]:
+    """Where a session file holds paths."""
+    if "file" in data["object"]:
+        yield data["object"], "file", "file", "object"
+    for sensor in data["sensor"]:
+        name = sensor["name"]
+        if isinstance(sensor.get("source"), list):
+            yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
+        elif "source" in sensor:
+            yield sensor, "source", "source", name
+        if "times" in sensor:
+            yield sensor, "times", "times", name
+        if isinstance(sensor.get("calibration"), dict):
+            yield sensor["calibration"], "file", "file", name
+        elif "calibration" in sensor:
+            yield sensor, "calibration", "file", name
+
+
+def _moved(session: Session, data: dict[str, Any]) -> dict[str, str]:
+    """New paths for those that lead out of the session's folder."""
+    moved: dict[str, str] = {}
+    for container, key, role, owner in _places(data):
+        old = container[key]
+        path = PurePath(old)
+        leads_out = path.is_absolute() or ".." in path.parts
+        # a stream's address is no path; it is refused when files are chosen
+        if not leads_out or (role == "source" and "://" in old) or old in moved:
+            continue
+        new = f"{owner}/{path.name}"
+        if new in moved.values():
+            raise SessionError(
+                f"{session.path}: {role}: found {old!r}, which would be {new} in the recording, "
+                "as another file would; use paths inside the session's folder"
+            )
+        moved[old] = new
+    return moved
+
+
+def _rewritten(
+    session: Session, text: str, moved: dict[str, str], expected: dict[str, Any]
+) -> bytes:
+    """The session file with paths changed, and nothing else."""
+    for old, new in moved.items():
+        text = text.replace(json.dumps(old, ensure_ascii=False), json.dumps(new))
+        text = text.replace(f"'{old}'", json.dumps(new))
+    try:
+        is_as_meant = tomllib.loads(text) == expected
+    except ValueError:
+        is_as_meant = False
+    if not is_as_meant:
+        raise SessionError(
+            f"{session.path}: {', '.join(moved)} cannot be replaced by paths inside the "
+            "recording; use paths inside the session's folder"
+        )
+    return text.encode()

@@ -1,0 +1,198 @@
+"""Recordings on their way to the disk: one writer per kind of source, frame by frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.errors import SessionError
+from mixpose.simulation.naming import SourceFiles
+from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.render import (
+    ImageFormat,
+    ProfileFormat,
+    render_image,
+    render_profile,
+)
+from mixpose.simulation.sighting import Sighting
+
+# Runs and no filter: the best for noise, and fast.
+_PNG = (
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER,
+    cv2.IMWRITE_PNG_FILTER_NONE,
+)
+_VIDEO_QUALITY = 95
+
+
+class SensorWriter(Protocol):
+    """Writes what one sensor records; used in a ``with`` statement."""
+
+    def write(
+        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+    ) -> None:
+        """Record one frame; numbers ascend."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+
+class _Closing:
+    """Leaves a ``with`` statement by `close`."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class ImageWriter(_Closing):
+    """A file per image."""
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ImageFormat
+    ) -> None:
+        self._files = files
+        self._folder = folder
+        self._options = options
+        self._form = form
+
+    def write(
+        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+    ) -> None:
+        """Draw and write one image."""
+        image = render_image(sighting, self._form, self._options, rng)
+        path = self._folder / self._files.name(number)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        suffix = path.suffix.casefold()
+        path.write_bytes(cv2.imencode(suffix, image, _PNG if suffix == ".png" else ())[1].tobytes())
+
+
+class VideoWriter(_Closing):
+    """All images in one video: MJPEG in .avi, MPEG-4 in .mp4."""
+
+    def __init__(
+        self,
+        files: SourceFiles,
+        folder: Path,
+        options: SimulationOptions,
+        form: ImageFormat,
+        fps: float,
+    ) -> None:
+        self._options = options
+        self._form = form
+        path = folder / files.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # OpenCV's own writer of MJPEG lets the quality be set
+        own = path.suffix.casefold() == ".avi"
+        self._video = cv2.VideoWriter(
+            str(path),
+            cv2.CAP_OPENCV_MJPEG if own else cv2.CAP_FFMPEG,
+            cv2.VideoWriter.fourcc(*("MJPG" if own else "mp4v")),
+            fps,
+            form.resolution,
+            (cv2.VIDEOWRITER_PROP_QUALITY, _VIDEO_QUALITY) if own else (),
+        )
+        if not self._video.isOpened():
+            raise SessionError(
+                f"simulate: sensor {files.sensor!r}: source: {files.path} cannot be written as a "
+                'video; write images, with a glob like "left*.png"'
+            )
+
+    def write(
+        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+    ) -> None:
+        """Draw one image and append it."""
+        image = render_image(sighting, self._form, self._options, rng)
+        self._video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+
+    def close(self) -> None:
+        """Finish the container."""
+        self._video.release()
+
+
+class ProfileWriter(_Closing):
+    """A row per frame: .npy of float32, or .csv without a header."""
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, options: SimulationOptions, form: ProfileFormat
+    ) -> None:
+        self._options = options
+        self._form = form
+        path = folder / files.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._is_text = path.suffix.casefold() == ".csv"
+        self._file = path.open("wb")
+        if not self._is_text:
+            shape = (options.frames, form.bins)
+            header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(self._file, header)
+
+    def write(
+        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+    ) -> None:
+        """Draw one profile and append it."""
+        profile = render_profile(sighting, self._form, self._options, rng)
+        self._file.write(_row_of(profile) if self._is_text else profile.astype("<f4").tobytes())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class DetectionWriter(_Closing):
+    """A row per detection, in no particular order within a frame.
+
+    A frame without detections has one row of weight 0, which says that the sensor looked.
+    """
+
+    def __init__(
+        self, files: SourceFiles, folder: Path, *, noise: float, coordinates: tuple[str, ...]
+    ) -> None:
+        self._noise = noise
+        self._coordinates = coordinates
+        path = folder / files.path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("w", encoding="ascii", newline="\n")
+        self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
+
+    def write(
+        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+    ) -> None:
+        """Append the detections of one frame."""
+        points = sighting.points + self._noise * rng.standard_normal(sighting.points.shape)
+        weights = sighting.levels
+        if not len(points):
+            points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
+        for i in rng.permutation(len(points)):
+            cells = [f"{value:.9g}" for value in (*points[i], weights[i])]
+            self._file.write(",".join([str(number), f"{time_s:.6f}", *cells]) + "\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _row_of(profile: NDArray[np.float32]) -> bytes:
+    return (",".join(f"{value:.6g}" for value in profile.tolist()) + "\n").encode("ascii")

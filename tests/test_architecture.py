@@ -1,0 +1,96 @@
+"""Rooms know only what is below them, and the public interface is complete."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import mixpose
+
+ROOT = Path(mixpose.__file__).parent
+
+# Each room with the rooms it may import from; rooms of one floor do not know each other.
+GROUND = {"errors", "rigid", "records"}
+MAY_IMPORT: dict[str, set[str]] = {
+    "errors": set(),
+    "rigid": set(),
+    "records": set(),
+    "sensors": GROUND,
+    "body": GROUND,
+    "density": GROUND,
+    "extraction": GROUND,
+    "optimise": set(),
+    "objective": GROUND | {"sensors", "body", "density"},
+    "estimation": GROUND | {"sensors", "body", "density", "objective", "optimise"},
+    "frames": GROUND,
+    "poses": GROUND,
+    "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
+    "simulation": GROUND | {"sensors", "body", "session", "frames"},
+    "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
+}
+EDGE = {"cli", "__init__", "__main__"}
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(ROOT).with_suffix("").parts[0]
+
+
+def imported_rooms(path: Path) -> set[str]:
+    rooms = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative imports hide the room"
+            names = [node.module or ""]
+            if node.module == "mixpose":
+                names = [f"mixpose.{alias.name}" for alias in node.names]
+        rooms |= {name.split(".")[1] for name in names if name.startswith("mixpose.")}
+    return rooms
+
+
+MODULES = sorted(ROOT.rglob("*.py"))
+
+
+def test_every_room_has_its_place_in_the_house() -> None:
+    assert {room_of(path) for path in MODULES} == set(MAY_IMPORT) | EDGE
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_module_imports_what_lies_above_it(path: Path) -> None:
+    room = room_of(path)
+    if room in EDGE:
+        return
+    assert imported_rooms(path) <= MAY_IMPORT[room] | {room}
+
+
+def test_simulation_of_the_truth_does_not_know_how_it_is_estimated() -> None:
+    for path in (ROOT / "simulation").glob("*.py"):
+        rooms = imported_rooms(path)
+        assert not rooms & {"density", "objective", "estimation", "optimise", "runner"}
+        text = path.read_text(encoding="utf-8")
+        assert "mixpose.extraction" not in text or "mixpose.extraction.options" in text
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_file_is_too_long_to_be_one_room(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 420
+
+
+def test_public_names_are_complete_and_lead_somewhere() -> None:
+    for name in mixpose.__all__:
+        assert getattr(mixpose, name) is not None
+    assert set(mixpose._HOMES) | {"__version__"} == set(mixpose.__all__)
+
+
+def test_importing_mixpose_imports_nothing_heavy() -> None:
+    code = "import sys, mixpose; print(sorted({'cv2', 'numpy', 'scipy'} & set(sys.modules)))"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,162 @@
+"""A density is a probability density, and looking it up is exact to float rounding."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mixpose.density import FLOOR, Density, Observation, Window, render, self_overlap
+from mixpose.records import GridPattern, Pattern, PointPattern
+
+
+def points_pattern() -> PointPattern:
+    rng = np.random.default_rng(1)
+    return PointPattern(rng.uniform(40, 160, (7, 2)), rng.uniform(0.5, 2.0, 7))
+
+
+def image_pattern() -> GridPattern:
+    values = np.zeros((200, 220), dtype=np.float32)
+    values[50:56, 70:74] = 90.0
+    values[120, 101] = 30.0
+    return GridPattern(values, np.zeros(2), 1.0)
+
+
+def range_points() -> PointPattern:
+    return PointPattern(np.array([[3.2], [7.9], [8.4]]), np.ones(3))
+
+
+def range_profile() -> GridPattern:
+    values = np.zeros((1, 400), dtype=np.float32)
+    values[0, [100, 130, 135]] = [1.0, 2.0, 1.5]
+    return GridPattern(values, np.array([900.0]), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "sigma"),
+    [
+        (points_pattern(), 1.5),
+        (points_pattern(), 12.0),
+        (image_pattern(), 1.5),
+        (image_pattern(), 17.0),
+        (range_points(), 0.3),
+        (range_profile(), 2.0),
+        (range_profile(), 11.0),
+    ],
+)
+def test_every_density_integrates_to_one(pattern: Pattern, sigma: float) -> None:
+    observation = Observation(pattern, sigma)
+    lower, upper = observation.extent()
+    g = observation.density(sigma, (lower - 6 * sigma, upper + 6 * sigma))
+    assert g.values.dtype == np.float32
+    # the window ends at 5 sigma: the tails hold 1e-6, float32 sums another 1e-6
+    assert g.integral() == pytest.approx(1.0, abs=2e-5)
+
+
+def test_blur_widens_a_feature_to_sigma_even_on_a_reduced_grid() -> None:
+    observation = Observation(image_pattern(), 20.0)
+    g = observation.density(20.0, (np.full(2, -200.0), np.full(2, 400.0)))
+    assert g.window.step > 1.5
+    u = g.window.axis(0)
+    profile = g.values.sum(axis=0, dtype=np.float64)
+    centre = (profile * u).sum() / profile.sum()
+    variance = (profile * (u - centre) ** 2).sum() / profile.sum()
+    values = image_pattern().values.sum(axis=0, dtype=np.float64)
+    own = np.average(
+        (np.arange(220) - np.average(np.arange(220), weights=values)) ** 2, weights=values
+    )
+    assert centre == pytest.approx(np.average(np.arange(220), weights=values), abs=0.02)
+    assert np.sqrt(variance) == pytest.approx(np.sqrt(20.0**2 + own), rel=2e-3)
+
+
+def test_remap_samples_float32_to_float_rounding() -> None:
+    # Before OpenCV 5 coordinates were rounded to 1/32 px: the objective was a staircase.
+    rng = np.random.default_rng(0)
+    values = rng.random((60, 80), dtype=np.float32)
+    y = rng.uniform([0, 0], [78, 58], (5000, 2))
+    looked_up = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0).sample(y)
+    i, j = np.floor(y[:, 1]).astype(int), np.floor(y[:, 0]).astype(int)
+    b, a = y[:, 1] - i, y[:, 0] - j
+    exact = (1 - b) * ((1 - a) * values[i, j] + a * values[i, j + 1]) + b * (
+        (1 - a) * values[i + 1, j] + a * values[i + 1, j + 1]
+    )
+    # indices are float32: 80 · 2⁻²⁴ of a step each way, slopes up to 1 per step
+    assert np.abs(looked_up - exact).max() < 2e-5
+    steps = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0).sample(
+        np.stack([np.linspace(10.0, 10.03, 50), np.full(50, 20.5)], axis=-1)
+    )
+    assert len(np.unique(steps)) == 50
+
+
+def test_more_samples_than_one_map_side_can_hold() -> None:
+    values = np.arange(40 * 50, dtype=np.float32).reshape(40, 50)
+    density = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0)
+    y = np.random.default_rng(0).uniform([0, 0], [48, 38], (70_001, 2))
+    # the ramp u + 50 v is interpolated exactly
+    np.testing.assert_allclose(density.sample(y), y[:, 0] + 50 * y[:, 1], atol=1e-3)
+    assert density.sample(y.reshape(70_001, 1, 2)).shape == (70_001, 1)
+
+
+def test_outside_the_window_and_at_nan_is_the_floor() -> None:
+    density = render(points_pattern(), 3.0, Window(np.zeros(2), (200, 200), 1.0), gradient=True)
+    y = np.array([[-1e6, -1e6], [1e12, 3.0], [np.nan, 4.0], [-5.0, 50.0]])
+    assert (density.sample(y) == FLOOR).all()
+
+
+@pytest.mark.parametrize("pattern", [points_pattern(), image_pattern(), range_points()])
+def test_gradient_channels_are_the_derivative_of_the_density(pattern: Pattern) -> None:
+    sigma = 6.0 if len(Observation(pattern, 1.0).extent()[0]) == 2 else 0.6
+    observation = Observation(pattern, sigma)
+    lower, upper = observation.extent()
+    g = observation.density(sigma, (lower - 5 * sigma, upper + 5 * sigma), gradient=True)
+    h = g.window.step
+    if g.dimension == 1:
+        numerical = (g.values[0, 2:, 0] - g.values[0, :-2, 0]) / (2 * h)
+        analytic = g.values[0, 1:-1, 1]
+    else:
+        numerical = (g.values[2:, 1:-1, 0] - g.values[:-2, 1:-1, 0]) / (2 * h)
+        analytic = g.values[1:-1, 1:-1, 2]
+    # central differences of a Gaussian err by h²/(6σ²) of its steepest slope
+    assert np.abs(numerical - analytic).max() < 0.06 * np.abs(analytic).max()
+    assert np.abs(analytic).max() > 0
+
+
+def test_matched_density_holds_inner_products_with_a_feature() -> None:
+    pattern, sigma = points_pattern(), 4.0
+    observation = Observation(pattern, sigma)
+    matched = observation.matched(sigma, (np.zeros(2), np.full(2, 200.0)))
+    weights = pattern.weights / pattern.weights.sum()
+    p = np.array([[80.0, 90.0]])
+    away = pattern.points - p
+    variance = 2 * sigma**2
+    expected = np.sum(weights * np.exp(-0.5 * (away**2).sum(1) / variance) / (2 * np.pi * variance))
+    assert matched.sample(p)[0, 0] == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("count", [20, 300])
+def test_energy_of_points_equals_the_integral_of_the_squared_density(count: int) -> None:
+    rng = np.random.default_rng(2)
+    pattern = PointPattern(rng.uniform(0, 150, (count, 2)), np.ones(count))
+    observation = Observation(pattern, 3.0)
+    g = observation.density(3.0, (np.full(2, -20.0), np.full(2, 170.0)))
+    integral = float((g.values.astype(np.float64) ** 2).sum() * g.window.step**2)
+    assert observation.energy(3.0) == pytest.approx(integral, rel=1e-4)
+
+
+def test_overlap_of_many_points_equals_all_pairs() -> None:
+    points = np.random.default_rng(4).uniform(0, 60, (150, 2))
+    away = ((points[:, None] - points[None]) ** 2).sum(-1)
+    exact = np.exp(-0.5 * away / 8.0).sum() / (2 * np.pi * 8.0)
+    assert self_overlap(points, np.ones(150), 8.0) == pytest.approx(exact, rel=1e-6)
+
+
+def test_an_empty_pattern_gives_a_density_of_zero() -> None:
+    pattern = PointPattern(np.zeros((0, 2)), np.zeros(0))
+    assert Observation(pattern, 1.0).is_empty
+    g = render(pattern, 2.0, Window(np.zeros(2), (10, 12), 1.0), gradient=True)
+    assert g.values.shape == (10, 12, 3)
+    assert not g.values.any()
+
+
+def test_opencv_is_new_enough_for_exact_remap() -> None:
+    assert int(cv2.__version__.split(".")[0]) >= 5

@@ -1,0 +1,172 @@
+"""Laws that every sensor obeys, and agreement with OpenCV's projections."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mixpose.rigid import from_rotation_vector
+from mixpose.sensors import (
+    OUTSIDE,
+    SENSOR_MODELS,
+    FisheyeCamera,
+    ParallelBeam,
+    PinholeCamera,
+    RangeSensor,
+    Sensor,
+)
+
+K = np.array([[820.0, 0.4, 633.0], [0, 815.0, 507.0], [0, 0, 1]])
+T_SENSOR_WORLD = from_rotation_vector([0.2, -0.3, 0.1], [30.0, -20.0, 900.0])
+DISTORTIONS = {
+    0: [],
+    4: [-0.21, 0.1, 1e-3, -4e-4],
+    5: [-0.21, 0.1, 1e-3, -4e-4, 0.02],
+    8: [0.3, 0.1, 1e-3, -4e-4, 0.02, 0.5, 0.05, 0.01],
+    12: [0.3, 0.1, 1e-3, -4e-4, 0.02, 0.5, 0.05, 0.01, 1e-3, 2e-4, -1e-3, 3e-4],
+    14: [0.3, 0.1, 1e-3, -4e-4, 0.02, 0.5, 0.05, 0.01, 1e-3, 2e-4, -1e-3, 3e-4, 0.02, -0.03],
+}
+
+
+def points_in_view(count: int = 200) -> NDArray[np.float64]:
+    return np.random.default_rng(3).uniform(-150, 150, (count, 3))
+
+
+def every_sensor() -> dict[str, Sensor]:
+    sensors: dict[str, Sensor] = {
+        f"pinhole{n}": PinholeCamera(K, np.array(d), (1280, 1024), T_SENSOR_WORLD)
+        for n, d in DISTORTIONS.items()
+    }
+    sensors["fisheye"] = FisheyeCamera(
+        K / 1.5, np.array([0.05, -0.01, 2e-3, -3e-4]), (1280, 1024), T_SENSOR_WORLD
+    )
+    sensors["parallel"] = ParallelBeam(0.5, np.array([640.0, 512.0]), None, T_SENSOR_WORLD)
+    sensors["lateration"] = RangeSensor(np.array([0.0, -1000.0, 20.0]), 3.5)
+    return sensors
+
+
+SENSORS = every_sensor()
+
+
+def test_every_registered_model_is_under_test() -> None:
+    assert {type(s) for s in SENSORS.values()} == set(SENSOR_MODELS.values())
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_analytic_jacobian_agrees_with_central_differences(name: str) -> None:
+    sensor, points, step = SENSORS[name], points_in_view(), 1e-3
+    _, J, visible = sensor.linearise(points)
+    assert visible.mean() > 0.9
+    for axis in range(3):
+        shift = np.zeros(3)
+        shift[axis] = step
+        forward, _ = sensor.project(points + shift)
+        backward, _ = sensor.project(points - shift)
+        numerical = (forward - backward) / (2 * step)
+        # truncation is O(step² y‴) and rounding O(1e-13 y / step): both far below 1e-6
+        np.testing.assert_allclose(J[visible, :, axis], numerical[visible], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_linearise_repeats_project_and_batches_over_leading_axes(name: str) -> None:
+    sensor, points = SENSORS[name], points_in_view().reshape(4, 50, 3)
+    y, visible = sensor.project(points)
+    y2, J, visible2 = sensor.linearise(points)
+    assert y.shape == (4, 50, sensor.dimension)
+    assert J.shape == (4, 50, sensor.dimension, 3)
+    np.testing.assert_allclose(y, y2, atol=1e-10)
+    np.testing.assert_array_equal(visible, visible2)
+    single, _ = sensor.project(points[2, 7])
+    np.testing.assert_allclose(single, y[2, 7], atol=1e-10)
+
+
+@pytest.mark.parametrize("count", DISTORTIONS)
+def test_pinhole_agrees_with_opencv_for_every_number_of_coefficients(count: int) -> None:
+    sensor, points = SENSORS[f"pinhole{count}"], points_in_view()
+    y, visible = sensor.project(points)
+    rvec, _ = cv2.Rodrigues(T_SENSOR_WORLD[:3, :3])
+    # cv2.projectPoints has no skew; apply K to its normalised output instead
+    coefficients = np.array(DISTORTIONS[count]) if count else np.zeros(4)
+    normalised, _ = cv2.projectPoints(points, rvec, T_SENSOR_WORLD[:3, 3], np.eye(3), coefficients)
+    expected = normalised[:, 0] @ K[:2, :2].T + K[:2, 2]
+    np.testing.assert_allclose(y[visible], expected[visible], atol=1e-8)
+
+
+def test_fisheye_agrees_with_opencv() -> None:
+    sensor, points = SENSORS["fisheye"], points_in_view()
+    assert isinstance(sensor, FisheyeCamera)
+    y, visible = sensor.project(points)
+    rvec, _ = cv2.Rodrigues(T_SENSOR_WORLD[:3, :3])
+    normalised, _ = cv2.fisheye.projectPoints(
+        points[:, None], rvec, T_SENSOR_WORLD[:3, 3], np.eye(3), sensor.distortion
+    )
+    expected = normalised[:, 0] @ sensor.camera_matrix[:2, :2].T + sensor.camera_matrix[:2, 2]
+    np.testing.assert_allclose(y[visible], expected[visible], atol=1e-8)
+
+
+def test_fisheye_is_smooth_on_its_axis() -> None:
+    sensor = FisheyeCamera(K)
+    y, J, visible = sensor.linearise(np.array([[0.0, 0.0, 500.0]]))
+    assert visible.all()
+    np.testing.assert_allclose(y[0], K[:2, 2])
+    np.testing.assert_allclose(J[0, :, :2], K[:2, :2] / 500)
+
+
+@pytest.mark.parametrize("model", [PinholeCamera, FisheyeCamera])
+def test_points_behind_a_camera_are_hidden_finite_and_without_pull(
+    model: type[PinholeCamera] | type[FisheyeCamera],
+) -> None:
+    sensor = model(K, resolution=(1280, 1024))
+    y, J, visible = sensor.linearise(np.array([[10.0, 5.0, -800.0], [1.0, 2.0, 0.0]]))
+    assert not visible.any()
+    assert (y == OUTSIDE).all()
+    assert (J == 0).all()
+
+
+def test_points_outside_the_image_are_hidden() -> None:
+    sensor = PinholeCamera(K, resolution=(1280, 1024))
+    _, visible = sensor.project(np.array([[0.0, 0.0, 1000.0], [900.0, 0.0, 1000.0]]))
+    assert visible.tolist() == [True, False]
+
+
+def test_a_point_beyond_the_turning_radius_of_the_lens_model_is_hidden() -> None:
+    # r(1 - 0.3 r²) turns at r = 1.054: a point at r = 1.5 would fold back to r = 0.49
+    sensor = PinholeCamera(K, np.array([-0.3, 0, 0, 0]))
+    _, visible = sensor.project(np.array([[1.0, 0, 1.0], [1.5, 0, 1.0]]))
+    assert visible.tolist() == [True, False]
+
+
+def test_range_includes_the_bias() -> None:
+    y, visible = RangeSensor(np.zeros(3), 0.25, (0.0, 10.0)).project(
+        np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0]])
+    )
+    assert y[0, 0] == 5.25
+    assert visible.tolist() == [True, False]
+
+
+def test_parallel_beam_of_the_paper() -> None:
+    gamma = np.pi / 2
+    T = np.eye(4)
+    T[:3, :3] = [
+        [np.cos(gamma), np.sin(gamma), 0],
+        [0, 0, 1],
+        [np.sin(gamma), -np.cos(gamma), 0],
+    ]
+    y, _ = ParallelBeam(1.0, np.zeros(2), None, T).project(np.array([[1.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(y[0], [2.0, 3.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_the_direction_to_the_sensor_is_the_one_along_which_nothing_moves(name: str) -> None:
+    sensor, points = SENSORS[name], points_in_view(20)
+    towards = sensor.towards(points)
+    _, J, visible = sensor.linearise(points)
+    along = np.einsum("nmk,nk->nm", J, towards / np.linalg.norm(towards, axis=1, keepdims=True))
+    # a camera sees no motion along its ray; a range falls by the whole of it
+    expected = -1.0 if name == "lateration" else 0.0
+    np.testing.assert_allclose(along[visible], expected, atol=1e-9)
+    if name != "lateration":
+        depth = towards @ sensor.T_sensor_world[2, :3]  # type: ignore[attr-defined]
+        assert (depth < 0).all()

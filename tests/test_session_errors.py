@@ -1,0 +1,399 @@
+"""Sessions that are wrong: one line that names the file, the key, the find and the rule."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mixpose.errors import SessionError
+from mixpose.session import load_session
+
+# A session in which every line may be exchanged for a wrong one.
+LINES = {
+    "unit": 'unit = "mm"',
+    "object": '[object]\nname = "tracker"',
+    "points": "points = [[0, 0, 0], [10, 0, 0], [0, 20, 0], [0, 0, 30]]",
+    "sigma": "sigma = 1",
+    "normals": "",
+    "start": "[start]\nrotation_vector = [0, 0, 0]\ntranslation = [0, 0, 900]",
+    "estimator": "[estimator]",
+    "extract": "[extract]",
+    "left": '[[sensor]]\nname = "left"\nmodel = "pinhole"\nsource = "l*.png"',
+    "matrix": "camera_matrix = [[800, 0, 640], [0, 800, 512], [0, 0, 1]]",
+    "left more": "",
+    "beam": '[[sensor]]\nname = "beam"\nmodel = "parallel"\nsource = "b*.png"',
+    "beam keys": "pixel_size = 0.5\nprincipal_point = [100, 50]",
+    "sonar": '[[sensor]]\nname = "sonar"\nmodel = "lateration"\nsource = "s.csv"',
+    "sonar keys": "position = [1, 2, 3]",
+}
+LEFT = 'sensor["left"].'
+IDENTITY = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+
+
+def message_of(folder: Path, text: str | bytes) -> str:
+    path = folder / "session.toml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SessionError) as caught:
+        load_session(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert len(message.splitlines()) == 1
+    return message.removeprefix(f"{path}: ")
+
+
+def with_lines(**changed: str) -> str:
+    lines = LINES | {key.replace("_", " "): line for key, line in changed.items()}
+    return "\n".join(lines.values())
+
+
+def test_the_table_itself_is_right(tmp_path: Path) -> None:
+    path = tmp_path / "session.toml"
+    path.write_text(with_lines(), encoding="utf-8")
+    assert len(load_session(path).sensors) == 3
+
+
+WRONG: list[tuple[dict[str, str], list[str]]] = [
+    # the top of the file
+    ({"unit": ""}, ["unit: missing", '"m", "cm", "mm", "um"']),
+    ({"unit": 'unit = "inch"'}, ['unit: found "inch"', '"cm"']),
+    ({"unit": 'unit = "MM"'}, ['did you mean "mm"?']),
+    ({"unit": 'unit = "mm"\nsensors = 3'}, ["sensors: unknown key", 'did you mean "sensor"?']),
+    ({"object": ""}, ["points: unknown key", "a key of [object]"]),
+    ({"unit": 'unit = "mm"\nstart = 3', "start": ""}, ["start: found 3", "[start]"]),
+    # the object
+    ({"object": "[object]"}, ["object.name: missing"]),
+    ({"object": '[object]\nname = ""'}, ['object.name: found ""']),
+    (
+        {"object": '[object]\nname = "t"\npionts = 1'},
+        ['object.pionts: unknown key; did you mean "points"?'],
+    ),
+    ({"points": ""}, ["object.points: missing", "markers.csv", "segments"]),
+    ({"points": "points = []"}, ["object.points: found []"]),
+    ({"points": "points = [[0, 0, 0], [1, 0, 0]]"}, ["object.points: found 2 features", "three"]),
+    ({"points": "segments = [[[0, 0, 0], [1, 0, 0]]]"}, ["object.segments: found 1 feature;"]),
+    ({"points": "points = [[0, 0, 0], [1, 0]]"}, ["object.points[1]: found [1, 0]", "[x, y, z]"]),
+    ({"points": 'points = [[0, 0, 0], [1, 0, "2"]]'}, ['object.points[1][2]: found "2"']),
+    ({"points": "points = [[0, nan, 0]]"}, ["object.points[0][1]: found nan", "finite"]),
+    ({"points": "points = [[0, true, 0]]"}, ["object.points[0][1]: found true"]),
+    ({"points": f"points = [[0, {10**400}, 0]]"}, ["object.points[0][1]", "more digits"]),
+    ({"points": LINES["points"] + '\nfile = "m.csv"'}, ["object.file: stands beside points"]),
+    ({"points": 'file = "none.csv"'}, ["object.file: no such file", "none.csv"]),
+    ({"points": "segments = [[[0, 0, 0], [1, 0]]]"}, ["object.segments[0][1]: found [1, 0]"]),
+    (
+        {"sigma": "segments = [[[1, 2, 3], [1, 2, 3]]]"},
+        ["object.segments[0]: found a segment without length"],
+    ),
+    ({"normals": "normals = [[0, 0, 1]]"}, ["object.normals: found 1 normals for 4 features"]),
+    (
+        {"normals": "normals = [[0, 0, 1], [0, 0, 1], [0, 0, 0], [0, 0, 1]]"},
+        ["object.normals[2]: found a normal of length 0"],
+    ),
+    # sigma
+    ({"sigma": "sigma = -1"}, ["object.sigma: found -1", "at least 0"]),
+    ({"sigma": "sigma = [1, -2, 1]"}, ["object.sigma: found -2"]),
+    ({"sigma": "sigma = inf"}, ["object.sigma: found inf"]),
+    ({"sigma": "sigma = 1e200"}, ["object.sigma: found 1e+200"]),
+    ({"sigma": 'sigma = "5"'}, ['object.sigma: found "5"', "[sx, sy, sz]"]),
+    ({"sigma": "sigma = []"}, ["object.sigma: found []"]),
+    ({"sigma": "sigma = [1, 2]"}, ["object.sigma: found 2 items for 4 features"]),
+    ({"sigma": "sigma = [1, 2, 3, -4]"}, ["object.sigma[3]: found -4"]),
+    ({"sigma": "sigma = [1, 2, 3, [1, nan, 1]]"}, ["object.sigma[3][1]: found nan"]),
+    ({"sigma": "sigma = [1, 2, 3, {a = 1}]"}, ["object.sigma[3]: found {a = 1}"]),
+    (
+        {"sigma": "sigma = [[1, 2, 0], [0, 1, 0], [0, 0, 1]]"},
+        ["object.sigma: found a matrix that is not symmetric"],
+    ),
+    (
+        {"sigma": "sigma = [[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
+        ["object.sigma: found a matrix with the eigenvalue -1"],
+    ),
+    (
+        {
+            "points": "points = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]",
+            "sigma": "sigma = [[2, 2, 2], [2, 2, 2], [2, 2, 2]]",
+        },
+        ["object.sigma:", "may be a covariance or one", "write sigma = 2"],
+    ),
+    # start
+    ({"start": "[start]"}, ["start.T_world_object: missing", "quaternion_xyzw"]),
+    ({"start": "[start]\nrotation_vector = [0, 0, 0]"}, ["start.translation: missing"]),
+    (
+        {"start": "[start]\ntranslation = [0, 0, 0]"},
+        ["start.translation: stands without a rotation", "euler_xyz_deg"],
+    ),
+    (
+        {"start": f"[start]\nT_world_object = {IDENTITY}\neuler_xyz_deg = [0, 0, 0]"},
+        ["start.euler_xyz_deg: stands beside T_world_object"],
+    ),
+    (
+        {"start": f"[start]\nT_world_object = {IDENTITY}\ntranslation = [0, 0, 0]"},
+        ["start.translation: stands beside T_world_object"],
+    ),
+    (
+        {"start": "[start]\nT_world_object = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"},
+        ["start.T_world_object: found [[1, 0, 0]", "4x4"],
+    ),
+    (
+        {"start": "[start]\nquaternion_xyzw = [0, 0, 0, 2]\ntranslation = [0, 0, 0]"},
+        ["start.quaternion_xyzw: found a quaternion of length 2"],
+    ),
+    (
+        {"start": "[start]\nquaternion_xyzw = [0, 0, 0, 0]\ntranslation = [0, 0, 0]"},
+        ["start.quaternion_xyzw: found a quaternion of length 0"],
+    ),
+    ({"start": LINES["start"] + "\nrotation_deg = 0"}, ["start.rotation_deg: found 0"]),
+    ({"start": LINES["start"] + "\nrotation_deg = 181"}, ["start.rotation_deg: found 181", "180"]),
+    ({"start": LINES["start"] + "\ndistance = -2"}, ["start.distance: found -2"]),
+    ({"start": LINES["start"] + "\ndistance = inf"}, ["start.distance: found inf"]),
+    # estimator
+    ({"estimator": '[estimator]\nobjective = "match"'}, ["estimator.objective", '"matched"?']),
+    ({"estimator": "[estimator]\nfree = []"}, ["estimator.free: found []"]),
+    ({"estimator": '[estimator]\nfree = "x"'}, ['estimator.free: found "x"', "a list"]),
+    ({"estimator": '[estimator]\nfree = ["x", "w"]'}, ['estimator.free[1]: found "w"', '"rx"']),
+    ({"estimator": '[estimator]\nfree = ["x", "x"]'}, ["estimator.free", '"x" stands there twice']),
+    ({"estimator": '[estimator]\nfree = [["x"]]'}, ['estimator.free[0]: found ["x"]']),
+    (
+        {"start": "", "estimator": '[estimator]\nfree = ["x", "y", "z", "rx"]'},
+        ['estimator.free: leaves out "ry", "rz"', "[start]"],
+    ),
+    ({"estimator": "[estimator]\nsamples = 0"}, ["estimator.samples: found 0", "at least 1"]),
+    ({"estimator": "[estimator]\nsamples = 1.5"}, ["estimator.samples: found 1.5", "an integer"]),
+    ({"estimator": "[estimator]\nseed = -1"}, ["estimator.seed: found -1"]),
+    ({"estimator": "[estimator]\nseed = true"}, ["estimator.seed: found true"]),
+    # extract
+    ({"extract": '[extract]\nmethod = "blob"'}, ["extract.method", 'did you mean "blobs"?']),
+    (
+        {"extract": '[extract]\nmethod = "a:b:c"'},
+        ['extract.method: found "a:b:c"', "module:function"],
+    ),
+    ({"extract": '[extract]\npolarity = "drak"'}, ["extract.polarity", 'did you mean "dark"?']),
+    (
+        {"extract": '[extract]\nthreshold = "outs"'},
+        ["extract.threshold", "a grey level", '"otsu"?'],
+    ),
+    ({"extract": "[extract]\nthreshold = nan"}, ["extract.threshold: found nan"]),
+    ({"extract": "[extract]\nthreshold = true"}, ["extract.threshold: found true"]),
+    ({"extract": "[extract]\nsigma = 0"}, ["extract.sigma: found 0", "greater than 0"]),
+    ({"extract": "[extract]\nmin_area = -1"}, ["extract.min_area: found -1"]),
+    ({"extract": "[extract]\nmax_area = 2"}, ["extract.max_area: found 2", "min_area, which is 3"]),
+    (
+        {"extract": "[extract]\ntreshold = 3"},
+        ['extract.treshold: unknown key; did you mean "threshold"?'],
+    ),
+    (
+        {"extract": "[extract]\nmax_area = 10", "left_more": "[sensor.extract]\nmin_area = 10"},
+        [LEFT + "extract.max_area: found 10", "min_area, which is 10"],
+    ),
+    (
+        {"left_more": "[sensor.extract]\nsigam = 3"},
+        [LEFT + 'extract.sigam: unknown key; did you mean "sigma"?'],
+    ),
+    # any sensor
+    ({"left": LINES["left"].replace('name = "left"', "")}, ["sensor[0].name: missing"]),
+    ({"left": LINES["left"].replace('"left"', '"a=b"')}, ['sensor["a=b"].name: found "a=b"']),
+    (
+        {"left": LINES["left"].replace('"left"', '"beam"')},
+        ["sensor[1].name", "the name of sensor[0]"],
+    ),
+    ({"left": LINES["left"].replace('"left"', "3")}, ["sensor[0].name: found 3"]),
+    (
+        {"left": LINES["left"].replace("pinhole", "pinhol")},
+        [LEFT + "model", 'did you mean "pinhole"?'],
+    ),
+    (
+        {"left": LINES["left"].replace("model", "modle")},
+        [LEFT + 'modle: unknown key; did you mean "model"?'],
+    ),
+    ({"left": '[[sensor]]\nname = "left"'}, [LEFT + "model: missing", '"lateration"']),
+    ({"left": LINES["left"].replace('"l*.png"', '""')}, [LEFT + 'source: found ""']),
+    ({"left": LINES["left"].replace('"l*.png"', "[]")}, [LEFT + "source: found []"]),
+    ({"left": LINES["left"].replace('"l*.png"', '["a", 3]')}, [LEFT + 'source: found ["a", 3]']),
+    ({"left_more": "fps = 0"}, [LEFT + "fps: found 0"]),
+    ({"left_more": "fps = 1e300"}, [LEFT + "fps: found 1e+300"]),
+    ({"left_more": 'fps = 5\ntimes = "t.csv"'}, [LEFT + "fps: stands beside times"]),
+    ({"left_more": "sigma = 5"}, [LEFT + "sigma: unknown key", "[object] and [extract]"]),
+    ({"left_more": "euler_xyz_deg = [0, 0, 0]"}, [LEFT + "euler_xyz_deg: unknown key", "[start]"]),
+    ({"left_more": "range_bias = 1"}, [LEFT + "range_bias: unknown key", "model lateration"]),
+    # where it stands
+    (
+        {"left_more": "T_sensor_world = " + IDENTITY.replace("0, 1]]", "1, 1]]")},
+        [LEFT + "T_sensor_world: found no rigid motion", "last row"],
+    ),
+    (
+        {"left_more": "T_sensor_world = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [5, 0, 0, 1]]"},
+        [LEFT + "T_sensor_world", "transpose"],
+    ),
+    (
+        {"left_more": "T_sensor_world = " + IDENTITY.replace("[[1", "[[1.001")},
+        [LEFT + "T_sensor_world", "not orthonormal", "by 0.002"],
+    ),
+    (
+        {"left_more": "T_sensor_world = " + IDENTITY.replace("[[1", "[[-1")},
+        [LEFT + "T_sensor_world", "mirrors"],
+    ),
+    (
+        {"left_more": "T_sensor_world = " + IDENTITY.replace("0]", "inf]", 1)},
+        [LEFT + "T_sensor_world[0][3]: found inf"],
+    ),
+    ({"left_more": "quaternion_xyzw = [0, 0, 0, 1]"}, [LEFT + "translation: missing"]),
+    # cameras
+    ({"matrix": ""}, [LEFT + "camera_matrix: missing", "calibration"]),
+    (
+        {"matrix": "camera_matirx = 3"},
+        [LEFT + 'camera_matirx: unknown key; did you mean "camera_matrix"?'],
+    ),
+    ({"matrix": "camera_matrix = [[800, 0], [0, 800]]"}, [LEFT + "camera_matrix: found [[800, 0]"]),
+    (
+        {"matrix": "camera_matrix = [[800, 0, 640], [0, 0, 512], [0, 0, 1]]"},
+        [LEFT + "camera_matrix: found the focal length fy = 0"],
+    ),
+    (
+        {"matrix": "camera_matrix = [[-800, 0, 640], [0, 800, 512], [0, 0, 1]]"},
+        [LEFT + "camera_matrix: found the focal length fx = -800"],
+    ),
+    (
+        {"matrix": "camera_matrix = [[800, 0, 0], [0, 800, 0], [640, 512, 1]]"},
+        [LEFT + "camera_matrix", "transpose it"],
+    ),
+    (
+        {"matrix": "camera_matrix = [[800, 0, 640], [0, 800, 512], [0, 0, 2]]"},
+        [LEFT + "camera_matrix", "[0, 0, 1]]"],
+    ),
+    (
+        {"left_more": "distortion = [0.1, 0.1, 0]"},
+        [LEFT + "distortion: found 3 coefficients", "4 or 5 or 8"],
+    ),
+    ({"left_more": "distortion = [0.1, 0.1, 0, nan]"}, [LEFT + "distortion[3]: found nan"]),
+    ({"left_more": "distortion = 0.1"}, [LEFT + "distortion: found 0.1"]),
+    (
+        {
+            "left": LINES["left"].replace("pinhole", "fisheye"),
+            "left_more": "distortion = [0, 0, 0, 0, 0]",
+        },
+        [LEFT + "distortion: found 5 coefficients; allowed: 4 numbers for model fisheye"],
+    ),
+    ({"left_more": "resolution = [640]"}, [LEFT + "resolution: found [640]"]),
+    ({"left_more": "resolution = [640, 0]"}, [LEFT + "resolution: found [640, 0]"]),
+    ({"left_more": f"resolution = [640, {10**400}]"}, [LEFT + "resolution: found", "more digits"]),
+    ({"left_more": "resolution = [640.0, 480]"}, [LEFT + "resolution: found [640.0, 480]"]),
+    ({"left_more": "resolution = [true, 480]"}, [LEFT + "resolution: found [true, 480]"]),
+    ({"left_more": 'calibration = "c.yml"'}, [LEFT + "camera_matrix: stands beside calibration"]),
+    ({"matrix": 'calibration = "none.yml"'}, [LEFT + "calibration: no such file", "none.yml"]),
+    ({"matrix": "calibration = 3"}, [LEFT + "calibration: found 3"]),
+    ({"matrix": "calibration = { node = 1 }"}, [LEFT + "calibration.node: unknown key"]),
+    # parallel
+    ({"beam_keys": "principal_point = [100, 50]"}, ['sensor["beam"].pixel_size: missing']),
+    ({"beam_keys": "pixel_size = 1"}, ['sensor["beam"].principal_point: missing', "[u, v]"]),
+    (
+        {"beam_keys": "pixel_size = 0\nprincipal_point = [100, 50]"},
+        ['sensor["beam"].pixel_size: found 0'],
+    ),
+    (
+        {"beam_keys": "pixel_size = 1\nprincipal_point = [100]"},
+        ['sensor["beam"].principal_point: found [100]'],
+    ),
+    # lateration
+    ({"sonar_keys": ""}, ['sensor["sonar"].position: missing']),
+    ({"sonar_keys": "position = [1, 2]"}, ['sensor["sonar"].position: found [1, 2]']),
+    (
+        {"sonar_keys": "position = [1, 2, 3]\nrange_bias = nan"},
+        ['sensor["sonar"].range_bias: found nan'],
+    ),
+    ({"sonar_keys": "position = [1, 2, 3]\nbin_size = 1"}, ['sensor["sonar"].range_min: missing']),
+    ({"sonar_keys": "position = [1, 2, 3]\nrange_min = 1"}, ['sensor["sonar"].bin_size: missing']),
+    (
+        {"sonar_keys": "position = [1, 2, 3]\nrange_min = 1\nbin_size = 0"},
+        ['sensor["sonar"].bin_size: found 0'],
+    ),
+    (
+        {"sonar_keys": "position = [1, 2, 3]\nresolution = [1, 1]"},
+        ['sensor["sonar"].resolution: unknown key', "model pinhole or fisheye"],
+    ),
+]
+
+
+@pytest.mark.parametrize(("changed", "words"), WRONG, ids=lambda case: str(case)[:70])
+def test_a_wrong_line_is_named(tmp_path: Path, changed: dict[str, str], words: list[str]) -> None:
+    message = message_of(tmp_path, with_lines(**changed))
+    for word in words:
+        assert word in message
+
+
+def test_no_sensor_at_all(tmp_path: Path) -> None:
+    text = "\n".join(list(LINES.values())[:8])
+    assert message_of(tmp_path, text).startswith("sensor: missing")
+    assert message_of(tmp_path, "sensor = []\n" + text).startswith("sensor: found []")
+
+
+def test_a_sensor_in_single_brackets(tmp_path: Path) -> None:
+    message = message_of(tmp_path, with_lines(left="[sensor]", beam="", sonar=""))
+    assert message.startswith("sensor: found {")
+    assert "[[sensor]], in double brackets" in message
+
+
+def test_further_findings_are_counted(tmp_path: Path) -> None:
+    message = message_of(tmp_path, with_lines(unit='unit = "x"', extract="[extract]\nsigma = 0"))
+    assert message.startswith("unit: ")
+    assert message.endswith("(and 1 more)")
+
+
+def test_an_unknown_key_comes_before_what_is_missing_for_it(tmp_path: Path) -> None:
+    message = message_of(tmp_path, with_lines(unit='unti = "mm"'))
+    assert message.startswith('unti: unknown key; did you mean "unit"?')
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b'unit = "mm"\n[object\n', ["not TOML", "line 2"]),
+        (b'unit = "mm"\nunit = "m"\n', ["not TOML", "line 2"]),
+        (b'unit = "mm"\n# caf\xe9\n', ["not UTF-8", "line 2"]),
+        (b"\x00\x01\x02", ["not TOML"]),
+        (b"a = " + b"[" * 100_000, ["nested too deeply"]),
+        (b"a = " + b"1" * 5000, ["not TOML"]),
+        (b"", ["unit: missing"]),
+    ],
+)
+def test_a_file_that_is_no_session(tmp_path: Path, content: bytes, words: list[str]) -> None:
+    message = message_of(tmp_path, content)
+    assert all(word in message for word in words)
+
+
+def test_no_file_and_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=r"none\.toml: no such file"):
+        load_session(tmp_path / "none.toml")
+    with pytest.raises(SessionError, match="cannot read"):
+        load_session(tmp_path)
+    with pytest.raises(SessionError, match="not a file name"):
+        load_session("a\0b")
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("", ["the file is empty"]),
+        ("name,x,y,z\n", ["no markers"]),
+        ("a,0,0,0\nb,1,0,0\nc,0,1,0\n", ["line 1", 'found "a,0,0,0"', "name,x,y,z"]),
+        ("name;x;y;z\na;0;0;0\n", ["line 1", 'found "name;x;y;z"']),
+        ("name,x,y,z,s,t\na,0,0,0,0,0\n", ["line 1", "no, one, three or nine"]),
+        ("name,x,y,z\na,0,0,0\nb,1,0\n", ["line 3", "found 3 cells", "4"]),
+        ("name,x,y,z\na,0,0,0\nb,1,zero,0\n", ["line 3, column y", 'found "zero"']),
+        ("name,x,y,z\na,0,0,0\nb,1,0,nan\n", ["line 3, column z", 'found "nan"']),
+        ("name,x,y,z\na,0,0,0\nb,1,0,0\n", ["found 2 features"]),
+        ("name,x,y,z,s\na,0,0,0,1\nb,1,0,0,-1\nc,0,1,0,1\n", ["sigma[1]", "found -1"]),
+    ],
+)
+def test_a_wrong_marker_file(tmp_path: Path, table: str, words: list[str]) -> None:
+    (tmp_path / "m.csv").write_text(table, encoding="utf-8")
+    message = message_of(tmp_path, with_lines(points='file = "m.csv"', sigma=""))
+    assert message.startswith("object.file: ")
+    assert all(word in message for word in words)
+
+
+def test_spread_in_the_marker_file_and_in_the_session(tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(
+        "name,x,y,z,s\na,0,0,0,1\nb,1,0,0,1\nc,0,1,0,1\n", encoding="utf-8"
+    )
+    message = message_of(tmp_path, with_lines(points='file = "m.csv"'))
+    assert message.startswith("object.sigma: stands beside the sigma columns of m.csv")

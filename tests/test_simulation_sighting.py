@@ -1,0 +1,133 @@
+"""What a sensor sees: hidden, averted and false features, and lines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mixpose.body import Body, PointFeature, SegmentFeature
+from mixpose.rigid import from_rotation_vector, transform
+from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.render import ImageFormat, render_image
+from mixpose.simulation.sighting import View, displacements, facing, look
+
+K = np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]])
+CAMERA = PinholeCamera(K, resolution=(640, 512))
+T = from_rotation_vector([0.3, -0.2, 0.5], [10.0, -5.0, 900.0])
+POINTS = np.random.default_rng(4).uniform(-80, 80, (8, 3))
+BODY = Body("body", tuple(PointFeature(p) for p in POINTS))
+
+
+def view_of(sensor: Sensor, count: int = 8, *, spacing: float = 1.0, ridge: float = 0.0) -> View:
+    low, high = sensor.lower, sensor.upper
+    if sensor.dimension == 1:
+        low, high = np.zeros(1), np.array([2000.0])
+    return View(sensor, low, high, np.ones(count), spacing, ridge)
+
+
+def counts(options: SimulationOptions, frames: int = 400) -> tuple[float, float, set[int]]:
+    """Mean numbers of true and false features, and the numbers of false ones that occur."""
+    true, false = [], []
+    for frame in range(frames):
+        seen = look(view_of(CAMERA), BODY, T, options, np.random.default_rng(frame))
+        true.append(int((seen.features < len(BODY)).sum()))
+        false.append(int((seen.features >= len(BODY)).sum()))
+    return float(np.mean(true)), float(np.mean(false)), set(false)
+
+
+def test_spots_are_where_the_features_project_to() -> None:
+    seen = look(view_of(CAMERA), BODY, T, SimulationOptions(1), np.random.default_rng(0))
+    expected, _ = CAMERA.project(transform(T, POINTS))
+    assert np.array_equal(seen.features, np.arange(8))
+    np.testing.assert_allclose(seen.points, expected, atol=1e-9)
+
+
+def test_a_whole_number_of_false_features_is_there_in_every_frame() -> None:
+    true, false, numbers = counts(SimulationOptions(1, clutter=3), 50)
+    assert (true, false, numbers) == (8, 3, {3})
+
+
+def test_a_broken_number_of_false_features_is_their_mean() -> None:
+    _, false, numbers = counts(SimulationOptions(1, clutter=1.25))
+    assert numbers == {1, 2}
+    assert false == pytest.approx(1.25, abs=3 * np.sqrt(0.25 * 0.75 / 400))
+
+
+def test_false_features_are_spread_over_the_image() -> None:
+    options = SimulationOptions(1, clutter=4000)
+    seen = look(view_of(CAMERA), BODY, T, options, np.random.default_rng(0))
+    false = seen.points[seen.features >= 8]
+    assert false.min(axis=0) == pytest.approx([-0.5, -0.5], abs=1.0)
+    assert false.max(axis=0) == pytest.approx([639.5, 511.5], abs=1.0)
+    assert false.mean(axis=0) == pytest.approx([319.5, 255.5], abs=3 * 185 / np.sqrt(4000))
+
+
+def test_features_are_hidden_with_the_given_probability() -> None:
+    true, _, _ = counts(SimulationOptions(1, hidden=0.25))
+    assert true == pytest.approx(8 * 0.75, abs=3 * np.sqrt(8 * 0.25 * 0.75 / 400))
+
+
+def test_a_number_of_features_can_be_hidden_in_every_view() -> None:
+    assert counts(SimulationOptions(1, hidden_count=3), 50)[0] == 5
+    assert counts(SimulationOptions(1, hidden_count=20), 3)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("sensor", "towards"),
+    [
+        (CAMERA, [0, 0, -1]),
+        (ParallelBeam(1.0, np.zeros(2), (640, 512)), [0, 0, -1]),
+        (RangeSensor(np.array([0.0, 5000.0, 900.0])), [0, 1, 0]),
+    ],
+    ids=["camera", "parallel", "range"],
+)
+def test_features_that_face_away_are_not_seen(sensor: Sensor, towards: list[float]) -> None:
+    features = (PointFeature(np.zeros(3)), PointFeature(np.ones(3)), PointFeature(-np.ones(3)))
+    R = T[:3, :3]
+    normals_world = np.array([towards, np.negative(towards), towards], dtype=np.float64)
+    body = Body("flat", features, normals_world @ R)
+    assert facing(sensor, body, T).tolist() == [True, False, True]
+    seen = look(view_of(sensor, 3), body, T, SimulationOptions(1), np.random.default_rng(0))
+    assert seen.features.tolist() == [0, 2] or sensor.dimension == 2
+    assert 1 not in seen.features
+
+
+def test_a_line_is_drawn_as_bright_as_a_point() -> None:
+    sigma, spacing = 1.6, 0.7 * 1.6
+    ridge = spacing / (np.sqrt(2 * np.pi) * sigma)
+    line = SegmentFeature(np.array([-60.0, 0, 0]), np.array([60.0, 10, 20]))
+    body = Body("rod", (line, PointFeature(np.array([0, 50.0, 0]))))
+    options = SimulationOptions(1, noise=0, shot_noise=0, background=0)
+    view = view_of(CAMERA, 2, spacing=spacing, ridge=ridge)
+    seen = look(view, body, T, options, np.random.default_rng(0))
+    image = render_image(seen, ImageFormat((640, 512), sigma), options, np.random.default_rng(0))
+    along = line.start + np.linspace(0.1, 0.9, 50)[:, None] * (line.end - line.start)
+    y, _ = CAMERA.project(transform(T, along))
+    nearest = np.rint(y).astype(int)
+    brightest = [image[v - 1 : v + 2, u - 1 : u + 2].max() for u, v in nearest]
+    # the line's depth differs by a sixth from end to end, and with it how dense its spots are
+    assert np.array(brightest) == pytest.approx(options.brightness, rel=0.2)
+
+
+def test_detections_of_a_line_weigh_as_much_as_a_point() -> None:
+    line = SegmentFeature(np.array([-60.0, 0, 0]), np.array([60.0, 10, 20]))
+    body = Body("rod", (line, PointFeature(np.array([0, 50.0, 0]))))
+    seen = look(view_of(CAMERA, 2), body, T, SimulationOptions(1), np.random.default_rng(0))
+    assert [seen.levels[seen.features == i].sum() for i in (0, 1)] == pytest.approx([1, 1])
+    gaps = np.linalg.norm(np.diff(seen.points[seen.features == 0], axis=0), axis=1)
+    assert 0.5 < gaps.min() <= gaps.max() <= 1.05
+
+
+def test_deformed_features_scatter_by_the_spread_that_the_body_states() -> None:
+    covariance = np.array([[9.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
+    body = Body("soft", (PointFeature(np.zeros(3), covariance), PointFeature(np.ones(3))))
+    offsets = np.array([displacements(body, np.random.default_rng(i)) for i in range(4000)])
+    np.testing.assert_allclose(np.cov(offsets[:, 0].T), covariance, atol=0.5)
+    assert not offsets[:, 1].any()
+    seen = look(
+        view_of(CAMERA, 2), body, T, SimulationOptions(1), np.random.default_rng(0),
+        offsets=offsets[0],
+    )  # fmt: skip
+    expected, _ = CAMERA.project(transform(T, body.means + offsets[0]))
+    np.testing.assert_allclose(seen.points, expected, atol=1e-9)
