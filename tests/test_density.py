@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mixpose.density import FLOOR, Density, Observation, Window, render, self_overlap
+from mixpose.density.grid import EXACT_CHANNELS, remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 
@@ -69,23 +70,41 @@ def test_blur_widens_a_feature_to_sigma_even_on_a_reduced_grid() -> None:
     assert np.sqrt(variance) == pytest.approx(np.sqrt(20.0**2 + own), rel=2e-3)
 
 
-def test_remap_samples_float32_to_float_rounding() -> None:
+@pytest.mark.parametrize("channels", EXACT_CHANNELS)
+def test_remap_samples_float32_to_float_rounding(channels: int) -> None:
     # Before OpenCV 5 coordinates were rounded to 1/32 px: the objective was a staircase.
+    # With 2 or more than 4 channels OpenCV 5.0 still does, by up to 0.02 here.
     rng = np.random.default_rng(0)
-    values = rng.random((60, 80), dtype=np.float32)
-    y = rng.uniform([0, 0], [78, 58], (5000, 2))
-    looked_up = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0).sample(y)
-    i, j = np.floor(y[:, 1]).astype(int), np.floor(y[:, 0]).astype(int)
-    b, a = y[:, 1] - i, y[:, 0] - j
+    values = rng.random((60, 80, channels), dtype=np.float32)
+    u, v = rng.uniform(0, 78, 5000).astype(np.float32), rng.uniform(0, 58, 5000).astype(np.float32)
+    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
+    b, a = (v - i)[:, None], (u - j)[:, None]
     exact = (1 - b) * ((1 - a) * values[i, j] + a * values[i, j + 1]) + b * (
         (1 - a) * values[i + 1, j] + a * values[i + 1, j + 1]
     )
-    # indices are float32: 80 · 2⁻²⁴ of a step each way, slopes up to 1 per step
-    assert np.abs(looked_up - exact).max() < 2e-5
-    steps = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0).sample(
-        np.stack([np.linspace(10.0, 10.03, 50), np.full(50, 20.5)], axis=-1)
-    )
-    assert len(np.unique(steps)) == 50
+    for count in (5000, 7):
+        looked_up = remap(values, u[:count], v[:count])
+        # numbers up to 1, a few roundings of 2⁻²⁴ each
+        assert np.abs(looked_up - exact[:count]).max() < 5e-7
+
+
+def test_coordinates_a_thousandth_of_a_step_apart_are_told_apart() -> None:
+    values = np.random.default_rng(0).random((60, 80), dtype=np.float32)
+    density = Density(values, Window(np.zeros(2), values.shape, 1.0), 1.0)
+    y = np.stack([np.linspace(10.0, 10.03, 31), np.full(31, 20.5)], axis=-1)
+    assert len(np.unique(density.sample(y))) == 31
+
+
+@pytest.mark.parametrize("pattern", [points_pattern(), range_points(), range_profile()])
+def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Pattern) -> None:
+    observation = Observation(pattern, 2.0)
+    for density in (
+        observation.matched(2.0, observation.extent()),
+        observation.density(2.0, observation.extent(), gradient=True),
+    ):
+        assert density.values.shape[2] in EXACT_CHANNELS
+        y = np.array([observation.extent()[0]])
+        assert density.sample(y).shape == (1, 1 + density.dimension)
 
 
 def test_more_samples_than_one_map_side_can_hold() -> None:

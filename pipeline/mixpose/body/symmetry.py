@@ -37,6 +37,8 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
     points = np.asarray(points, dtype=np.float64)
     centre = points.mean(axis=0)
     centred = points - centre
+    if np.linalg.svd(centred, compute_uv=False)[1] <= tolerance:
+        return from_parts(*_line_symmetries(centred, centre, tolerance))
     base = _widest_triple(centred)
     tree = cKDTree(centred)
     found = [np.eye(3)]
@@ -57,6 +59,17 @@ def default_tolerance(points: Floats) -> float:
     """A hundredth of the mean distance from the centre: below it a body is called symmetric."""
     centred = points - points.mean(axis=0)
     return float(0.01 * np.linalg.norm(centred, axis=1).mean())
+
+
+def _line_symmetries(centred: Floats, centre: Floats, tolerance: float) -> tuple[Floats, Floats]:
+    """Rotations and translations of points on a line: identity and, if any, the half-turn."""
+    axis = np.linalg.svd(centred)[2][0]
+    places = np.sort(centred @ axis)
+    rotations = np.eye(3)[None]
+    if np.abs(places + places[::-1]).max() <= tolerance:
+        across = np.linalg.svd(centred)[2][1]
+        rotations = np.concatenate([rotations, 2 * np.outer(across, across)[None] - np.eye(3)])
+    return rotations, np.asarray(centre - rotations @ centre)
 
 
 def _widest_triple(centred: Floats) -> tuple[int, int, int]:

@@ -10,12 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density.blur import bell
-from mixpose.density.grid import FAR, remap
+from mixpose.density.grid import FAR, merge, remap
 from mixpose.records import PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -33,8 +32,11 @@ class Atlas:
 
     Attributes
     ----------
-    values : (n * H, W, 1 + m) float32
-        Tiles below one another.
+    values : (n * H, W, 3) float32
+        Tiles below one another: density, then gradient;
+        for ranges the last channel is empty.
+    second : (n * H, W, 3 or 1) float32
+        Second derivatives on the same tiles: uu, uv, vv, or rr alone for ranges.
     origins : (n, m) float64
         Sensor coordinates of each tile's first grid point.
     rows : int
@@ -46,6 +48,7 @@ class Atlas:
     """
 
     values: NDArray[np.float32]
+    second: NDArray[np.float32]
     origins: Floats
     rows: int
     step: float
@@ -62,18 +65,34 @@ class Atlas:
         -------
         (..., n, 1 + m) float32
         """
+        return self._look_up(self.values, y, self._maps(y))
+
+    def sample_all(self, y: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """As `sample`, with the second derivatives (..., n, m, m)."""
+        maps = self._maps(y)
+        second = remap(self.second, *maps)
+        if self.origins.shape[1] == 2:
+            second = second[:, [0, 1, 1, 2]]
+        return self._look_up(self.values, y, maps), second.reshape(*y.shape, y.shape[-1])
+
+    def _look_up(
+        self,
+        layers: NDArray[np.float32],
+        y: Floats,
+        maps: tuple[NDArray[np.float32], NDArray[np.float32]],
+    ) -> NDArray[np.float32]:
+        channels = 1 + y.shape[-1]
+        return remap(layers, *maps)[:, :channels].reshape(*y.shape[:-1], channels)
+
+    def _maps(self, y: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         n, m = self.origins.shape
         index = (y - self.origins) / self.step
-        columns = self.values.shape[1]
-        limits = np.array([columns - 1, self.rows - 1][:m])
+        limits = np.array([self.values.shape[1] - 1, self.rows - 1][:m])
         inside = np.all((index >= 0) & (index <= limits), axis=-1)
         map_u = np.where(inside, index[..., 0], FAR)
         row = index[..., 1] if m == 2 else np.zeros(index.shape[:-1])
         map_v = np.where(inside, row + self.rows * np.arange(n), FAR)
-        flat = remap(
-            self.values, map_u.ravel().astype(np.float32), map_v.ravel().astype(np.float32)
-        )
-        return flat.reshape(*y.shape[:-1], self.values.shape[2])
+        return map_u.ravel().astype(np.float32), map_v.ravel().astype(np.float32)
 
 
 def render_atlas(pattern: PointPattern, sigma: float, centres: Floats, reach: float) -> Atlas:
@@ -96,21 +115,24 @@ def render_atlas(pattern: PointPattern, sigma: float, centres: Floats, reach: fl
     half = int(np.ceil(reach / step))
     offsets = step * np.arange(-half, half + 1)
     weights = (pattern.weights / pattern.weights.sum()).astype(np.float32)
-    bells, slopes = zip(
-        *(
-            bell((centres[:, k, None] + offsets)[:, None, :], pattern.points[:, k], sigma)
-            for k in range(m)
-        ),
-        strict=True,
-    )
+    axes = [
+        bell((centres[:, k, None] + offsets)[:, None, :], pattern.points[:, k], sigma)
+        for k in range(m)
+    ]
     if m == 1:
-        layers = [weights @ bells[0], weights @ slopes[0]]
-        rows = 1
+        rows, layers = 1, [weights @ derivative for derivative in axes[0]]
     else:
-        down = np.swapaxes(bells[1] * weights[:, None], 1, 2)
-        slope_down = np.swapaxes(slopes[1] * weights[:, None], 1, 2)
-        layers = [down @ bells[0], down @ slopes[0], slope_down @ bells[0]]
         rows = len(offsets)
-    stacked = cv2.merge([np.ascontiguousarray(layer.reshape(n * rows, -1)) for layer in layers])
-    origins = centres + offsets[0]
-    return Atlas(np.asarray(stacked, dtype=np.float32), origins, rows, step, sigma)
+        along = axes[0]
+        down = [np.swapaxes(derivative * weights[:, None], 1, 2) for derivative in axes[1]]
+        orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
+        layers = [down[v] @ along[u] for u, v in orders]
+    flat = [np.ascontiguousarray(layer.reshape(n * rows, -1)) for layer in layers]
+    return Atlas(
+        values=merge(flat[: 1 + m]),
+        second=merge(flat[1 + m :]),
+        origins=centres + offsets[0],
+        rows=rows,
+        step=step,
+        sigma=sigma,
+    )

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density.grid import Density, Window
+from mixpose.density.grid import Density, Window, merge
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -48,16 +48,19 @@ def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = F
     return Density(values, window, sigma)
 
 
+def _nothing(window: Window, gradient: bool) -> NDArray[np.float32]:
+    return np.zeros((*window.shape, 3) if gradient else window.shape, dtype=np.float32)
+
+
 def _render_points(
     pattern: PointPattern, sigma: float, window: Window, gradient: bool
 ) -> NDArray[np.float32]:
     dimension = pattern.points.shape[1]
     total = pattern.weights.sum()
     if total <= 0:
-        channels = (1 + dimension,) if gradient else ()
-        return np.zeros((*window.shape, *channels), dtype=np.float32)
+        return _nothing(window, gradient)
     weights = (pattern.weights / total).astype(np.float32)
-    bells, slopes = zip(
+    bells, slopes, _ = zip(
         *(bell(window.axis(k), pattern.points[:, k], sigma) for k in range(dimension)), strict=True
     )
     if dimension == 1:
@@ -70,16 +73,18 @@ def _render_points(
             layers += [rows @ slopes[0], (slopes[1].T * weights) @ bells[0]]
     if not gradient:
         return layers[0]
-    return np.asarray(cv2.merge(layers[: 1 + dimension]), dtype=np.float32)
+    return merge(layers[: 1 + dimension])
 
 
 def bell(
     axis: Floats, centres: Floats, sigma: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Gaussians (..., M, n) around centres (M,) along axes (..., n), and their derivatives."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Gaussians (..., M, n) around centres (M,) along axes (..., n), and two derivatives."""
     away = ((axis - centres[:, None]) / sigma).astype(np.float32)
-    values = np.exp(-0.5 * away * away) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
-    return values, values * away * np.float32(-1.0 / sigma)
+    squared = away * away
+    values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
+    slopes = values * away * np.float32(-1.0 / sigma)
+    return values, slopes, values * (squared - 1) * np.float32(1.0 / sigma**2)
 
 
 def _render_grid(
@@ -88,21 +93,21 @@ def _render_grid(
     dimension = len(pattern.origin)
     total = float(pattern.values.sum(dtype=np.float64)) * pattern.step**dimension
     if total <= 0:
-        channels = (1 + dimension,) if gradient else ()
-        return np.zeros((*window.shape, *channels), dtype=np.float32)
+        return _nothing(window, gradient)
     source = _blocks(pattern, window, margin=TRUNCATE * sigma)
     # averaging twice over n pixels adds 2 (n² − 1)/12 px² of variance
     variance = sigma**2 - (source.step**2 - pattern.step**2) / 6
     spread = float(np.sqrt(max(variance, 0.0))) / source.step
     layers = _filtered(source.values / np.float32(total), spread, source.step, gradient)
-    stacked = np.asarray(cv2.merge(layers) if gradient else layers[0], dtype=np.float32)
+    stacked = merge(layers) if gradient else layers[0]
     on_source = Density(stacked, Window(source.origin, source.values.shape, source.step), sigma)
     first = (window.origin - source.origin) / source.step
     if abs(window.step / source.step - 1) < 1e-9 and np.allclose(first, first.round(), atol=1e-6):
         column, row = int(first[0].round()), int(first[1].round()) if dimension == 2 else 0
         cut = stacked[row : row + window.shape[0], column : column + window.shape[1]]
         return np.ascontiguousarray(cut)
-    return on_source.sample(_grid_points(window))
+    sampled = on_source.sample(_grid_points(window))
+    return merge([sampled[..., k] for k in range(1 + dimension)]) if gradient else sampled
 
 
 def _blocks(pattern: GridPattern, window: Window, margin: float) -> GridPattern:

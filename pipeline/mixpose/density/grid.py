@@ -4,6 +4,9 @@ A density is float32 values plus the affine map from sensor coordinates to array
 ``index = (y - origin) / step``: windows, coarse levels and range profiles (one row high) are all
 the same thing.  Channel 0 holds the density g, the following m channels its gradient by sensor
 coordinates.  Outside the array every channel is `FLOOR`.
+
+Arrays have 1, 3 or 4 channels: for those `cv2.remap` of OpenCV 5 is exact to float rounding, for
+2 it still rounds coordinates to 1/32 of a step.  Densities of ranges are padded to 3.
 """
 
 from __future__ import annotations
@@ -61,8 +64,9 @@ class Density:
 
     Attributes
     ----------
-    values : (H, W, 1 + m) or (H, W) float32
-        Density in 1/unit^m, then its gradient in 1/unit^(m+1) where it was asked for.
+    values : (H, W, 3) or (H, W) float32
+        Density in 1/unit^m, then its gradient in 1/unit^(m+1) where it was asked for; for
+        ranges the last channel is empty.
     window : Window
     sigma : float
         Standard deviation, in sensor units, that one exact feature has in it.
@@ -92,7 +96,7 @@ class Density:
 
         Returns
         -------
-        (..., C) or (...,) float32
+        (..., 1 + m) or (...,) float32
             The channels at y, `FLOOR` outside; without the last axis for a single channel.
         """
         index = (y.reshape(-1, self.dimension) - self.window.origin) / self.window.step
@@ -101,7 +105,20 @@ class Density:
         map_u = index[:, 0].astype(np.float32)
         map_v = index[:, 1].astype(np.float32) if self.dimension == 2 else np.zeros_like(map_u)
         looked_up = remap(self.values, map_u, map_v)
-        return looked_up.reshape(*y.shape[:-1], *self.values.shape[2:])
+        if self.values.ndim == 2:
+            return looked_up.reshape(y.shape[:-1])
+        return looked_up[:, : 1 + self.dimension].reshape(*y.shape[:-1], 1 + self.dimension)
+
+
+EXACT_CHANNELS = (1, 3, 4)
+
+
+def merge(layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Stack layers (H, W) as channels (H, W, C), padded to a number that is looked up exactly."""
+    while len(layers) > 1 and len(layers) not in EXACT_CHANNELS:
+        layers = [*layers, np.zeros_like(layers[0])]
+    merged = np.asarray(cv2.merge(layers), dtype=np.float32)
+    return merged.reshape(*layers[0].shape, len(layers))
 
 
 def remap(

@@ -108,7 +108,7 @@ def _meet(term: MatchedTerm, body: Body, T_world_object: Floats) -> _Met | None:
     J = pose_jacobian(by_world[seen], T_world_object, points[seen])
     weights = weights[seen]
     sampled = term.matched.sample(y)[seen].astype(np.float64)
-    norm, _, _ = overlap_terms(y[seen], J, weights, term.variance)
+    norm = overlap_terms(y[seen], J, weights, term.variance).norm
     product = float(weights @ sampled[:, 0])
     if product <= 0:
         return None

@@ -1,7 +1,8 @@
 """The background of an image: a coarse map of it, and its noise.
 
 Uneven light is taken out by medians of tiles, bilinear in between, so that one level serves the
-whole frame.  A median holds as long as features cover less than half of its tile.
+whole frame.  A tile is a fifth of the shorter side: light changes over a frame rather than over
+so many pixels.  Features up to half the shorter side are taken out by medians over tiles.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 # (H, W) uint8, uint16 or float32, as OpenCV takes and gives them.
 Grey: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
 
-TILE_PX = 128
-MOST_TILES = 8
-SAMPLES_PER_TILE_SIDE = 12
+TILES_PER_SHORT_SIDE = 5
+LEAST_TILE_PX = 16
+SAMPLES_PER_TILE_SIDE = 16
 
 # Noise is measured between pixels so far apart: interpolated or compressed pixels are more
 # alike than noise would make them.
@@ -37,14 +38,14 @@ def background_tiles(image: Grey) -> Grey:
     (rows, columns) array of the type of the image
         Medians of the tiles into which the image divides.
     """
-    rows, v = _sample_places(image.shape[0])
-    columns, u = _sample_places(image.shape[1])
+    tile = tile_side(image)
+    rows, v = _sample_places(image.shape[0], tile)
+    columns, u = _sample_places(image.shape[1], tile)
     places = image[np.ix_(v, u)].reshape(rows, v.size // rows, columns, u.size // columns)
     tiles = _median(places.swapaxes(1, 2).reshape(rows, columns, -1))
-    if min(rows, columns) >= 3:
-        # A feature that fills a tile must not become background.
-        return cv2.medianBlur(tiles, 3)
-    return tiles
+    # A feature that fills tiles must not become background.  Too low a background only lets
+    # more of it be looked at, too high a one hides features.
+    return cv2.min(cv2.medianBlur(tiles, 3), cv2.medianBlur(tiles, 5))
 
 
 def spread_out(tiles: Grey, image: Grey) -> Grey:
@@ -69,8 +70,9 @@ def noise_of(image: Grey) -> float:
     """Robust standard deviation of a pixel of an image (H, W), shading and features apart."""
     if image.shape[1] <= 2 * NOISE_SPACING_PX:
         return 0.0 if image.dtype == np.float32 else 1.0
-    v = _sample_places(image.shape[0])[1]
-    u = _sample_places(image.shape[1] - 2 * NOISE_SPACING_PX)[1]
+    tile = tile_side(image)
+    _, v = _sample_places(image.shape[0], tile)
+    _, u = _sample_places(image.shape[1] - 2 * NOISE_SPACING_PX, tile)
     rows = image[v].astype(np.float32)
     left, middle, right = (rows[:, u + shift * NOISE_SPACING_PX] for shift in range(3))
     # A straight slope of light has no second difference.
@@ -85,9 +87,15 @@ def noise_of(image: Grey) -> float:
     return noise if image.dtype == np.float32 else max(noise, 1.0)
 
 
-def _sample_places(side: int) -> tuple[int, NDArray[np.intp]]:
+def tile_side(image: Grey) -> int:
+    """About how wide and high a tile is, in px."""
+    height, width = image.shape
+    return max(int(min(height, width)) // TILES_PER_SHORT_SIDE, LEAST_TILE_PX)
+
+
+def _sample_places(side: int, about: int) -> tuple[int, NDArray[np.intp]]:
     """Number of tiles along a side, and the pixels of each that are looked at, in a row."""
-    tiles = min(max(side // TILE_PX, 1), MOST_TILES)
+    tiles = max(round(side / about), 1)
     tile = side // tiles
     step = max(tile // SAMPLES_PER_TILE_SIDE, 1)
     inside = np.arange(step // 2, tile, step)

@@ -22,14 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.extraction.contours import (
+    Box,
     Contour,
     cut_out,
-    enclosed,
     filled_area,
     neighbours,
     on_border,
-    outer,
     outlines,
+    pieces,
 )
 from mixpose.extraction.ellipse import Ellipse, distances, find_rim, is_waisted
 from mixpose.extraction.options import ExtractOptions
@@ -42,6 +42,9 @@ SMALL_AREA_PX = 100.0
 
 # Least share of its convex hull that a blob fills, if it has no elliptical rim.
 LEAST_SOLIDITY = 0.9
+
+# The step at its outline is taken between rings of this width.
+STEP_PX = 3
 
 # What has no shape is searched again at a level higher by this factor.
 LEVEL_RATIO = 1.4
@@ -90,15 +93,23 @@ def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
         `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
     """
     contours = outlines(scene.grey, scene.zero + scene.level)
-    blobs = _search(scene, contours, scene.level, options.min_area)
+    blobs = _search(scene, contours, scene.level, options.min_area, islands=True)
     largest = math.inf if options.max_area is None else options.max_area
     return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
 
 
 def _search(
-    scene: Foreground, contours: Sequence[Contour], level: float, min_area: float
+    scene: Foreground,
+    contours: Sequence[Contour],
+    level: float,
+    min_area: float,
+    *,
+    islands: bool = False,
 ) -> list[Blob]:
-    """Blobs among the outer contours of what is above a level."""
+    """Blobs among outer contours of what is above a level.
+
+    With `islands`, contours in the holes of these are yet to be looked for.
+    """
     blobs: list[Blob] = []
     shapeless: list[Contour] = []
     for contour in contours:
@@ -118,7 +129,7 @@ def _search(
             blobs.append(whole)
             continue
         for contour in group:
-            blobs += _other(scene, contour, level, min_area)
+            blobs += _other(scene, contour, level, min_area, islands=islands)
     return blobs
 
 
@@ -134,34 +145,44 @@ def _disk(scene: Foreground, contour: Contour, level: float) -> Blob | None:
     return Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
 
 
-def _other(scene: Foreground, contour: Contour, level: float, min_area: float) -> list[Blob]:
+def _other(
+    scene: Foreground, contour: Contour, level: float, min_area: float, *, islands: bool
+) -> list[Blob]:
     """A large blob without an elliptical rim if it is compact, or else the blobs inside of it."""
-    hull = cv2.convexHull(contour)
     box = cv2.boundingRect(contour)
-    compact = cv2.contourArea(contour) >= LEAST_SOLIDITY * cv2.contourArea(hull)
-    whole = []
-    if not on_border(scene, box):
-        # The hull makes up for holes that broke through the outline.
-        moments = cv2.moments(hull)
-        centre = (moments["m10"] / moments["m00"], moments["m01"] / moments["m00"])
-        whole = [Blob(*centre, filled_area(contour))]
     patch, inside, corner = cut_out(scene, contour, box, 0)
-    islands = enclosed(patch, inside, corner, level)
-    found = _search(scene, islands, level, min_area)
+    within = [
+        piece
+        for piece in pieces(above(patch, level) & inside, corner)
+        if tuple(cv2.boundingRect(piece)) != tuple(box)
+    ]
+    found = _search(scene, within, level, min_area) if islands else []
+    whole = [] if on_border(scene, box) else [_hull_blob(contour)]
     if not scene.judged:
         return whole + found
+    cv2.drawContours(inside, within, -1, 0, cv2.FILLED, offset=(-corner[0], -corner[1]))
     typical, peak = _brightness(scene, patch, inside)
-    stands_out = compact and typical >= scene.least_peak
-    # What is on islands is found already.
-    cv2.drawContours(inside, islands, -1, 0, cv2.FILLED, offset=(-corner[0], -corner[1]))
+    stands_out = (
+        typical >= scene.least_peak
+        and cv2.contourArea(contour) >= LEAST_SOLIDITY * cv2.contourArea(cv2.convexHull(contour))
+        and _step(scene, contour, box) >= LEAST_STEP_SHARE * typical
+    )
     inner: list[Blob] = []
     for part, higher in come_apart(scene, contour, patch, inside, level):
-        inner += _search(scene, outer(part, corner), higher, min_area)
+        inner += _search(scene, pieces(part, corner), higher, min_area)
     higher = LEVEL_RATIO * level
     clear = stands_out and peak < CORE_RATIO * typical
     if not inner and not clear and higher < peak:
-        inner = _search(scene, outer(above(patch, higher) & inside, corner), higher, min_area)
+        brighter = pieces(above(patch, higher) & inside, corner)
+        inner = _search(scene, brighter, higher, min_area)
     return found + (inner or (whole if stands_out else []))
+
+
+def _hull_blob(contour: Contour) -> Blob:
+    """The blob of an outline, its centre that of the hull: holes may have broken the outline."""
+    moments = cv2.moments(cv2.convexHull(contour))
+    centre = (moments["m10"] / moments["m00"], moments["m01"] / moments["m00"])
+    return Blob(*centre, filled_area(contour))
 
 
 def _brightness(
@@ -172,6 +193,15 @@ def _brightness(
     if values.size == 0:
         return 0.0, 0.0
     return float(np.median(values)), float(values.max())
+
+
+def _step(scene: Foreground, contour: Contour, box: Box) -> float:
+    """How much brighter a blob is a little inside of its outline than a little outside."""
+    patch, inside, _ = cut_out(scene, contour, box, STEP_PX + 1)
+    around = np.ones((2 * STEP_PX + 1, 2 * STEP_PX + 1), np.uint8)
+    rim = inside - cv2.erode(inside, around)
+    surroundings = cv2.dilate(inside, around) - inside
+    return float(cv2.mean(patch, rim)[0] - cv2.mean(patch, surroundings)[0])
 
 
 def _outside_disks(blobs: list[Blob]) -> list[Blob]:

@@ -27,7 +27,7 @@ CONTOUR_SAMPLES = 64
 
 
 def outlines(grey: Grey, level: float) -> list[Contour]:
-    """Outer contours of what is above a level in an image (H, W).
+    """Outermost contours of what is above a level in an image (H, W).
 
     The mask is made strip by strip, and contours are followed where nothing crosses from one
     strip to the next: on a frame with few features no second frame is ever written.
@@ -50,29 +50,20 @@ def outlines(grey: Grey, level: float) -> list[Contour]:
 def _follow(strips: list[NDArray[np.uint8]], top: int) -> Sequence[Contour]:
     if not any(strip.any() for strip in strips):
         return []
-    return outer(np.vstack(strips) if len(strips) > 1 else strips[0], (0, top))
+    mask = np.vstack(strips) if len(strips) > 1 else strips[0]
+    return cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(0, top))[0]
 
 
-def outer(mask: NDArray[np.uint8], corner: tuple[int, int]) -> Sequence[Contour]:
-    """Outer contours of a mask whose first pixel is at `corner`."""
-    return cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=corner)[0]
+def pieces(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:
+    """Outer contours of all that is connected in a mask, islands in holes included.
 
-
-def enclosed(
-    patch: NDArray[np.float32], inside: NDArray[np.uint8], corner: tuple[int, int], level: float
-) -> list[Contour]:
-    """Outer contours of the islands above a level in the holes of what a contour encloses.
-
-    Parameters are the patch, the mask and the corner that `cut_out` returns without a margin.
+    `corner` is the place (u, v) of the mask's first pixel.
     """
-    contours, family = cv2.findContours(
-        above(patch, level) & inside, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=corner
-    )
+    contours, family = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE, offset=corner)
+    if not contours:
+        return []
     # The last entry of a contour's family is its parent, which only holes have.
-    pieces = [c for c, relatives in zip(contours, family[0], strict=True) if relatives[3] < 0]
-    # The piece as large as the patch is the one that encloses the others.
-    size = (*corner, *patch.shape[::-1])
-    return [piece for piece in pieces if tuple(cv2.boundingRect(piece)) != size]
+    return [c for c, relatives in zip(contours, family[0], strict=True) if relatives[3] < 0]
 
 
 def filled_area(contour: Contour) -> float:

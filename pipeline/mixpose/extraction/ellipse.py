@@ -30,6 +30,7 @@ MOST_REACH_PX = 6
 LEAST_COVERAGE = 0.6
 LEAST_TOLERANCE_PX = 0.5
 SPREAD_PX = 0.6
+HOPELESS_SHARE = 0.15
 MOST_OBLIQUE = 0.15
 
 # Two spots that touch: along and across the middle of an ellipse that is long.
@@ -166,6 +167,8 @@ def fit_ellipse(points: Floats) -> Ellipse | None:
             best, best_spread = ellipse, spread
         if spread < SPREAD_PX:
             break
+    if best is None or best_spread > SPREAD_PX + HOPELESS_SHARE * min(best.half_axes):
+        return None
     for _ in range(3):
         if best is None:
             return None

@@ -14,7 +14,7 @@ MARGIN_PX = 3
 
 # The centroid leaves out what is below this share of the peak: halo, flare, noise.  More would
 # pull the centre towards pixels, less lets in more noise.
-CENTROID_SHARE = 0.15
+CENTROID_SHARE = 0.1
 
 # The step at the rim, as a share of the whole signal, tells things from tips of soft light.
 LEAST_STEP_SHARE = 0.4

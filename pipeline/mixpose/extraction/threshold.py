@@ -20,6 +20,7 @@ from mixpose.records import Image
 Window: TypeAlias = tuple[int, int, int, int]
 
 RULES = ("auto", "otsu", "local")
+
 # How much is looked at around a window to know its background.
 LEAST_MARGIN_PX = 64
 
@@ -142,7 +143,7 @@ def _bright(
     """
     u0, v0, u1, v1 = window
     height, width = image.shape
-    u_margin, v_margin = (max(side // 2, LEAST_MARGIN_PX) for side in (u1 - u0, v1 - v0))
+    u_margin, v_margin = (max(side, LEAST_MARGIN_PX) for side in (u1 - u0, v1 - v0))
     left, top = max(u0 - u_margin, 0), max(v0 - v_margin, 0)
     near = image[top : min(v1 + v_margin, height), left : min(u1 + u_margin, width)]
     inner = np.s_[v0 - top : v1 - top, u0 - left : u1 - left]

@@ -46,11 +46,14 @@ class Quadratic:
     gradient : (6,) float64
     curvature : (6, 6) float64
         Symmetric, positive semidefinite.
+    hessian : (6, 6) float64 or None
+        Minus the second derivative itself, where it is known; may be indefinite.
     """
 
     value: float
     gradient: Floats
     curvature: Floats
+    hessian: Floats | None = None
 
 
 class Objective(Protocol):

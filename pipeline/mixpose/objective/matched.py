@@ -34,6 +34,8 @@ from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
+
 REACH = 4.0
 """Margin of a window around the predicted features, in standard deviations of C."""
 
@@ -95,8 +97,13 @@ class MatchedObjective:
         return total
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient and Gauss-Newton curvature at one pose (4, 4)."""
+        """Value, gradient and Gauss-Newton curvature at one pose (4, 4).
+
+        On fine tiles the Hessian is given too, but for the second derivatives of the projection,
+        which act on residuals only.
+        """
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
+        hessian: Floats | None = np.zeros((6, 6))
         points = transform(T_world_object, self.points)
         for term in self.terms:
             y, by_world, seen = term.sensor.linearise(points)
@@ -104,32 +111,85 @@ class MatchedObjective:
             if not seen.any():
                 continue
             J = pose_jacobian(by_world[seen], T_world_object, self.points[seen])
-            sampled = term.matched.sample(y)[seen].astype(np.float64)
-            share = _share(term, sampled, y[seen], J, self.weights[seen])
+            sampled, second = _look_up(term.matched, y, seen)
+            share = _share(term, sampled, second, y[seen], J, self.weights[seen])
             value += share.value
             gradient += share.gradient
             curvature += share.curvature
-        return Quadratic(value, gradient, curvature)
+            known = hessian is not None and share.hessian is not None
+            hessian = hessian + share.hessian if known else None  # type: ignore[operator]
+        return Quadratic(value, gradient, curvature, hessian)
 
 
-def _share(term: MatchedTerm, sampled: Floats, y: Floats, J: Floats, weights: Floats) -> Quadratic:
+def _look_up(
+    matched: Density | Atlas, y: Floats, seen: NDArray[np.bool_]
+) -> tuple[Floats, Floats | None]:
+    """C with its gradient, and its second derivatives where they are known."""
+    if isinstance(matched, Density):
+        return matched.sample(y[seen]).astype(np.float64), None
+    sampled, second = matched.sample_all(y)
+    return sampled[seen].astype(np.float64), second[seen].astype(np.float64)
+
+
+def _share(
+    term: MatchedTerm,
+    sampled: Floats,
+    second: Floats | None,
+    y: Floats,
+    J: Floats,
+    weights: Floats,
+) -> Quadratic:
     """One sensor's weighted share ω S with its derivatives; y (n, m), J (n, m, 6)."""
+    flat = (weights[:, None, None] * J).reshape(-1, J.shape[-1])
     product = float(weights @ sampled[:, 0])
-    by_pose = np.einsum("n,nm,nmk->k", weights, sampled[:, 1:], J)
-    norm, half_norm_by_pose, gram = overlap_terms(y, J, weights, term.variance)
-    amplitude = product / norm
+    by_pose = sampled[:, 1:].reshape(-1) @ flat
+    overlap = overlap_terms(y, J, weights, term.variance)
+    amplitude = product / overlap.norm
     scale = term.weight / term.energy
-    gradient = 2 * amplitude * (by_pose - amplitude * half_norm_by_pose)
-    curvature = gram - np.outer(half_norm_by_pose, half_norm_by_pose) / norm
+    by_amplitude = (by_pose - 2 * amplitude * overlap.half_gradient) / overlap.norm
+    gradient = 2 * amplitude * (by_pose - amplitude * overlap.half_gradient)
+    curvature = overlap.gram - np.outer(overlap.half_gradient, overlap.half_gradient) / overlap.norm
+    hessian = None
+    if second is not None:
+        # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
+        bend = flat.T @ (second @ J).reshape(-1, J.shape[-1])
+        hessian = -scale * (
+            2 * overlap.norm * np.outer(by_amplitude, by_amplitude)
+            + 2 * amplitude * bend
+            - amplitude**2 * overlap.second
+        )
     return Quadratic(
-        scale * product * amplitude, scale * gradient, 2 * scale * amplitude**2 * curvature
+        scale * product * amplitude,
+        scale * gradient,
+        2 * scale * amplitude**2 * curvature,
+        hessian,
     )
 
 
-def overlap_terms(
-    y: Floats, J: Floats, weights: Floats, variance: float
-) -> tuple[float, Floats, Floats]:
-    """⟨h, h⟩, ⟨h, ∂h⟩ and ⟨∂h, ∂h⟩ of a predicted mixture.
+@dataclass(frozen=True)
+class Overlap:
+    """Inner products of a predicted mixture h with itself and its derivatives by the pose.
+
+    Attributes
+    ----------
+    norm : float
+        ⟨h, h⟩.
+    half_gradient : (6,) array
+        ⟨h, ∂h⟩, half the gradient of the norm.
+    gram : (6, 6) array
+        ⟨∂h, ∂h⟩.
+    second : (6, 6) array
+        Second derivative of the norm, without those of the projection.
+    """
+
+    norm: float
+    half_gradient: Floats
+    gram: Floats
+    second: Floats
+
+
+def overlap_terms(y: Floats, J: Floats, weights: Floats, variance: float) -> Overlap:
+    """Overlap of the features of a predicted mixture.
 
     Parameters
     ----------
@@ -140,30 +200,36 @@ def overlap_terms(
     weights : (n,) array
     variance : float
         2σ².
-
-    Returns
-    -------
-    float, (6,) array, (6, 6) array
     """
     top = peak(variance, y.shape[1])
-    pairs = close_pairs(y, variance)
-    i, j = pairs[:, 0], pairs[:, 1]
-    away = y[i] - y[j]
-    bells = weights[i] * weights[j] * np.exp(-0.5 * np.einsum("pm,pm->p", away, away) / variance)
-    near = bells > 1e-12 * float(np.max(weights)) ** 2
-    i, j, away, bells = i[near], j[near], away[near], bells[near]
-    norm = top * (float(weights @ weights) + 2 * float(bells.sum()))
-    flat = (J * weights[:, None, None]).reshape(-1, J.shape[-1])
+    size = J.shape[-1]
+    flat = (J * weights[:, None, None]).reshape(-1, size)
     gram = flat.T @ flat * (top / variance)
-    by_pose = np.zeros(J.shape[-1])
-    if len(i):
-        along_i = np.einsum("pm,pmk->pk", away, J[i])
-        along_j = np.einsum("pm,pmk->pk", away, J[j])
-        by_pose = -(top / variance) * bells @ (along_i - along_j)
-        cross = np.einsum("p,pmk,pml->kl", bells, J[i], J[j]) * (top / variance)
-        cross -= (along_i.T * bells) @ along_j * (top / variance**2)
-        gram += cross + cross.T
-    return norm, by_pose, gram
+    own = float(weights @ weights)
+    pairs = close_pairs(y, variance)
+    away = y[pairs[:, 0]] - y[pairs[:, 1]]
+    exponent = (away * away).sum(axis=1) * (-0.5 / variance)
+    near = exponent > _NEGLIGIBLE
+    if not near.any():
+        return Overlap(top * own, np.zeros(size), gram, np.zeros((size, size)))
+    i, j = pairs[near, 0], pairs[near, 1]
+    away, bells = away[near], weights[i] * weights[j] * np.exp(exponent[near]) * top
+    J_i, J_j = J[i], J[j]
+    along_i = np.einsum("pm,pmk->pk", away, J_i)
+    along_j = np.einsum("pm,pmk->pk", away, J_j)
+    along = along_i - along_j
+    half_gradient = -(bells @ along) / variance
+    cross = _weighted(bells, J_i, J_j) / variance - (along_i.T * bells) @ along_j / variance**2
+    J_apart = J_i - J_j
+    second = (along.T * bells) @ along / variance**2 - _weighted(bells, J_apart, J_apart) / variance
+    norm = top * own + 2 * float(bells.sum())
+    return Overlap(norm, half_gradient, gram + cross + cross.T, 2 * second)
+
+
+def _weighted(weights: Floats, A: Floats, B: Floats) -> Floats:
+    """Σ_p w_p A_pᵀ B_p for A and B of shape (p, m, k)."""
+    size = A.shape[-1]
+    return np.asarray((A * weights[:, None, None]).reshape(-1, size).T @ B.reshape(-1, size))
 
 
 def _self_overlaps(y: Floats, weights: Floats, variance: float) -> Floats:

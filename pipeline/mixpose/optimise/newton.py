@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 _STUCK = 1e9  # damping at which steps no longer move anything
+_LEAST_CURVATURE = 1e-3  # of the diagonal: flatter Hessians would throw a step far away
 State = TypeVar("State")
 
 
@@ -34,6 +35,11 @@ class Model(Protocol):
     @property
     def curvature(self) -> Floats:
         """C (n, n)."""
+        ...
+
+    @property
+    def hessian(self) -> Floats | None:
+        """Minus the second derivative (n, n) where it is known; used where it is definite."""
         ...
 
 
@@ -118,16 +124,26 @@ def ascend(
 
 def _step(here: Model, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """Damped Newton step and the gain that the model expects of it."""
-    C = here.curvature[np.ix_(free, free)]
-    g = here.gradient[free]
-    diagonal = np.diag(C).copy()
+    inner = np.ix_(free, free)
+    C, g = here.curvature[inner], here.gradient[free]
+    diagonal = np.diag(C)
     # a direction without curvature must not make the system singular
     floor = max(float(diagonal.max(initial=0.0)) * 1e-12, np.finfo(np.float64).tiny)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, floor))
-    A = C * scale[:, None] * scale + damping * np.eye(len(g))
-    A += 1e-12 * np.eye(len(g))
+    if here.hessian is not None and _is_definite(here.hessian[inner] * scale[:, None] * scale):
+        C = here.hessian[inner]
+    A = C * scale[:, None] * scale + (damping + 1e-12) * np.eye(len(g))
     partial = scale * np.linalg.solve(A, scale * g)
     step = np.zeros(len(free))
     step[free] = partial
     gain = float(g @ partial - 0.5 * partial @ C @ partial)
     return step, gain
+
+
+def _is_definite(scaled: Floats) -> bool:
+    """Whether a matrix, scaled to a diagonal near 1, is safely positive definite."""
+    try:
+        np.linalg.cholesky(scaled - _LEAST_CURVATURE * np.eye(len(scaled)))
+    except np.linalg.LinAlgError:
+        return False
+    return True

@@ -1,0 +1,94 @@
+"""The object model: mixtures, samples, symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mixpose.body import Body, PointFeature, Sampler, SegmentFeature, symmetries, uniforms
+from mixpose.rigid import from_rotation_vector, transform
+
+COVARIANCE = np.array([[9.0, 2.0, 0.0], [2.0, 4.0, 1.0], [0.0, 1.0, 1.0]])
+
+
+@pytest.mark.parametrize("sampler", ["latin-hypercube", "low-discrepancy"])
+def test_samples_have_the_mean_and_covariance_of_their_feature(sampler: Sampler) -> None:
+    features = (PointFeature(np.array([1.0, 2.0, 3.0]), COVARIANCE), PointFeature(np.zeros(3)))
+    samples = Body("b", features).sample(2000, sampler=sampler)
+    assert samples.shape == (2, 2000, 3)
+    # antithetic pairs cancel the error of the mean altogether
+    np.testing.assert_allclose(samples[0].mean(axis=0), [1, 2, 3], atol=1e-12)
+    # stratified in each dimension: far better than the 0.3 of independent draws
+    np.testing.assert_allclose(np.cov(samples[0].T), COVARIANCE, atol=0.2)
+    np.testing.assert_allclose(samples[1], 0.0)
+
+
+def test_all_features_take_the_same_offsets_unless_told_otherwise() -> None:
+    features = tuple(PointFeature(np.array([x, 0, 0.0]), COVARIANCE) for x in (0.0, 5.0))
+    body = Body("b", features)
+    common = body.sample(100)
+    np.testing.assert_allclose(common[1] - common[0], np.tile([5.0, 0, 0], (100, 1)))
+    fresh = body.sample(100, common=False)
+    assert np.abs(fresh[1] - fresh[0] - [5.0, 0, 0]).max() > 1.0
+
+
+def test_samples_repeat_with_the_seed() -> None:
+    body = Body("b", (PointFeature(np.zeros(3), COVARIANCE),))
+    np.testing.assert_array_equal(body.sample(64, seed=3), body.sample(64, seed=3))
+    assert not np.array_equal(body.sample(64, seed=3), body.sample(64, seed=4))
+
+
+def test_a_latin_hypercube_has_one_point_in_every_layer() -> None:
+    points = uniforms(100, antithetic=False)
+    for column in points.T:
+        np.testing.assert_array_equal(np.sort((column * 100).astype(int)), np.arange(100))
+
+
+def test_a_segment_is_uniform_along_its_line() -> None:
+    feature = SegmentFeature(np.zeros(3), np.array([10.0, 0.0, 0.0]))
+    samples = Body("b", (feature,)).sample(1000)
+    np.testing.assert_allclose(np.histogram(samples[0, :, 0], 10, (0, 10))[0], 100, atol=1)
+    points, weights = feature.nodes()
+    assert weights.sum() == pytest.approx(1.0)
+    np.testing.assert_allclose(weights @ points, feature.mean)
+
+
+def test_an_exact_body_needs_no_samples() -> None:
+    body = Body("b", tuple(PointFeature(np.array([x, 0, 0.0])) for x in (0.0, 1.0, 3.0)))
+    assert body.is_exact
+    assert body.sample(1000).shape == (3, 1, 3)
+
+
+CUBE = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)])
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("points", "order"),
+    [
+        (CUBE, 24),
+        (CUBE[1:-1], 6),  # the paper's object: two opposite corners missing
+        (np.array([[0, 0, 0], [0, 0.045, 0], [0, -0.045, 0], [0.04, 0, 0]]), 2),  # a T
+        (np.array([[x, y, 0.0] for x in range(9) for y in range(6)]), 4),  # a chessboard
+        (RNG.uniform(-1, 1, (7, 3)), 1),
+        (np.array([[0, 0, -1.0], [0, 0, 0], [0, 0, 1.0]]), 2),  # on a line: half a turn
+    ],
+)
+def test_symmetries_are_found_and_map_the_points_onto_themselves(
+    points: np.ndarray, order: int
+) -> None:
+    turned = transform(from_rotation_vector([0.3, -1.0, 0.5], [10.0, 2.0, -3.0]), points)
+    found = symmetries(turned, 1e-3)
+    assert len(found) == order
+    np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)
+    for T in found:
+        mapped = transform(T, turned)
+        distance = np.linalg.norm(mapped[:, None] - turned[None], axis=-1)
+        assert distance.min(axis=1).max() < 1e-6
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+
+
+def test_a_symmetry_within_the_spread_of_the_features_counts() -> None:
+    bent = CUBE + np.random.default_rng(1).normal(0, 0.01, CUBE.shape)
+    assert len(symmetries(bent, 1e-3)) == 1
+    assert len(symmetries(bent, 0.1)) == 24

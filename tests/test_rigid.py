@@ -1,0 +1,73 @@
+"""Laws of rigid motions and their conventions."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose.rigid import (
+    from_rotation_vector,
+    inverse,
+    is_rigid,
+    nearest_rigid,
+    perturb,
+    quaternion_xyzw,
+    rotation_angle_deg,
+    transform,
+    twist_between,
+)
+
+RNG = np.random.default_rng(0)
+POSES = from_rotation_vector(RNG.normal(0, 1.5, (50, 3)), RNG.normal(0, 100, (50, 3)))
+POINTS = RNG.normal(0, 50, (7, 3))
+
+
+def test_a_motion_and_its_inverse_cancel() -> None:
+    np.testing.assert_allclose(
+        transform(inverse(POSES), transform(POSES, POINTS)),
+        np.broadcast_to(POINTS, (50, 7, 3)),
+        atol=1e-10,
+    )
+
+
+def test_composition_is_the_matrix_product() -> None:
+    a, b = POSES[:25], POSES[25:]
+    np.testing.assert_allclose(
+        transform(a @ b, POINTS), transform(a, transform(b, POINTS)), atol=1e-9
+    )
+
+
+def test_twist_between_undoes_perturb() -> None:
+    twists = RNG.uniform(-1, 1, (50, 6)) * [10, 10, 10, 1, 1, 1]
+    np.testing.assert_allclose(twist_between(POSES, perturb(POSES, twists)), twists, atol=1e-9)
+
+
+def test_a_twist_turns_about_world_axes_through_the_objects_origin() -> None:
+    T = from_rotation_vector([0.4, 0.0, 0.0], [5.0, 6.0, 7.0])
+    turned = perturb(T, np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    np.testing.assert_allclose(turned[:3, 3], T[:3, 3])
+    about_z = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    np.testing.assert_allclose(turned[:3, :3], about_z @ T[:3, :3], atol=1e-12)
+
+
+def test_quaternions_are_xyzw_with_positive_w() -> None:
+    for T in POSES:
+        q = quaternion_xyzw(T)
+        assert q[3] >= 0
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-12)
+
+
+def test_the_angle_between_poses_is_that_of_the_turn() -> None:
+    twists = np.zeros((50, 6))
+    twists[:, 4] = np.linspace(0, 3.1, 50)
+    angles = rotation_angle_deg(POSES, perturb(POSES, twists))
+    np.testing.assert_allclose(angles, np.degrees(twists[:, 4]), atol=1e-6)
+
+
+def test_rounded_matrices_are_mended_and_mirrors_are_refused() -> None:
+    rounded = POSES[0].round(5)
+    assert is_rigid(rounded)
+    np.testing.assert_allclose(nearest_rigid(rounded), POSES[0], atol=2e-5)
+    mirror = np.diag([1.0, 1.0, -1.0, 1.0])
+    assert not is_rigid(mirror)
+    assert not is_rigid(np.full((4, 4), np.nan))
