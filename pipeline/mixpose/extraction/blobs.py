@@ -151,6 +151,8 @@ def _other(
     """A large blob without an elliptical rim if it is compact, or else the blobs inside of it."""
     box = cv2.boundingRect(contour)
     patch, inside, corner = cut_out(scene, contour, box, 0)
+    if scene.judged and cv2.minMaxLoc(patch, inside)[1] < scene.least_peak:
+        return []
     within = [
         piece
         for piece in pieces(above(patch, level) & inside, corner)

@@ -87,8 +87,9 @@ def _find(grey: Grey, threshold: str | float) -> Floats:
     order = np.argsort(-steps, kind="stable")
     order = order[steps[order] > NOISE_FACTOR * noise_of(grey)]
     corners, clearest = [np.empty((0, 2))], 0.0
-    for batch in (order[first : first + BATCH] for first in range(0, len(order), BATCH)):
+    for first in range(0, len(order), BATCH):
         # The clearest first: what is too faint beside them need not be looked at.
+        batch = order[first : first + BATCH]
         batch = batch[steps[batch] >= FAINT_SHARE * clearest]
         fitted_corners, fitted = _fit_saddles(blurred, rough[batch])
         crossed, differences = _four_fields(smooth, fitted_corners)
