@@ -210,6 +210,7 @@ def test_a_video_that_ends_early_keeps_its_frames(tmp_path: Path) -> None:
         ('model = "pinhole"', 'model = "pinhol"', ["pinhol", "pinhole"]),
         ("[object]", "[object]\nsigma = -1.0", ["sigma", "-1"]),
         ("[start]", "[begin]", ["begin", "start"]),
+        ('method = "blobs"', 'method = "blob"', ["extract.method", "blobs"]),
     ],
 )
 def test_a_mistake_in_the_session_is_one_line(

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.extraction.options import ExtractOptions
+from mixpose.errors import SessionError
+from mixpose.extraction import ExtractOptions, check_options
 from mixpose.rigid import Floats
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.session.calibration import read_calibration
@@ -77,6 +78,15 @@ def merge_extract(defaults: ExtractTable, own: ExtractTable | None) -> ExtractOp
     return options
 
 
+def _check_extraction(options: ExtractOptions) -> None:
+    """Say now, with the key, what would fail on the first image."""
+    try:
+        check_options(options)  # without a folder: reading a session runs nobody's code
+    except SessionError as error:
+        key, _, text = str(error).partition(": ")
+        raise BadKeyError(text, key.removeprefix("extract.")) from error
+
+
 def _keys_given(table: ExtractTable) -> dict[str, Any]:
     return {key: getattr(table, key) for key in table.model_fields_set}
 
@@ -101,6 +111,8 @@ def _build_sensor(table: AnySensorTable, defaults: ExtractTable, folder: Path) -
             sensor = RangeSensor(table.position, table.range_bias)
     with under("extract"):
         extract = merge_extract(defaults, table.extract)
+        if not isinstance(table, LaterationTable):
+            _check_extraction(extract)
     return SensorSetup(
         name=table.name,
         model=table.model,
