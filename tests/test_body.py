@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mixpose.body import Body, PointFeature, Sampler, SegmentFeature, symmetries, uniforms
+from mixpose.body import Body, Gravity, PointFeature, Sampler, SegmentFeature, symmetries, uniforms
 from mixpose.rigid import from_rotation_vector, transform
 
 COVARIANCE = np.array([[9.0, 2.0, 0.0], [2.0, 4.0, 1.0], [0.0, 1.0, 1.0]])
@@ -21,6 +21,25 @@ def test_samples_have_the_mean_and_covariance_of_their_feature(sampler: Sampler)
     # stratified in each dimension: far better than the 0.3 of independent draws
     np.testing.assert_allclose(np.cov(samples[0].T), COVARIANCE, atol=0.2)
     np.testing.assert_allclose(samples[1], 0.0)
+
+
+def test_a_uniform_spread_is_a_box_with_the_same_covariance() -> None:
+    diagonal = np.diag([9.0, 4.0, 1.0])
+    body = Body("b", (PointFeature(np.zeros(3), diagonal, "uniform"),))
+    samples = body.sample(4000)[0]
+    np.testing.assert_allclose(np.cov(samples.T), diagonal, atol=0.2)
+    # a Gaussian would reach beyond √3 standard deviations in 8 % of the samples
+    assert (np.abs(samples) <= np.sqrt(3 * np.array([9.0, 4.0, 1.0])) + 1e-9).all()
+
+
+def test_gravity_displaces_along_the_world_whatever_the_pose() -> None:
+    gravity = Gravity(np.array([0.0, 0.0, -2.0]), 1.5)
+    body = Body("b", (PointFeature(np.zeros(3)),), gravity=gravity)
+    offsets = body.world_offsets(1000)
+    assert not body.is_exact
+    assert offsets.shape == (1000, 3)
+    assert not offsets[:, :2].any()
+    assert offsets[:, 2].std() == pytest.approx(1.5, rel=0.02)
 
 
 def test_all_features_take_the_same_offsets_unless_told_otherwise() -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from mixpose.rigid import (
+    from_orthonormal,
     from_rotation_vector,
     inverse,
     is_rigid,
@@ -62,6 +64,16 @@ def test_the_angle_between_poses_is_that_of_the_turn() -> None:
     twists[:, 4] = np.linspace(0, 3.1, 50)
     angles = rotation_angle_deg(POSES, perturb(POSES, twists))
     np.testing.assert_allclose(angles, np.degrees(twists[:, 4]), atol=1e-6)
+
+
+def test_the_papers_rigid_affine_transformation_is_a_pose() -> None:
+    V, w = POSES[3, :3, :3], np.array([40.0, -3.0, 7.0])
+    T = from_orthonormal(V, w)
+    np.testing.assert_allclose(transform(T, POINTS), (POINTS + w) @ V, atol=1e-10)
+    with pytest.raises(ValueError, match="orthonormal"):
+        from_orthonormal(V * 1.01, w)
+    with pytest.raises(ValueError, match="orthonormal"):
+        from_orthonormal(V @ np.diag([1.0, 1.0, -1.0]), w)
 
 
 def test_rounded_matrices_are_mended_and_mirrors_are_refused() -> None:

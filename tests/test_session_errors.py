@@ -157,7 +157,7 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"start": "", "estimator": '[estimator]\nfree = ["x", "y", "z", "rx"]'},
         ['estimator.free: leaves out "ry", "rz"', "[start]"],
     ),
-    ({"estimator": "[estimator]\nsamples = 0"}, ["estimator.samples: found 0", "at least 1"]),
+    ({"estimator": "[estimator]\nsamples = 0"}, ["estimator.samples: found 0", "at least 2"]),
     ({"estimator": "[estimator]\nsamples = 1.5"}, ["estimator.samples: found 1.5", "an integer"]),
     ({"estimator": "[estimator]\nseed = -1"}, ["estimator.seed: found -1"]),
     ({"estimator": "[estimator]\nseed = true"}, ["estimator.seed: found true"]),
@@ -212,7 +212,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"left_more": "fps = 0"}, [LEFT + "fps: found 0"]),
     ({"left_more": "fps = 1e300"}, [LEFT + "fps: found 1e+300"]),
     ({"left_more": 'fps = 5\ntimes = "t.csv"'}, [LEFT + "fps: stands beside times"]),
-    ({"left_more": "sigma = 5"}, [LEFT + "sigma: unknown key", "[object] and [extract]"]),
+    (
+        {"left_more": "sigma = 5"},
+        [LEFT + "sigma: unknown key", "[object] and [gravity] and [extract]"],
+    ),
     ({"left_more": "euler_xyz_deg = [0, 0, 0]"}, [LEFT + "euler_xyz_deg: unknown key", "[start]"]),
     ({"left_more": "range_bias = 1"}, [LEFT + "range_bias: unknown key", "model lateration"]),
     # where it stands

@@ -57,6 +57,27 @@ def from_rotation_vector(rotation_vector: ArrayLike, translation: ArrayLike) -> 
     return from_parts(rotation_matrix(rotation_vector), translation)
 
 
+def from_orthonormal(V: ArrayLike, w: ArrayLike) -> Floats:
+    """The paper's rigid affine transformation x = Vᵀ(z + w) as a 4x4 motion.
+
+    Parameters
+    ----------
+    V : (3, 3) array
+        Orthonormal columns of a right-handed base.
+    w : (3,) array
+
+    Raises
+    ------
+    ValueError
+        If V is not orthonormal within 1e-6, or mirrors.
+    """
+    R = np.asarray(V, dtype=np.float64).T
+    T = from_parts(R, R @ np.asarray(w, dtype=np.float64))
+    if not is_rigid(T, tolerance=1e-6):
+        raise ValueError("V is not a right-handed orthonormal base, so that Vᵀ is no rotation")
+    return T
+
+
 def rotation_matrix(rotation_vector: ArrayLike) -> Floats:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians."""
     vectors = np.asarray(rotation_vector, dtype=np.float64)

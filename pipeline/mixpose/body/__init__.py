@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from mixpose.body.features import Feature, PointFeature, SegmentFeature
-from mixpose.body.model import Body, Nodes
+from mixpose.body.features import Feature, PointFeature, SegmentFeature, Spread
+from mixpose.body.model import Body, Gravity, Nodes
 from mixpose.body.sampling import Sampler, uniforms
 from mixpose.body.symmetry import symmetries
 
 __all__ = [
     "Body",
     "Feature",
+    "Gravity",
     "Nodes",
     "PointFeature",
     "Sampler",
     "SegmentFeature",
+    "Spread",
     "symmetries",
     "uniforms",
 ]

@@ -8,13 +8,15 @@ class with these members.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Spread: TypeAlias = Literal["gaussian", "uniform"]
 
 SEGMENT_NODES = 24
 
@@ -38,7 +40,10 @@ class Feature(Protocol):
         ...
 
     def sample(self, uniforms: Floats) -> Floats:
-        """Turn uniform numbers (R, 4) in (0, 1) into samples (R, 3) of the density."""
+        """Turn uniform numbers (R, 5) in (0, 1) into samples (R, 3) of the density.
+
+        The first three are for the spread, the fourth runs along a line, the fifth is the body's.
+        """
         ...
 
 
@@ -49,17 +54,20 @@ def no_spread() -> Floats:
 
 @dataclass(frozen=True)
 class PointFeature:
-    """A point: exact (delta) or Gaussian, q_i = N(z_i, Σ_i).
+    """A point: exact (delta), Gaussian, q_i = N(z_i, Σ_i), or uniform in a box.
 
     Parameters
     ----------
     position : (3,) array
     covariance : (3, 3) array
         Σ_i; zero for a delta.
+    spread : {"gaussian", "uniform"}
+        Density with that covariance: a Gaussian, or a box along its principal axes.
     """
 
     position: Floats
     covariance: Floats = field(default_factory=no_spread)
+    spread: Spread = "gaussian"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", np.asarray(self.position, dtype=np.float64))
@@ -75,24 +83,26 @@ class PointFeature:
         return self.position[None], np.ones(1)
 
     def sample(self, uniforms: Floats) -> Floats:
-        """Samples (R, 3) of the Gaussian from uniform numbers (R, 4); the last is not used."""
-        return self.position + gaussian(uniforms, self.covariance)
+        """Samples (R, 3) of the density from uniform numbers (R, 5)."""
+        return self.position + offsets(uniforms, self.covariance, self.spread)
 
 
 @dataclass(frozen=True)
 class SegmentFeature:
-    """A straight line, uniform along its length, blurred by a Gaussian.
+    """A straight line, uniform along its length, blurred by its spread.
 
     Parameters
     ----------
     start, end : (3,) array
     covariance : (3, 3) array
         Spread about the line; zero for a sharp line.
+    spread : {"gaussian", "uniform"}
     """
 
     start: Floats
     end: Floats
     covariance: Floats = field(default_factory=no_spread)
+    spread: Spread = "gaussian"
 
     def __post_init__(self) -> None:
         for name in ("start", "end", "covariance"):
@@ -110,15 +120,19 @@ class SegmentFeature:
         return self.start + along * (self.end - self.start), weights
 
     def sample(self, uniforms: Floats) -> Floats:
-        """Samples (R, 3) from uniform numbers (R, 4); the last one runs along the line."""
-        on_line = self.start + uniforms[:, 3:] * (self.end - self.start)
-        return on_line + gaussian(uniforms, self.covariance)
+        """Samples (R, 3) from uniform numbers (R, 5); the fourth runs along the line."""
+        on_line = self.start + uniforms[:, 3:4] * (self.end - self.start)
+        return on_line + offsets(uniforms, self.covariance, self.spread)
 
 
-def gaussian(uniforms: Floats, covariance: Floats) -> Floats:
-    """Zero-mean Gaussian offsets (R, 3) from the first three of uniform numbers (R, 4)."""
+def offsets(uniforms: Floats, covariance: Floats, spread: Spread) -> Floats:
+    """Zero-mean offsets (R, 3) of a covariance from the first three of uniform numbers (R, 5)."""
     if not covariance.any():
         return np.zeros((len(uniforms), 3))
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(ndtri(uniforms[:, :3]) @ root.T)
+    if spread == "gaussian":
+        unit = ndtri(uniforms[:, :3])
+    else:
+        unit = np.sqrt(12.0) * (uniforms[:, :3] - 0.5)
+    return np.asarray(unit @ root.T)

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
@@ -35,6 +36,22 @@ class Nodes:
 
 
 @dataclass(frozen=True)
+class Gravity:
+    """Displacement of all features along a direction of the world, however the body is turned.
+
+    Attributes
+    ----------
+    direction : (3,) float64
+        In the world, of any length.
+    sigma : float
+        Standard deviation of the displacement along it, length units.
+    """
+
+    direction: Floats
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Body:
     """A rigid body known by its features.
 
@@ -45,11 +62,14 @@ class Body:
         The densities q_i in the object's frame.
     normals : (N, 3) float64 or None
         Outward normals: a feature is seen only by sensors it faces.
+    gravity : Gravity or None
+        Spread that stays with the world while the body turns.
     """
 
     name: str
     features: tuple[Feature, ...]
     normals: Floats | None = None
+    gravity: Gravity | None = None
 
     def __len__(self) -> int:
         return len(self.features)
@@ -83,7 +103,8 @@ class Body:
     @cached_property
     def is_exact(self) -> bool:
         """Whether every feature is a delta: then no sampling is needed."""
-        return len(self.nodes.points) == len(self) and not self.covariances.any()
+        sharp = len(self.nodes.points) == len(self) and not self.covariances.any()
+        return sharp and self.gravity is None
 
     @cached_property
     def radius(self) -> float:
@@ -139,3 +160,15 @@ class Body:
                 own = uniforms(count, sampler=sampler, antithetic=antithetic, seed=seed + 7919 * i)
             samples.append(feature.sample(own))
         return np.array(samples)
+
+    def world_offsets(self, count: int, *, antithetic: bool = True, seed: int = 0) -> Floats:
+        """Displacements along gravity (R, 3) in the world, one for each sample of a feature.
+
+        Zero for a body that states none.  They belong to the samples of the same count and seed.
+        """
+        if self.gravity is None:
+            return np.zeros((1 if self.is_exact else 2 * (count // 2), 3))
+        drawn = uniforms(count, antithetic=antithetic, seed=seed)[:, 4]
+        direction = np.asarray(self.gravity.direction, dtype=np.float64)
+        unit = direction / np.linalg.norm(direction)
+        return np.asarray(self.gravity.sigma * ndtri(drawn)[:, None] * unit)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Sampler: TypeAlias = Literal["latin-hypercube", "low-discrepancy"]
 
-DIMENSIONS = 4  # three for a Gaussian, one along a line
+DIMENSIONS = 5  # three for a feature's spread, one along a line, one along gravity
 
 
 def uniforms(
@@ -38,7 +38,7 @@ def uniforms(
 
     Returns
     -------
-    (R, 4) array
+    (R, 5) array
         Numbers strictly between 0 and 1.
 
     Raises

@@ -7,6 +7,7 @@ from mixpose.density.blur import render
 from mixpose.density.grid import FLOOR, Density, Window
 from mixpose.density.observation import STEPS_PER_SIGMA, Observation
 from mixpose.density.overlap import close_pairs, peak, self_overlap
+from mixpose.density.weighting import weighted
 
 __all__ = [
     "FLOOR",
@@ -19,4 +20,5 @@ __all__ = [
     "peak",
     "render",
     "self_overlap",
+    "weighted",
 ]

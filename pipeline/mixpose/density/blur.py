@@ -91,7 +91,8 @@ def _render_grid(
     pattern: GridPattern, sigma: float, window: Window, gradient: bool
 ) -> NDArray[np.float32]:
     dimension = len(pattern.origin)
-    total = float(pattern.values.sum(dtype=np.float64)) * pattern.step**dimension
+    # magnitudes: the plain sum of a profile with noise about zero may be nothing or negative
+    total = float(np.abs(pattern.values).sum(dtype=np.float64)) * pattern.step**dimension
     if total <= 0:
         return _nothing(window, gradient)
     source = _blocks(pattern, window, margin=TRUNCATE * sigma)

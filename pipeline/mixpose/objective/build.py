@@ -39,7 +39,8 @@ def _paper(
     near: Floats,
     fine: bool,
 ) -> Objective:
-    return PaperObjective(sampled_terms(views, samples, sigmas, near), samples)
+    terms = sampled_terms(views, samples, sigmas, near)
+    return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
 
 
 def _independent(
@@ -50,7 +51,8 @@ def _independent(
     near: Floats,
     fine: bool,
 ) -> Objective:
-    return IndependentObjective(sampled_terms(views, samples, sigmas, near), samples)
+    terms = sampled_terms(views, samples, sigmas, near)
+    return IndependentObjective(terms, samples, body.world_offsets(samples.shape[1]))
 
 
 OBJECTIVES: dict[ObjectiveName, Builder] = {

@@ -57,15 +57,25 @@ class _SampledObjective:
     terms : sequence of SampledTerm
     samples : (N, R, 3) array
         Samples z_ir of every feature, in the object's frame.
+    world_offsets : (R, 3) array or None
+        Displacements in the world that belong to the samples, as by gravity: they do not turn
+        with the pose.
     """
 
-    def __init__(self, terms: Sequence[SampledTerm], samples: Floats) -> None:
+    def __init__(
+        self,
+        terms: Sequence[SampledTerm],
+        samples: Floats,
+        world_offsets: Floats | None = None,
+    ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
+        offsets = np.zeros((1, 3)) if world_offsets is None else world_offsets
+        self.offsets = np.broadcast_to(offsets, samples.shape).reshape(-1, 3)
 
     def densities(self, T_world_object: Floats) -> list[Floats]:
         """g_l at all samples (..., S), per sensor."""
-        points = transform(T_world_object, self.points)
+        points = transform(T_world_object, self.points) + self.offsets
         looked_up = []
         for term in self.terms:
             y, _ = term.sensor.project(points)
@@ -86,7 +96,7 @@ class _SampledObjective:
         raise AssertionError("an objective says how sensors combine")
 
     def _linearised(self, T_world_object: Floats) -> list[_Sampled]:
-        points = transform(T_world_object, self.points)
+        points = transform(T_world_object, self.points) + self.offsets
         result = []
         for term in self.terms:
             y, by_world, _ = term.sensor.linearise(points)

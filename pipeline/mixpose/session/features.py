@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.body import Body, Feature, PointFeature, SegmentFeature
+from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import Floats
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.markers import Markers, read_markers
@@ -53,9 +53,24 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
                 "found a segment without length; allowed: two different ends", "segments", i
             )
     spreads = _spreads(table, markers, count)
-    features: list[Feature] = [PointFeature(z, C) for z, C in zip(points, spreads)]
-    features += [SegmentFeature(a, b, C) for (a, b), C in zip(segments, spreads[len(points) :])]
-    return Body(table.name, tuple(features), _normals(table.normals, count))
+    kind = table.spread
+    features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]
+    for (a, b), C in zip(segments, spreads[len(points) :]):
+        features.append(SegmentFeature(a, b, C, kind))
+    normals = _normals(table.normals, count)
+    return Body(table.name, tuple(features), normals, _gravity(table))
+
+
+def _gravity(table: ObjectTable) -> Gravity | None:
+    if table.gravity is None:
+        return None
+    if not table.gravity.direction.any():
+        raise BadKeyError(
+            "found a direction without length; allowed: where gravity points in the world",
+            "gravity",
+            "direction",
+        )
+    return Gravity(table.gravity.direction, table.gravity.sigma)
 
 
 def _markers(table: ObjectTable, folder: Path) -> Markers | None:

@@ -21,6 +21,7 @@ from pydantic import (
 )
 from pydantic_core import core_schema
 
+from mixpose.body import Spread
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.session.arrays import LARGEST, RESOLUTION_FORM, is_number, numbers
@@ -127,6 +128,13 @@ class Placement(Table):
     translation: Annotated[Floats | None, ArrayOf((3,), "three numbers: x, y, z")] = None
 
 
+class GravityTable(Table):
+    """``[object.gravity]``: displacement along a direction of the world."""
+
+    direction: Annotated[Floats, ArrayOf((3,), "a direction [x, y, z] in the world")]
+    sigma: Annotated[Number, Field(gt=0, description="a length greater than 0")]
+
+
 class ObjectTable(Table):
     """``[object]``."""
 
@@ -141,6 +149,10 @@ class ObjectTable(Table):
     ] = None
     normals: Annotated[
         Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
+    ] = None
+    spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
+    gravity: Annotated[
+        GravityTable | None, Field(description="a table with direction and sigma")
     ] = None
 
 
@@ -169,7 +181,7 @@ class EstimatorTable(Table):
         "matched"
     )
     free: Annotated[tuple[str, ...], PlainValidator(_free)] = TWIST_NAMES
-    samples: Annotated[int, Field(ge=1, description="an integer of at least 1")] = 1000
+    samples: Annotated[int, Field(ge=2, description="an integer of at least 2")] = 1000
     seed: Annotated[int, Field(ge=0, description="an integer of at least 0")] = 0
 
 
