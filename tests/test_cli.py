@@ -75,6 +75,7 @@ def test_every_synthetic_recording_is_estimated_accurately(
     result = mixpose("run", SYNTHETIC / name / "session.toml", "-o", poses)
     assert result.returncode == 0, result.stderr
     assert result.stdout == ""
+    assert "ok -> " in result.stderr
     figures = evaluate(poses, SYNTHETIC / name / "truth.jsonl")
     assert figures["ok"] == figures["frames"]
     assert figures["missing"] == 0
@@ -234,13 +235,18 @@ def test_an_object_with_too_few_features_is_told(recording: Path) -> None:
     assert_one_line(mixpose("check", session), 2, "points", "found 2", "three")
 
 
-def test_without_a_start_one_line_says_so(recording: Path) -> None:
+def test_without_a_start_the_first_pose_is_searched_for(recording: Path) -> None:
     session = recording / "session.toml"
     text = session.read_text(encoding="utf-8")
     before, _, after = text.partition("[start]")
     rest = after[after.index("\n[") :]
     session.write_text(before + rest, encoding="utf-8")
-    assert_one_line(mixpose("run", session), 2, "start")
+    poses = recording / "poses.jsonl"
+    result = mixpose("run", session, "-o", poses)
+    assert result.returncode == 0, result.stderr
+    figures = evaluate(poses, SYNTHETIC / "two_cameras" / "truth.jsonl")
+    assert figures["ok"] == 8
+    assert figures["rotation_deg"]["max"] < 0.05
 
 
 def test_missing_files_are_told(recording: Path) -> None:
@@ -259,6 +265,46 @@ def test_wrong_options_are_one_line() -> None:
 def test_an_unwritable_output_is_told(recording: Path) -> None:
     result = mixpose("run", recording / "session.toml", "-o", recording / "no" / "poses.jsonl")
     assert_one_line(result, 2, "poses.jsonl")
+
+
+@pytest.mark.parametrize("name", ["session.toml", "left0003.png"])
+def test_an_input_is_never_overwritten(recording: Path, name: str) -> None:
+    before = (recording / name).read_bytes()
+    result = mixpose("run", recording / "session.toml", "-o", recording / name)
+    assert_one_line(result, 2, name, "input")
+    assert (recording / name).read_bytes() == before
+
+
+def test_a_file_of_another_origin_is_never_overwritten(recording: Path) -> None:
+    shutil.copy(SYNTHETIC / "two_cameras" / "truth.jsonl", recording)
+    (recording / "notes.txt").write_text("measured on Monday\n", encoding="utf-8")
+    for name in ("truth.jsonl", "notes.txt"):
+        before = (recording / name).read_bytes()
+        assert_one_line(mixpose("run", recording / "session.toml", "-o", recording / name), 2, name)
+        assert (recording / name).read_bytes() == before
+
+
+def test_a_run_that_fails_before_its_first_frame_leaves_earlier_poses(recording: Path) -> None:
+    poses = recording / "poses.jsonl"
+    assert mixpose("run", recording / "session.toml", "-o", poses, "--stop", "2").returncode == 0
+    before = poses.read_bytes()
+    (recording / "left0000.png").write_bytes(b"")
+    assert_one_line(mixpose("run", recording / "session.toml", "-o", poses), 3, "left0000.png")
+    assert poses.read_bytes() == before
+
+
+def test_a_stray_file_among_numbered_ones_is_told(recording: Path) -> None:
+    shutil.copy(recording / "left0000.png", recording / "left_test.png")
+    result = mixpose("run", recording / "session.toml", "--stop", "1")
+    assert "warning" in result.stderr
+    assert "left_test.png" in result.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_is_one_line() -> None:
+    session = SYNTHETIC / "two_cameras" / "session.toml"
+    result = mixpose("run", session, "-o", "/dev/full", "--stop", "1")
+    assert_one_line(result, 2, "No space left")
 
 
 def test_debug_shows_the_traceback(recording: Path) -> None:

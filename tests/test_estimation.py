@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.errors import SessionError
 from mixpose.estimation import (
     EstimatorOptions,
     Tracker,
@@ -174,16 +173,21 @@ def test_no_features_in_any_sensor_is_lost(
     assert not estimate.sensors["left"].used
 
 
-def test_a_start_is_needed(body: Body, pinhole_cameras: list[PinholeCamera]) -> None:
-    with pytest.raises(SessionError, match="start"):
-        estimate_pose(detect(pinhole_cameras, body, TRUTH), body)
+def test_without_a_start_the_pose_is_found_everywhere(
+    body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    T = from_rotation_vector([1.4, -2.0, 0.7], [80.0, 20.0, -30.0])
+    estimate = estimate_pose(detect(pinhole_cameras, body, T, noise=0.2, false=3), body)
+    assert estimate.status == "ok"
+    assert estimate.T_world_object is not None
+    assert rotation_angle_deg(estimate.T_world_object, T) < 0.3
 
 
 def test_a_moving_body_is_followed_and_found_again_after_an_occlusion(
     body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:
-    tracker = Tracker.create(body, EstimatorOptions())
-    track = tracker.begin(TRUTH)
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
     statuses = []
     for frame in range(20):
         phase = 0.25 * frame
@@ -220,7 +224,7 @@ def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
 def test_assessment_tells_hidden_from_met(body: Body, pinhole_cameras: list[PinholeCamera]) -> None:
     views = detect(pinhole_cameras, body, TRUTH, hidden=2, false=2)
     judged = assess(views, body, TRUTH, ALL_FREE)
-    assert judged.found == pytest.approx(12, abs=0.2)
+    assert judged.measurements == pytest.approx(24, abs=0.4)
     assert judged.coverage == pytest.approx(6 / 8, abs=0.02)
     for report in judged.sensors.values():
         # six of eight features met, six of eight detections explained: (6/8)²

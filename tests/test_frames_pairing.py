@@ -40,6 +40,9 @@ class Recorded:
     def describe(self) -> str:
         return "recorded"
 
+    def caution(self) -> str | None:
+        return None
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

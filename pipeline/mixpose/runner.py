@@ -47,6 +47,7 @@ def run(
     session: Session,
     *,
     sources: Mapping[str, str] | None = None,
+    opened: Mapping[str, Source] | None = None,
     selection: Selection = Selection(),
     T_start: Floats | None = None,
 ) -> Generator[Estimate, None, None]:
@@ -58,6 +59,8 @@ def run(
     sources : mapping of str to str or None
         Recordings that replace those of the session, by sensor name; relative to the working
         directory.
+    opened : mapping of str to Source or None
+        Recordings that `open_sources` opened already, in place of `sources`.
     selection : Selection
     T_start : (4, 4) array or None
         Pose to begin at in place of the session's ``[start]``.
@@ -70,33 +73,30 @@ def run(
     Raises
     ------
     SessionError
-        If the session has no start, or names no source for a sensor.
+        If the session names no source for a sensor.
     RecordingError
         In place of the first frame that cannot be read.
     """
     tracker, track = begin(session, T_start)
-    opened = open_sources(session, sources or {})
+    if opened is None:
+        opened = open_sources(session, sources or {})
     frames = pair(opened, selection.start, selection.stop, selection.step)
     return _estimates(session, tracker, track, frames)
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
     """The tracker of a session and its track before the first frame."""
-    if T_start is None:
-        if session.start is None:
-            raise SessionError(
-                f"{session.path}: start: found none, a start is needed: add [start] with "
-                "T_world_object near the first frame's pose"
-            )
-        T_start = session.start.T_world_object
     start = session.start
+    if T_start is None and start is not None:
+        T_start = start.T_world_object
     tracker = Tracker.create(
         session.body,
         session.estimator,
+        T_start,
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
     )
-    return tracker, tracker.begin(T_start)
+    return tracker, tracker.begin()
 
 
 def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:

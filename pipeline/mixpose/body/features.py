@@ -26,6 +26,11 @@ class Feature(Protocol):
     """A feature density q_i in the object's frame."""
 
     @property
+    def spread(self) -> Spread:
+        """Density of the spread about the nodes."""
+        ...
+
+    @property
     def mean(self) -> Floats:
         """Expected position (3,)."""
         ...

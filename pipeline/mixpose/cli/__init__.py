@@ -42,13 +42,24 @@ def _status(arguments: list[str]) -> int:
         return _fail(f"{error.format_message()} See {command} --help", WRONG_USAGE)
     except (KeyboardInterrupt, typer.Abort):
         outcome = INTERRUPTED
-    except BrokenPipeError:
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            if debug:
+                raise
+            _drop_standard_output()
+            place = f"{error.filename}: " if error.filename else "output: "
+            return _fail(f"{place}cannot be written or read: {error.strerror}", WRONG_USAGE)
         # the reader of a pipe has seen enough; keep Python from complaining when it flushes
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_standard_output()
         return 0
     if outcome == INTERRUPTED:  # which is also what typer makes of a keyboard interrupt
         return _fail("interrupted; everything so far is written", INTERRUPTED)
     return outcome if isinstance(outcome, int) else 0
+
+
+def _drop_standard_output() -> None:
+    """Let what is still in the buffer go nowhere when Python flushes it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _fail(message: str, status: int) -> int:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Iterable
-from contextlib import ExitStack, closing
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 from mixpose import __version__
+from mixpose.cli.notices import Summary, warn_of_sources
+from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import SessionError
-from mixpose.poses.formats import FORMATS, PoseWriter
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import JsonlWriter, read_poses, resume_point
+from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
-from mixpose.runner import Selection, run
+from mixpose.runner import Selection, open_sources, run
 from mixpose.session import Session, load_session
 
 
@@ -42,24 +42,41 @@ def run_session(path: Path, request: RunRequest) -> None:
     """
     session = load_session(path)
     header = header_of(session)
-    selection, T_start = request.selection, None
-    resumed = False
+    selection, T_start, resumed = request.selection, None, False
+    opened = open_sources(session, _sources(request.sources))
+    if request.output is not None and not _is_device(request.output):
+        refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
         selection, T_start, resumed = _resumed(request, header)
-    estimates = run(
-        session, sources=_sources(request.sources), selection=selection, T_start=T_start
-    )
-    with ExitStack() as stack:
-        stack.enter_context(closing(estimates))
-        stream = _open(request.output, stack, append=resumed)
-        writer: PoseWriter
-        if request.format == "jsonl":
-            writer = JsonlWriter(stream, header, resume=resumed)
-        else:
-            writer = FORMATS[request.format](stream, header)
-        stack.callback(writer.close)
+    warn_of_sources(opened)
+    summary = Summary()
+    estimates = run(session, opened=opened, selection=selection, T_start=T_start)
+    with (
+        closing(estimates),
+        Output(request.output, request.format, header, append=resumed) as output,
+    ):
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
-            writer.write(estimate)
+            output.write(estimate)
+            summary.add(estimate)
+    summary.say("" if request.output is None else f" -> {request.output}")
+
+
+def _is_device(path: Path) -> bool:
+    """Whether a path is a pipe or a device, which holds nothing that could be lost."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
+def _inputs(session: Session) -> Iterator[Path]:
+    """Files that a run reads."""
+    yield session.path
+    for setup in session.sensors:
+        names = (setup.source,) if isinstance(setup.source, str) else setup.source
+        for name in names:
+            yield session.folder / name
+            if isinstance(setup.source, str) and "://" not in name:
+                yield from session.folder.glob(name) if not Path(name).is_absolute() else ()
+        if setup.times is not None:
+            yield setup.times
 
 
 def header_of(session: Session) -> Header:
@@ -96,7 +113,8 @@ def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | N
     begin = last + 1
     if wanted.start is not None:
         # stay on the numbers that the whole run would have taken
-        begin = wanted.start + -(-(begin - wanted.start) // wanted.step) * wanted.step
+        steps = max(-(-(begin - wanted.start) // wanted.step), 0)
+        begin = wanted.start + steps * wanted.step
     elif wanted.step > 1:
         begin = last + wanted.step
     trusted = [
@@ -106,16 +124,6 @@ def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | N
     ]
     T_start = trusted[-1] if trusted else None
     return Selection(begin, wanted.stop, wanted.step), T_start, True
-
-
-def _open(output: Path | None, stack: ExitStack, *, append: bool) -> TextIO:
-    if output is None:
-        return sys.stdout
-    try:
-        stream = output.open("a" if append else "w", encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
-    return stack.enter_context(stream)
 
 
 def _with_progress(

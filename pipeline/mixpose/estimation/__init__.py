@@ -7,7 +7,8 @@ from mixpose.estimation.assessment import Assessment, assess
 from mixpose.estimation.local import Fit, fit_near, free_mask
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.single import estimate_pose
-from mixpose.estimation.tracker import Track, Tracker
+from mixpose.estimation.track import Track
+from mixpose.estimation.tracker import Tracker
 
 __all__ = [
     "Assessment",

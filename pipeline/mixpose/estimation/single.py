@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.errors import SessionError
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.tracker import Tracker
 from mixpose.objective import View
@@ -34,22 +33,15 @@ def estimate_pose(
         Sensors with what they observed.
     model : Body
     start : (4, 4) array or None
-        T_world_object near the pose.
+        T_world_object near the pose; without it the pose is searched for everywhere.
     options : EstimatorOptions or None
 
     Returns
     -------
     Estimate
         Of frame 0.
-
-    Raises
-    ------
-    SessionError
-        If no start is given.
     """
-    if start is None:
-        raise SessionError("estimate_pose: start: found none, a pose near the true one is needed")
-    tracker = Tracker.create(model, options or EstimatorOptions())
+    tracker = Tracker.create(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
-    _, estimate = tracker.advance(tracker.begin(start), 0, None, views)
+    _, estimate = tracker.advance(tracker.begin(), 0, None, views)
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))

@@ -1,67 +1,70 @@
-"""From frame to frame: predict, estimate, judge.
+"""From frame to frame: predict, estimate, search where that does not convince, judge.
 
 A tracker is a value: `advance` takes a track and a frame and returns the next track with the
-estimate.  While lost it keeps the last pose that it trusted, looks around it ever more widely,
-and invents nothing.
+estimate.  While lost it keeps what it trusted last, looks around it ever more widely and
+everywhere else, and invents nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.estimation.assessment import LEAST_COVERAGE, Assessment, assess
+from mixpose.estimation.assessment import Assessment, assess
+from mixpose.estimation.flips import flipped
 from mixpose.estimation.local import fit_near, free_mask
 from mixpose.estimation.multistart import NARROWING, candidates
 from mixpose.estimation.options import EstimatorOptions
+from mixpose.estimation.track import (
+    Branch,
+    Prediction,
+    Track,
+    follow,
+    nearest_alike,
+    predict,
+    prior_of,
+)
 from mixpose.objective import View
-from mixpose.records import Estimate, SensorReport
-from mixpose.rigid import perturb, twist_between
+from mixpose.records import Estimate, Hypothesis, SensorReport
+from mixpose.rigid import rotation_angle_deg
+from mixpose.search import search
 
 Floats: TypeAlias = NDArray[np.float64]
 
 START_ROTATION_DEG = 5.0
 START_DISTANCE_SHARE = 0.1  # of the body's radius
-CONVINCING = 0.75
-"""Share of the body that must be met for the first descent to be taken without looking further."""
 
-_COASTING = 3  # frames for which the velocity is believed without a pose
-_STEADY_ROTATION_DEG = 1.0
-_STEADY_DISTANCE_SHARE = 0.03
-_WIDENING = 1.5  # per frame without a pose
-_WIDEST = 4.0
+SURE = 7.0
+"""Log odds against clutter from which a pose is believed."""
+
+POSSIBLE = 0.0
+"""Log odds from which a pose is worth telling, if only as one of several."""
+
+_DOUBTFUL = -3.0  # log odds from which it is, where most of the body is met
+_MOST = 0.6
+
+RIVAL = 0.01
+"""Belief from which another pose makes a frame ambiguous."""
+
+CONVINCING = 0.75
+"""Share of the body that must be met for the prediction to be taken without looking elsewhere."""
+
+_LISTED = 0.001
+_SAME_ROTATION_DEG = 1.0
+_SAME_DISTANCE_SHARE = 0.02  # of the body's radius
 
 
 @dataclass(frozen=True)
-class Track:
-    """What is known between two frames.
-
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        The last pose that was trusted, or the start.
-    uncertainty : (6,) float64
-        Standard deviations of the next pose about the prediction.
-    frame : int or None
-        Where the last trusted pose was seen; None before the first.
-    time_s : float or None
-    velocity : (6,) float64
-        Twist per unit of the clock: seconds where the frames have times, else frames.
-    misses : int
-        Frames since the last trusted pose.
-    """
+class Rated:
+    """A pose with its assessment."""
 
     T_world_object: Floats
-    uncertainty: Floats
-    frame: int | None = None
-    time_s: float | None = None
-    velocity: Floats | None = None
-    misses: int = 0
+    assessment: Assessment
 
 
 @dataclass(frozen=True)
@@ -72,12 +75,14 @@ class Tracker:
     options: EstimatorOptions
     samples: Floats
     start_uncertainty: Floats
+    T_start: Floats | None = None
 
     @classmethod
     def create(
         cls,
         body: Body,
         options: EstimatorOptions,
+        T_start: Floats | None = None,
         *,
         rotation_deg: float | None = None,
         distance: float | None = None,
@@ -88,17 +93,26 @@ class Tracker:
         ----------
         body : Body
         options : EstimatorOptions
+        T_start : (4, 4) array or None
+            Where the body is about the first frame; None: anywhere.
         rotation_deg, distance : float or None
             Half-widths of where to look around the start; None: 5° and a tenth of the radius.
         """
         turn = np.radians(START_ROTATION_DEG if rotation_deg is None else rotation_deg)
         shift = START_DISTANCE_SHARE * body.radius if distance is None else distance
         samples = body.sample(options.samples, seed=options.seed)
-        return cls(body, options, samples, np.repeat([shift, turn], 3))
+        return cls(body, options, samples, np.repeat([shift, turn], 3), T_start)
 
-    def begin(self, T_start: Floats) -> Track:
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which of the six directions are estimated."""
+        return free_mask(self.options)
+
+    def begin(self) -> Track:
         """The track before the first frame."""
-        return Track(np.asarray(T_start, dtype=np.float64), self.start_uncertainty)
+        if self.T_start is None:
+            return Track()
+        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),))
 
     def advance(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
@@ -118,83 +132,115 @@ class Tracker:
         Track, Estimate
             The track for the next frame, and the frame's estimate without its latency.
         """
-        free = free_mask(self.options)
         usable = [view for view in views if not view.observation.is_empty]
-        unused = {view.name: SensorReport(False) for view in views if view.observation.is_empty}
-        best = self._best(track, frame, time_s, usable) if usable else None
-        reports = dict(unused) if best is None else {**best[1].sensors, **unused}
-        ordered = {view.name: reports[view.name] for view in views}
-        if best is None or not self._trusted(best[1], free):
-            lost = self._lost(frame, time_s, ordered, best)
-            return replace(track, misses=track.misses + 1), lost
-        T, judged = best
+        rated = self._rated(track, frame, time_s, usable) if usable else []
+        reports = {view.name: SensorReport(False) for view in views}
+        if rated:
+            reports |= rated[0].assessment.sensors
+        weights = beliefs(rated)
+        if not rated or not self._possible(rated[0]):
+            score = rated[0].assessment.score if rated else 0.0
+            lost = Estimate(frame, time_s, self.body.name, "lost", None, None, score, reports)
+            return track.missed(), lost
+        best = rated[0]
+        clear = self._sure(best) and (len(rated) == 1 or weights[1] < RIVAL)
+        kept = [(one.T_world_object, w) for one, w in zip(rated, weights) if w >= _LISTED]
         estimate = Estimate(
-            frame, time_s, self.body.name, "ok", T, judged.covariance, judged.score, ordered
+            frame=frame,
+            time_s=time_s,
+            object=self.body.name,
+            status="ok" if clear else "ambiguous",
+            T_world_object=best.T_world_object,
+            covariance=best.assessment.covariance,
+            score=best.assessment.score,
+            sensors=reports,
+            hypotheses=() if clear else tuple(Hypothesis(T, w) for T, w in kept),
         )
-        return self._follow(track, frame, time_s, T), estimate
+        noise = best.assessment.noise if clear else track.noise
+        return follow(track, self.body, kept, frame, time_s, noise), estimate
 
-    def _best(
+    def _rated(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> tuple[Floats, Assessment] | None:
-        """The pose that meets most of the body, looking ever wider until one convinces."""
-        free = free_mask(self.options)
-        best: tuple[Floats, Assessment] | None = None
-        for T_guess, uncertainty in self._guesses(track, frame, time_s, views):
-            fit = fit_near(views, self.body, T_guess, uncertainty, self.options, self.samples)
-            judged = assess(views, self.body, fit.T_world_object, free)
-            if best is None or judged.coverage > best[1].coverage:
-                best = fit.T_world_object, judged
-            if judged.coverage >= CONVINCING and self._trusted(judged, free):
-                break
-        return best
+    ) -> list[Rated]:
+        """Distinct poses that may explain the frame, most evident first."""
+        predictions = predict(track, frame, time_s)
+        T_reference = predictions[0].T_world_object if predictions else self.T_start
+        rated: list[Rated] = []
 
-    def _guesses(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> Iterator[tuple[Floats, Floats]]:
-        """Where to look, in order: the prediction, then ever wider about the last pose."""
-        wide = self.start_uncertainty * min(_WIDENING**track.misses, _WIDEST)
-        T_expected = track.T_world_object
-        if track.frame is not None and track.misses <= _COASTING:
-            elapsed = _elapsed(track, frame, time_s)
-            velocity = np.zeros(6) if track.velocity is None else track.velocity
-            T_expected = perturb(track.T_world_object, velocity * elapsed)
-            yield T_expected, track.uncertainty
-        yield track.T_world_object, wide
-        free_wide = np.where(free_mask(self.options), wide, 0.0)
-        for T in candidates(views, self.body, T_expected, free_wide, seed=self.options.seed):
-            yield T, free_wide / NARROWING
+        def consider(T: Floats) -> None:
+            T = nearest_alike(T, self.body, T_reference)
+            prior = prior_of(T, predictions, self.body, self.free, track.misses)
+            judged = assess(views, self.body, T, self.free, before=track.noise, prior=prior)
+            self._insert(rated, Rated(T, judged))
 
-    def _trusted(self, judged: Assessment, free: NDArray[np.bool_]) -> bool:
-        enough = judged.measurements >= int(free.sum())
-        return enough and judged.coverage >= LEAST_COVERAGE
+        for prediction in predictions:
+            consider(self._fit(views, prediction.T_world_object, prediction.uncertainty))
+        if not (rated and self._sure(rated[0]) and rated[0].assessment.coverage > CONVINCING):
+            for T in self._elsewhere(views, predictions):
+                consider(T)
+        for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
+            consider(self._fit(views, mirrored, self.start_uncertainty / NARROWING))
+        return rated
 
-    def _lost(
-        self,
-        frame: int,
-        time_s: float | None,
-        reports: Mapping[str, SensorReport],
-        best: tuple[Floats, Assessment] | None,
-    ) -> Estimate:
-        score = 0.0 if best is None else best[1].score
-        return Estimate(frame, time_s, self.body.name, "lost", None, None, score, reports)
-
-    def _follow(self, track: Track, frame: int, time_s: float | None, T: Floats) -> Track:
-        """The track after a trusted pose."""
-        velocity, uncertainty = None, self.start_uncertainty
-        if track.frame is not None:
-            elapsed = _elapsed(track, frame, time_s)
-            moved = twist_between(track.T_world_object, T)
-            velocity = moved / elapsed if elapsed > 0 and track.misses == 0 else None
-            steady = np.repeat(
-                [_STEADY_DISTANCE_SHARE * self.body.radius, np.radians(_STEADY_ROTATION_DEG)], 3
+    def _elsewhere(self, views: Sequence[View], predictions: Sequence[Prediction]) -> list[Floats]:
+        """Poses found without a prediction: around it by many starts, and everywhere."""
+        found = []
+        for prediction in predictions[:1]:
+            wide = np.where(
+                self.free, np.maximum(prediction.uncertainty, self.start_uncertainty), 0
             )
-            half = np.repeat([np.abs(moved[:3]).max(), np.abs(moved[3:]).max()], 3) / 2
-            uncertainty = np.maximum(half, steady)
-        return Track(T, uncertainty, frame, time_s, velocity)
+            T = prediction.T_world_object
+            for start in candidates(views, self.body, T, wide, seed=self.options.seed):
+                found.append(self._fit(views, start, wide / NARROWING))
+        T_reference = predictions[0].T_world_object if predictions else self.T_start
+        for candidate in search(
+            views,
+            self.body,
+            free=self.free,
+            T_reference=T_reference,
+            seed=self.options.seed,
+        ):
+            T = candidate.T_world_object
+            if self.options.objective != "matched":
+                T = self._fit(views, T, self.start_uncertainty / NARROWING**2)
+            found.append(T)
+        return found
+
+    def _fit(self, views: Sequence[View], T: Floats, uncertainty: Floats) -> Floats:
+        fit = fit_near(views, self.body, T, uncertainty, self.options, self.samples)
+        return fit.T_world_object
+
+    def _sure(self, rated: Rated) -> bool:
+        return self._possible(rated) and rated.assessment.log_evidence > SURE
+
+    def _possible(self, rated: Rated) -> bool:
+        enough = rated.assessment.measurements >= int(self.free.sum())
+        least = _DOUBTFUL if rated.assessment.coverage >= _MOST else POSSIBLE
+        return enough and rated.assessment.log_evidence > least
+
+    def _insert(self, rated: list[Rated], new: Rated) -> None:
+        """Keep a list of distinct poses, the most evident first."""
+        for k, old in enumerate(rated):
+            if self._alike(old.T_world_object, new.T_world_object):
+                if new.assessment.log_evidence > old.assessment.log_evidence:
+                    rated[k] = new
+                break
+        else:
+            rated.append(new)
+        rated.sort(key=lambda one: -one.assessment.log_evidence)
+
+    def _alike(self, T_a: Floats, T_b: Floats) -> bool:
+        T_b = nearest_alike(T_b, self.body, T_a)
+        centre = np.append(self.body.means.mean(axis=0), 1.0)
+        apart = float(np.linalg.norm((T_a - T_b) @ centre))
+        near = apart < _SAME_DISTANCE_SHARE * self.body.radius
+        return near and float(rotation_angle_deg(T_a, T_b)) < _SAME_ROTATION_DEG
 
 
-def _elapsed(track: Track, frame: int, time_s: float | None) -> float:
-    """Time since the last trusted pose: seconds where both frames have times, else frames."""
-    if time_s is not None and track.time_s is not None:
-        return time_s - track.time_s
-    return float(frame - (track.frame or 0))
+def beliefs(rated: Sequence[Rated]) -> list[float]:
+    """Share of belief of each pose among its rivals."""
+    if not rated:
+        return []
+    logs = np.array([one.assessment.log_evidence for one in rated])
+    weights = np.exp(logs - logs.max())
+    return [float(w) for w in weights / weights.sum()]

@@ -68,6 +68,28 @@ class ImageSequence:
         numbers = numbers_text(self.first, self.numbers[-1], self.length)
         return f"{self.length} image{plural} {_size_text(_size(image))}{depth}, {numbers}"
 
+    def caution(self) -> str | None:
+        """What is odd about the numbers: a file or two among numbered ones took them from all."""
+        if self.length < 3 or self.numbers != tuple(range(self.length)):
+            return None
+        ends = [re.search(r"[0-9]+$", path.stem) for path in self.paths]
+        values = [int(end.group()) if end else None for end in ends]
+        if all(value == number for value, number in zip(values, self.numbers, strict=True)):
+            return None
+        bare = [path.name for path, value in zip(self.paths, values, strict=True) if value is None]
+        if bare and len(bare) < self.length / 2:
+            return (
+                f"{bare[0]} ends in no frame number but {self.length - len(bare)} others do, so "
+                "all are numbered by their place; leave it out of the source"
+            )
+        if not bare:
+            twice = next(v for v in values if values.count(v) > 1)
+            return (
+                f"two names end in the frame number {twice}, so all are numbered by their place; "
+                "leave one out of the source"
+            )
+        return None
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

@@ -69,6 +69,10 @@ class RangeProfiles:
             f"{reach:g}, {numbers_text(0, self.length - 1, self.length)}"
         )
 
+    def caution(self) -> str | None:
+        """Nothing to say of it: only images can be misnumbered."""
+        return None
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

@@ -74,6 +74,9 @@ class Source(Protocol):
     def describe(self) -> str:
         """One line for people: what, how many, which numbers."""
 
+    def caution(self) -> str | None:
+        """What is odd about the recording though it can be read; None if nothing is."""
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

@@ -86,6 +86,10 @@ class DetectionTable:
         numbers = numbers_text(contents.first, contents.last, contents.frames)
         return f"{contents.rows} detections, {numbers}"
 
+    def caution(self) -> str | None:
+        """Nothing to say of it: only images can be misnumbered."""
+        return None
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

@@ -68,6 +68,10 @@ class Video:
             return f"{size}, frames from 0"
         return f"{size}, {numbers_text(0, self.promised - 1, self.promised)}"
 
+    def caution(self) -> str | None:
+        """Nothing to say of it: only images can be misnumbered."""
+        return None
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

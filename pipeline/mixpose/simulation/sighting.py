@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body, SegmentFeature
-from mixpose.body.features import Feature, gaussian
+from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats
 from mixpose.sensors import Sensor
 from mixpose.sensors.base import Mask
@@ -127,7 +127,8 @@ def brightness_levels(count: int, spread: float, rng: np.random.Generator) -> Fl
 def displacements(body: Body, rng: np.random.Generator) -> Floats:
     """Displacements (N, 3) of the features, drawn from the spread that the body states."""
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
-    return np.array([gaussian(u, f.covariance)[0] for u, f in zip(draws, body.features)])
+    pairs = zip(draws, body.features, strict=True)
+    return np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
 
 
 def _hidden(count: int, options: SimulationOptions, rng: np.random.Generator) -> Mask:

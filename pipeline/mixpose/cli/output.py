@@ -1,0 +1,118 @@
+"""Where poses are written: to a stream, or to a file that is never something else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from mixpose.errors import SessionError
+from mixpose.poses.formats import FORMATS, PoseWriter
+from mixpose.poses.header import Header
+from mixpose.poses.jsonl import JsonlWriter
+from mixpose.records import Estimate
+
+_FIRST_WORDS = ('{"type": "header"', "frame,time_s,object", "scene_id,im_id", "#")
+
+
+class Output:
+    """Writes poses; a file is opened with the first of them, so that no failure empties it.
+
+    Parameters
+    ----------
+    path : Path or None
+        None is standard output.
+    format_name : str
+        Of `mixpose.poses.formats.FORMATS`.
+    header : Header
+    append : bool
+        Go on in a file of JSON lines that has its header already.
+    """
+
+    def __init__(
+        self, path: Path | None, format_name: str, header: Header, *, append: bool
+    ) -> None:
+        self._path, self._format, self._header = path, format_name, header
+        self._append = append
+        self._stream: TextIO | None = None
+        self._writer: PoseWriter | None = None
+
+    def __enter__(self) -> Output:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if error is None and self._writer is None and not (self._path and self._path.exists()):
+            self._open()  # a run without frames says at least what it was
+        if self._writer is not None and not isinstance(error, OSError):
+            self._writer.close()
+        if self._stream is not None and self._path is not None:
+            self._stream.close()
+
+    def write(self, estimate: Estimate) -> None:
+        """Write one frame, at once."""
+        writer = self._writer or self._open()
+        writer.write(estimate)
+
+    def _open(self) -> PoseWriter:
+        stream: TextIO = sys.stdout
+        if self._path is not None:
+            try:
+                stream = open_text(self._path, append=self._append)
+            except OSError as error:
+                raise SessionError(
+                    f"-o {self._path}: cannot be written: {error.strerror}"
+                ) from error
+        if self._format == "jsonl":
+            self._writer = JsonlWriter(stream, self._header, resume=self._append)
+        else:
+            self._writer = FORMATS[self._format](stream, self._header)
+        self._stream = stream
+        return self._writer
+
+
+def open_text(path: Path, *, append: bool) -> TextIO:
+    """Open a text file for writing, the same bytes on every system."""
+    return path.open("a" if append else "w", encoding="utf-8", newline="\n")
+
+
+def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
+    """Make sure that a file about to be written is new, or holds poses that mixpose wrote.
+
+    Raises
+    ------
+    SessionError
+        If it is an input of the run, or holds something else.
+    """
+    if not path.parent.is_dir():
+        raise SessionError(f"-o {path}: there is no folder {path.parent}")
+    if path.is_dir():
+        raise SessionError(f"-o {path}: is a folder; name a file")
+    if not path.is_file():
+        return
+    if any(each.exists() and path.samefile(each) for each in inputs):
+        raise SessionError(f"-o {path}: is an input of this run; name another file")
+    with path.open("rb") as stream:
+        beginning = stream.read(4096).decode("utf-8", errors="replace")
+    first = beginning.partition("\n")[0]
+    numbers_only = first and all(_is_number(word) for word in first.split())
+    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only):
+        raise SessionError(
+            f"-o {path}: holds something that mixpose did not write; name another file"
+        )
+    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
+        raise SessionError(f"-o {path}: holds poses of another origin; name another file")
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

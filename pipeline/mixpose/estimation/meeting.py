@@ -1,0 +1,214 @@
+"""Where a pose meets a sensor's observation: which features were met, and how closely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import Observation, peak
+from mixpose.objective import pose_jacobian
+from mixpose.objective.base import facing
+from mixpose.objective.matched import MatchedTerm, overlap_terms
+from mixpose.records import PointPattern
+from mixpose.rigid import transform
+
+Floats: TypeAlias = NDArray[np.float64]
+
+LEAST_SHARE = 0.3  # of a full feature's density: below it a feature was not met
+_SMALLEST_REGION = 20.0  # in σ: features crowd at least over so wide a region
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """A pose against one sensor, at the finest blur.
+
+    Attributes
+    ----------
+    explained : float
+        Share of the sensor's density that the pose accounts for.
+    shares : (n,) float64
+        How far each feature in view was met, 0 to its weight.
+    offsets : (n, m) float64
+        Observed minus predicted place of each, sensor units; 0 where it was not met.
+    J : (n, m, 6) float64
+        Jacobian of the predicted places by the pose.
+    expected : float
+        Sum of the weights of the features in view.
+    unseen : float
+        Sum of the weights of the features that face the sensor outside its view.
+    sigma : float
+        σ_ε.
+    crowd : float
+        Observed features per unit of the sensor's coordinates, around the prediction.
+    count : float
+        Number of observed features.
+    """
+
+    explained: float
+    shares: Floats
+    offsets: Floats
+    J: Floats
+    expected: float
+    unseen: float
+    sigma: float
+    crowd: float
+    count: float
+
+    @property
+    def coverage(self) -> float:
+        """Share of the features that face the sensor that were met."""
+        return float(self.shares.sum() / max(self.expected + self.unseen, 1e-12))
+
+    @property
+    def measurements(self) -> float:
+        """Number of coordinates that were met."""
+        return float(self.shares.sum() * self.J.shape[1])
+
+    @property
+    def squares(self) -> float:
+        """Sum of the squared offsets, in σ."""
+        scaled = self.offsets / self.sigma
+        return float(self.shares @ (scaled * scaled).sum(axis=1))
+
+    @property
+    def rms(self) -> float | None:
+        """Root mean square of the offsets of the met features, sensor units; None without any."""
+        if not self.shares.any():
+            return None
+        return float(self.sigma * np.sqrt(self.squares / self.shares.sum()))
+
+
+def meet(
+    term: MatchedTerm, observation: Observation, body: Body, T_world_object: Floats
+) -> Meeting:
+    """Compare what a pose predicts for a sensor with what was observed.
+
+    Parameters
+    ----------
+    term : MatchedTerm
+        The sensor's matched density at σ_ε, on fine tiles around the pose.
+    observation : Observation
+    body : Body
+    T_world_object : (4, 4) array
+
+    Returns
+    -------
+    Meeting
+    """
+    points, weights = body.nodes.points, body.nodes.weights
+    points_world = transform(T_world_object, points)
+    y, by_world, seen = term.sensor.linearise(points_world)
+    faced = facing(term.sensor, T_world_object, points_world, body.node_normals)
+    count = peak(term.variance, y.shape[1]) / term.energy
+    unseen = float(weights[faced & ~seen].sum())
+    seen &= faced
+    J = pose_jacobian(by_world[seen], T_world_object, points[seen])
+    sampled = term.matched.sample(y)[seen].astype(np.float64)
+    y, weights = y[seen], weights[seen]
+    shares, offsets, explained = np.zeros(len(y)), np.zeros(y.shape), 0.0
+    product = float(weights @ sampled[:, 0])
+    if product > 0:
+        norm = overlap_terms(y, J, weights, term.variance).norm
+        explained = min(product**2 / (term.energy * norm), 1.0)
+        if isinstance(observation.pattern, PointPattern):
+            shares, offsets = _nearest(observation.pattern, y, weights, term.variance)
+        else:
+            shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
+    sigma = float(np.sqrt(term.variance / 2))
+    return Meeting(
+        explained=explained,
+        shares=shares,
+        offsets=offsets,
+        J=J,
+        expected=float(weights.sum()),
+        unseen=unseen,
+        sigma=sigma,
+        crowd=_crowd(observation, y, sigma, count),
+        count=_count(observation, count),
+    )
+
+
+def _nearest(
+    pattern: PointPattern, y: Floats, weights: Floats, variance: float
+) -> tuple[Floats, Floats]:
+    """Offsets to the detection nearest to each prediction, each detection taken once.
+
+    Returns
+    -------
+    shares : (n,) array
+        The weight of a feature that was met, 0 for the others.
+    offsets : (n, m) array
+    """
+    shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
+    away = pattern.points[None] - y[:, None]
+    squared = (away * away).sum(axis=-1)
+    order = np.argsort(squared, axis=None)
+    reach = -2 * variance * np.log(LEAST_SHARE)
+    i, j = np.unravel_index(order[: int((squared <= reach).sum())], squared.shape)
+    free = np.ones(squared.shape[1], dtype=np.bool_)
+    for feature, detection in zip(i.tolist(), j.tolist(), strict=True):
+        if free[detection] and not shares[feature]:
+            free[detection] = False
+            shares[feature] = weights[feature]
+            offsets[feature] = away[feature, detection]
+    return shares, offsets
+
+
+def _residuals(
+    term: MatchedTerm, y: Floats, weights: Floats, sampled: Floats, amplitude: float
+) -> tuple[Floats, Floats]:
+    """How far a grid of values puts each feature from its prediction.
+
+    Around a prediction that fits, C is `amplitude` times the predicted mixture blurred alike.
+    What is left of the gradient is the pull on this feature alone, without its neighbours'.
+
+    Returns
+    -------
+    shares : (n,) array
+        Weight with which each feature was met; 0 for those that were not.
+    offsets : (n, m) array
+        Residuals in sensor units.
+    """
+    top = peak(term.variance, y.shape[1])
+    away = y[:, None] - y[None]
+    bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / term.variance) * top
+    predicted_gradient = -(bells[..., None] * away).sum(axis=1) / term.variance
+    neighbours = bells.sum(axis=1) - weights * top
+    own = sampled[:, 0] - amplitude * neighbours
+    # what the better half of the features looks like on its own
+    full = float(np.median(np.sort(own)[len(own) // 2 :]))
+    if full <= 0:
+        return np.zeros(len(y)), np.zeros(y.shape)
+    shares = np.clip(own / full, 0.0, 1.0)
+    shares = np.where(shares > LEAST_SHARE, shares, 0.0) * weights
+    pull = sampled[:, 1:] - amplitude * predicted_gradient
+    offsets = term.variance * pull / np.maximum(own, LEAST_SHARE * full)[:, None]
+    return shares, np.where(shares[:, None] > 0, offsets, 0.0)
+
+
+def _count(observation: Observation, participation: float) -> float:
+    """Number of observed features: of detections, or of equal ones that give the energy."""
+    if isinstance(observation.pattern, PointPattern):
+        return float(len(observation.pattern.points))
+    return participation
+
+
+def _crowd(observation: Observation, y: Floats, sigma: float, count: float) -> float:
+    """Density of observed features: over the whole pattern, or near the body if denser there."""
+    smallest = _SMALLEST_REGION * sigma
+    lower, upper = observation.extent()
+    overall = _count(observation, count) / float(np.prod(np.maximum(upper - lower, smallest)))
+    if not isinstance(observation.pattern, PointPattern):
+        return overall
+    found = observation.pattern.points
+    if not len(y):
+        return overall
+    near, far = y.min(axis=0), y.max(axis=0)
+    grow = np.maximum(smallest - (far - near), 0.0) / 2
+    inside = np.all((found >= near - grow) & (found <= far + grow), axis=1)
+    region = float(np.prod(np.maximum(far - near, smallest)))
+    return max(overall, float(inside.sum()) / region)

@@ -1,0 +1,71 @@
+"""Poses from three points of the body and where they are in the world, in bulk."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_TINY = np.finfo(np.float64).tiny
+
+
+def align_triples(body: Floats, world: Floats) -> Floats:
+    """Rigid motions that bring triangles onto triangles of about the same shape.
+
+    Parameters
+    ----------
+    body, world : (3, 3, K) array
+        Corners of the triangles: corner, coordinate, triangle.
+
+    Returns
+    -------
+    (K, 4, 4) array
+        T_world_object: centres coincide, planes coincide, and within the plane the turn is the
+        least-squares one.
+    """
+    centre_body, centre_world = body.mean(axis=0), world.mean(axis=0)
+    from_centre_body, from_centre_world = body - centre_body, world - centre_world
+    x_body, y_body, z_body = _frames(body)
+    x_world, y_world, z_world = _frames(world)
+    sine, cosine = np.zeros(body.shape[2]), np.zeros(body.shape[2])
+    for a, b in zip(from_centre_body, from_centre_world):
+        ax, ay, bx, by = _dot(a, x_body), _dot(a, y_body), _dot(b, x_world), _dot(b, y_world)
+        sine += ax * by - ay * bx
+        cosine += ax * bx + ay * by
+    length = np.maximum(np.hypot(sine, cosine), _TINY)
+    c, s = cosine / length, sine / length
+    turned_x, turned_y = c * x_body - s * y_body, s * x_body + c * y_body
+    T = np.zeros((body.shape[2], 4, 4))
+    for i in range(3):
+        for j in range(3):
+            T[:, i, j] = (
+                x_world[i] * turned_x[j] + y_world[i] * turned_y[j] + z_world[i] * z_body[j]
+            )
+        T[:, i, 3] = centre_world[i] - (T[:, i, :3].T * centre_body).sum(axis=0)
+    T[:, 3, 3] = 1.0
+    return T
+
+
+def _frames(triangles: Floats) -> tuple[Floats, Floats, Floats]:
+    """Orthonormal axes (3, K each): along the first side, in the plane, across it."""
+    x = _unit(triangles[1] - triangles[0])
+    z = _unit(cross(x, triangles[2] - triangles[0]))
+    return x, cross(z, x), z
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of vectors (3, K)."""
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.maximum(np.sqrt(_dot(vectors, vectors)), _TINY))

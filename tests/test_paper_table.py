@@ -1,0 +1,202 @@
+"""The paper's accuracy table, reduced to a few runs: what is exact, and what is a bound."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+TOOLS = Path(__file__).resolve().parents[1] / "tools"
+sys.path.insert(0, str(TOOLS))
+
+from paper import runs  # noqa: E402
+from paper.bounds import cramer_rao, oracle  # noqa: E402
+from paper.matched import Fit, fit_grids  # noqa: E402
+from paper.measurements import measure  # noqa: E402
+from paper.runs import DEGREES, START_UNCERTAINTY, Errors, views  # noqa: E402
+from paper.sampled import sampled_objectives  # noqa: E402
+from paper.search import fmaxsearch  # noqa: E402
+from paper.systems import (  # noqa: E402
+    POINTS,
+    SCENARIOS,
+    Scenario,
+    System,
+    draw,
+    parameters,
+    pose,
+    systems,
+)
+from paper.table import COLUMNS, rms_table  # noqa: E402
+
+from mixpose.density import Density, Window  # noqa: E402
+from mixpose.objective import IndependentObjective, PaperObjective  # noqa: E402
+from mixpose.objective.paper import SampledTerm  # noqa: E402
+from mixpose.rigid import transform  # noqa: E402
+
+Floats = NDArray[np.float64]
+SYSTEMS = {system.name: system for system in systems()}
+BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
+
+
+@pytest.fixture(scope="module")
+def one_run() -> Errors:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "SAMPLES", 100)  # a tenth, as only the matched estimate is judged
+        return runs.run(0, 0)
+
+
+def matched(system: System, scenario: Scenario, number: int) -> tuple[Fit, Floats]:
+    """A fit from a start as the paper draws it, and its error in degrees and units."""
+    truth, start = draw(np.random.default_rng([7, number]))
+    measurements = measure(system, scenario, truth, np.random.default_rng(number))
+    seen = views(system, scenario, measurements)
+    fit = fit_grids(seen, system.body(scenario), pose(start), START_UNCERTAINTY)
+    return fit, (parameters(fit.T_world_object) - truth) * DEGREES
+
+
+def test_a_pose_is_turned_after_it_is_shifted() -> None:
+    beta, _ = draw(np.random.default_rng(3))
+    c, s = np.cos(beta[:3]), np.sin(beta[:3])
+    R1 = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
+    R2 = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
+    R3 = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+    expected = (POINTS + beta[3:]) @ (R3 @ R2 @ R1).T
+    assert transform(pose(beta), POINTS) == pytest.approx(expected, abs=1e-10)
+    assert parameters(pose(beta)) == pytest.approx(beta, abs=1e-12)
+
+
+def test_starts_are_drawn_within_the_intervals_of_the_paper() -> None:
+    drawn = [draw(np.random.default_rng(k)) for k in range(500)]
+    truths = np.array([truth for truth, _ in drawn])
+    off = np.array([start - truth for truth, start in drawn])
+    assert np.abs(np.degrees(truths[:, :3]) - np.array([0, 0, -60])).max() <= 5
+    assert np.abs(truths[:, 3:] - 40).max() <= 5
+    assert np.abs(np.degrees(off[:, :3])).max() <= 2.5
+    assert np.abs(off[:, 3:]).max() <= 5
+
+
+@pytest.mark.parametrize("name", ["1", "3"])
+def test_no_feature_is_cut_off_in_the_widest_scenario(name: str) -> None:
+    truth, _ = draw(np.random.default_rng(5))
+    for one in measure(SYSTEMS[name], BY_NAME["II"], truth, np.random.default_rng(0)):
+        # six Gaussians of unit mass on a grid of one unit
+        assert one.clean.sum() == pytest.approx(6.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["1", "3"])
+def test_noise_is_twice_the_peak_of_one_feature(name: str) -> None:
+    system = SYSTEMS[name]
+    truth, _ = draw(np.random.default_rng(5))
+    one = measure(system, BY_NAME["IV"], truth, np.random.default_rng(0))[0]
+    peak = (2 * np.pi * 25) ** (-system.sensors[0].dimension / 2)
+    assert (one.values - one.clean).std() == pytest.approx(2 * peak, rel=0.1)
+
+
+@pytest.mark.parametrize("name", ["1", "2", "3"])
+def test_fast_objectives_are_those_of_mixpose(name: str) -> None:
+    system, scenario = SYSTEMS[name], BY_NAME["I"]
+    truth, start = draw(np.random.default_rng(1))
+    measurements = measure(system, scenario, truth, np.random.default_rng(0))
+    samples = system.body(scenario).sample(200, antithetic=False)
+    terms = [
+        SampledTerm(
+            sensor, Density(m.values / m.values.sum(), Window(m.origin, m.values.shape, 1.0), 5.0)
+        )
+        for sensor, m in zip(system.sensors, measurements, strict=True)
+    ]
+    paper, independent = sampled_objectives(system, measurements, samples)
+    for beta in (truth, start):
+        # single-precision coordinates: 1e-4 units of 5 at the farthest
+        assert paper(beta) == pytest.approx(
+            float(PaperObjective(terms, samples).value(pose(beta))), rel=2e-5
+        )
+        assert independent(beta) == pytest.approx(
+            float(IndependentObjective(terms, samples).value(pose(beta))), rel=2e-5
+        )
+
+
+def test_the_simplex_starts_like_fminsearch() -> None:
+    def bowl(x: Floats) -> float:
+        return float((x[0] - 3) ** 2 + 2 * (x[1] + 1) ** 2)
+
+    start = np.array([2.0, 0.0])
+    options = {"xatol": 1e-4, "fatol": 1e-4}
+    expected = minimize(bowl, start, method="Nelder-Mead", options=options).x
+    assert fmaxsearch(lambda x: -bowl(x), start) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("scenario", ["I", "II", "III-as-printed"])
+@pytest.mark.parametrize(("name", "bound"), [("1", 1e-3), ("3", 1e-2)])
+def test_the_matched_estimate_is_exact_without_noise(
+    name: str, bound: float, scenario: str
+) -> None:
+    # measured over 300 runs: 2e-7 for the cameras, 1e-4 for the ranges
+    for number in range(3):
+        _, error = matched(SYSTEMS[name], BY_NAME[scenario], number)
+        assert np.abs(error).max() < bound
+
+
+def test_a_deformed_body_is_fitted_like_known_correspondences() -> None:
+    system, scenario = SYSTEMS["1"], BY_NAME["III"]
+    for number in range(3):
+        truth, _ = draw(np.random.default_rng([7, number]))
+        fit, error = matched(system, scenario, number)
+        known = (oracle(system, scenario, system.body(scenario), truth) - truth) * DEGREES
+        assert fit.settled
+        assert np.abs(known).max() > 5  # the deformation moves any estimate by that much
+        assert error == pytest.approx(known, abs=1e-3)
+
+
+def test_noise_is_not_taken_for_a_deformed_body() -> None:
+    for name in ("1", "3"):
+        for number in range(2):
+            fit, _ = matched(SYSTEMS[name], BY_NAME["IV"], number)
+            assert not fit.settled
+            assert fit.misfit < 6  # standard deviations; a deformed body shows 1e15
+
+
+def test_under_noise_the_matched_estimate_is_near_the_cramer_rao_bound() -> None:
+    system, scenario = SYSTEMS["1"], BY_NAME["IV"]
+    ratios = []
+    for number in range(5):
+        truth, _ = draw(np.random.default_rng([7, number]))
+        measurements = measure(system, scenario, truth, np.random.default_rng(number))
+        bound = cramer_rao(system, scenario, measurements, truth) * DEGREES**2
+        _, error = matched(system, scenario, number)
+        ratios.append(error**2 / bound)
+    # the mean of 30 dependent ratios has expectation 1 and a standard deviation of about 0.35
+    assert 0.2 < np.mean(ratios) < 2.5
+
+
+def test_a_run_fills_every_cell(one_run: Errors) -> None:
+    table = rms_table([one_run])
+    assert list(table) == ["1", "2", "3"]
+    for scenarios in table.values():
+        assert list(scenarios) == ["I", "II", "III", "III-as-printed", "IV"]
+        for name, row in scenarios.items():
+            assert set(row) == set(COLUMNS)
+            for column in ("paper", "matched", "oracle", "independent"):
+                values: Any = row[column]
+                assert len(values) == 6
+                assert np.all(np.isfinite(values))
+            assert (row["crlb"] is None) == (name != "IV")
+            assert (row["published"] is None) == (name == "III")
+
+
+def test_the_papers_objective_is_biased_where_features_overlap(one_run: Errors) -> None:
+    cell = one_run["3", "II"]
+    assert np.abs(cell["paper"][:3]).max() > 1  # degrees; 10 over many runs
+    assert np.abs(cell["matched"][:3]).max() < 1e-2
+
+
+def test_zero_runs_are_refused() -> None:
+    command = [sys.executable, str(TOOLS / "reproduce_paper.py"), "--runs", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "--runs: found 0" in done.stderr

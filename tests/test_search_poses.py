@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.body import Body
+from mixpose.density import Observation
+from mixpose.errors import SessionError
+from mixpose.objective import View
+from mixpose.records import GridPattern, PointPattern
+from mixpose.rigid import from_rotation_vector, transform
+from mixpose.runner import observe, open_sources
+from mixpose.search import Candidate, search
+from mixpose.sensors import ParallelBeam
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from benchmarks.search_cases import Row, Trial, absent, errors, is_right, trial
+
+ALL = np.ones(6, dtype=np.bool_)
+
+
+def found(frame: Trial) -> list[Candidate]:
+    return search(frame.views, frame.body, free=ALL, T_reference=None)
+
+
+@pytest.mark.parametrize(
+    ("row", "trials"),
+    [
+        (Row("2 pinhole", 6, 0, 0, 0.99), 8),
+        (Row("2 pinhole", 6, 1, 3, 0.99), 8),
+        (Row("2 pinhole", 8, 2, 4, 0.99), 8),
+        (Row("2 pinhole", 6, 2, 4, 0.95), 5),
+        (Row("2 pinhole", 8, 4, 8, 0.95), 2),
+        (Row("1 pinhole", 5, 0, 5, 0.99), 4),
+        (Row("1 pinhole", 8, 2, 5, 0.99), 2),
+        (Row("2 parallel", 6, 0, 0, 0.99), 8),
+        (Row("2 parallel", 6, 1, 2, 0.99), 8),
+        (Row("3 ranges", 6, 0, 0, 0.95), 3),
+    ],
+    ids=lambda value: value.name if isinstance(value, Row) else "",
+)
+def test_a_random_pose_of_a_random_body_is_found(row: Row, trials: int) -> None:
+    for seed in range(trials):
+        frame = trial(row, seed)
+        assert is_right(found(frame)[0].T_world_object, frame), seed
+
+
+def test_one_of_two_poses_that_fit_four_detections_alike_is_the_true_one() -> None:
+    row = Row("1 pinhole", 5, 1, 5, 0.8)
+    for seed in range(4):
+        frame = trial(row, seed)
+        candidates = found(frame)
+        assert any(is_right(each.T_world_object, frame) for each in candidates), seed
+
+
+def test_false_detections_alone_have_little_evidence() -> None:
+    row = Row("2 pinhole", 6, 1, 3, 0.99)
+    with_body = [found(trial(row, seed))[0].evidence for seed in range(4)]
+    without = [found(absent(row, seed, detections=8)) for seed in range(4)]
+    most = max(each[0].evidence for each in without if each)
+    # the odds that tell a body from none: at least e^15
+    assert min(with_body) > most + 15
+
+
+def test_candidates_are_the_same_for_the_same_seed() -> None:
+    frame = trial(Row("1 pinhole", 5, 0, 5, 0.99), 0)
+    first, second = found(frame), found(frame)
+    assert len(first) == len(second)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.T_world_object, b.T_world_object)
+
+
+def test_candidates_differ_by_more_than_the_bodys_symmetries(
+    paper_body: Body, parallel_cameras: list[ParallelBeam]
+) -> None:
+    T = from_rotation_vector([0.5, 1.0, -0.7], [20.0, -10.0, 5.0])
+    views = [
+        View(str(k), camera, Observation(PointPattern(y, np.ones(len(y))), 1.0))
+        for k, camera in enumerate(parallel_cameras)
+        for y in (camera.project(transform(T, paper_body.means))[0],)
+    ]
+    candidates = search(views, paper_body, free=ALL, T_reference=None)
+    images = transform(T @ paper_body.symmetries, paper_body.means)
+    assert len(paper_body.symmetries) == 6
+    off = [
+        np.abs(images - transform(each.T_world_object, paper_body.means)).max(axis=(1, 2)).min()
+        for each in candidates
+    ]
+    assert off[0] < 0.01
+    assert candidates[0].score == pytest.approx(2.0, abs=1e-3)
+    assert all(each > 1.0 for each in off[1:])
+
+
+def test_directions_that_are_not_free_stay_where_the_reference_has_them() -> None:
+    frame = trial(Row("1 pinhole", 5, 0, 5, 0.99), 3)
+    turn = from_rotation_vector([0, 0, 2.0], np.zeros(3))
+    reference = frame.T_world_object.copy()
+    reference[:3, :3] = turn[:3, :3] @ reference[:3, :3]
+    reference[:2, 3] += [40.0, -30.0]
+    free = np.array([True, True, False, False, False, True])
+    best = search(frame.views, frame.body, free=free, T_reference=reference)[0].T_world_object
+    assert is_right(best, frame)
+    assert best[2, 3] == pytest.approx(reference[2, 3], abs=1e-9)
+    np.testing.assert_allclose(best[2, :3], reference[2, :3], atol=1e-9)
+
+
+def test_held_directions_without_a_reference_are_refused() -> None:
+    frame = trial(Row("1 pinhole", 5, 0, 5, 0.99), 0)
+    with pytest.raises(SessionError, match="start"):
+        search(frame.views, frame.body, free=np.eye(6, dtype=np.bool_)[0], T_reference=None)
+
+
+def test_spots_in_grey_images_are_found_as_well(
+    paper_body: Body, parallel_cameras: list[ParallelBeam]
+) -> None:
+    T = from_rotation_vector([0.2, -0.4, 0.3], [-40.0, -30.0, 10.0])
+    v, u = np.mgrid[:401, :401]
+    views = []
+    for k, camera in enumerate(parallel_cameras):
+        y, seen = camera.project(transform(T, paper_body.means))
+        assert seen.all()
+        image = sum(np.exp(-0.5 * ((u - a) ** 2 + (v - b) ** 2) / 2.0**2) for a, b in y)
+        pattern = GridPattern(np.asarray(image, dtype=np.float32), np.zeros(2), 1.0)
+        views.append(View(str(k), camera, Observation(pattern, 2.5, intrinsic=2.0)))
+    best = search(views, paper_body, free=ALL, T_reference=None)[0].T_world_object
+    frame = Trial(views, paper_body, T, 1000.0)
+    angle, shift = errors(best, frame)
+    # overlapping spots of a symmetric body move each other's peaks by a px at most
+    assert angle < 1.0
+    assert shift < 1.0
+
+
+def test_views_without_detections_give_no_candidates(paper_body: Body) -> None:
+    camera = ParallelBeam(1.0, np.zeros(2))
+    empty = Observation(PointPattern(np.zeros((0, 2)), np.zeros(0)), 1.0)
+    assert search([View("a", camera, empty)], paper_body, free=ALL, T_reference=None) == []
+    assert search([], paper_body, free=ALL, T_reference=None) == []
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_too_few_detections_are_no_error(count: int) -> None:
+    frame = trial(Row("2 pinhole", 6, 6 - count, 0, 0.0), 0)
+    for views in (frame.views, frame.views[:1]):
+        candidates = search(views, frame.body, free=ALL, T_reference=None)
+        assert all(np.isfinite(each.T_world_object).all() for each in candidates)
+
+
+def test_a_chessboard_is_not_found_a_square_off(recordings: Path) -> None:
+    import json
+
+    from mixpose.frames import pair
+    from mixpose.session import load_session
+
+    folder = recordings / "stereo_chessboard"
+    session = load_session(folder / "session.toml")
+    lines = [
+        json.loads(line)
+        for line in (folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()
+    ]
+    truth = {line["frame"]: line["T_world_object"] for line in lines if "frame" in line}
+    for frame_set in pair(open_sources(session, {}), 8, 11, 1):
+        views = observe(session, frame_set)
+        best = search(views, session.body, free=ALL, T_reference=None)[0].T_world_object
+        images = transform(
+            np.array(truth[frame_set.number]) @ session.body.symmetries, session.body.means
+        )
+        off = np.abs(images - transform(best, session.body.means)).max(axis=(1, 2)).min()
+        # squares are 24 mm wide; the reference itself is good to about a millimetre
+        assert off < 3.0

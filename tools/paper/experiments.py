@@ -1,0 +1,159 @@
+"""Where printed rows come from that the text's own settings do not give.
+
+Each experiment changes one thing in the paper's estimate and shows the cell that it moves.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from paper.measurements import SNR, Measurement, measure
+from paper.published import PUBLISHED
+from paper.runs import DEGREES, SAMPLES
+from paper.sampled import sampled_objectives
+from paper.search import TOLERANCE, fmaxsearch
+from paper.systems import SCENARIOS, Scenario, System, draw, systems
+from paper.table import NUMBERS
+
+Floats: TypeAlias = NDArray[np.float64]
+Negative: TypeAlias = Literal["kept", "cut off", "shifted up"]
+
+MOST_RUNS = 100
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """The paper's estimate of one cell, with one thing changed.
+
+    Attributes
+    ----------
+    name : str
+    system, scenario : str
+    samples : int
+        R.
+    common : bool
+        Whether all features share their sample offsets.
+    spread : float
+        Standard deviation σ of the features.
+    snr : float
+        Peak of one feature over the noise's standard deviation.
+    negative : str
+        What becomes of negative pixels.
+    steps : tuple of float or None
+        Start simplex in radians and units; None for fminsearch's 5 %.
+    tolerance : float
+    """
+
+    name: str
+    system: str
+    scenario: str
+    samples: int = SAMPLES
+    common: bool = True
+    spread: float = 5.0
+    snr: float = SNR
+    negative: Negative = "kept"
+    steps: tuple[float, float] | None = None
+    tolerance: float = TOLERANCE
+
+
+EXPERIMENTS = (
+    Experiment("start simplex of 0.03 rad and 3 units", "1", "I", steps=(0.03, 3.0)),
+    Experiment("as in the table", "2", "I"),
+    Experiment("fresh samples for every feature", "2", "I", common=False),
+    Experiment("R = 10000", "2", "I", samples=10 * SAMPLES),
+    Experiment("R = 10000, fresh samples", "2", "I", samples=10 * SAMPLES, common=False),
+    Experiment("lhsnorm given σ for σ²", "2", "I", spread=float(np.sqrt(5.0))),
+    Experiment("R = 10000", "2", "III-as-printed", samples=10 * SAMPLES),
+    Experiment("noise of half a peak", "1", "IV", snr=2.0),
+    Experiment("noise of half a peak, shifted up", "1", "IV", snr=2.0, negative="shifted up"),
+    Experiment("negative pixels cut off", "1", "IV", negative="cut off"),
+    Experiment("negative pixels shifted up", "1", "IV", negative="shifted up"),
+    Experiment("R = 10000", "2", "IV", samples=10 * SAMPLES),
+    Experiment("noise of half a peak", "2", "IV", snr=2.0),
+    Experiment("noise of half a peak, R = 10000", "2", "IV", samples=10 * SAMPLES, snr=2.0),
+    Experiment("the same, cut off", "2", "IV", samples=10 * SAMPLES, snr=2.0, negative="cut off"),
+    Experiment(
+        "the same, shifted up", "2", "IV", samples=10 * SAMPLES, snr=2.0, negative="shifted up"
+    ),
+    Experiment("noise of half a peak", "3", "IV", snr=2.0),
+    Experiment("lhsnorm given σ for σ²", "3", "I", spread=float(np.sqrt(5.0))),
+)
+
+
+def error(experiment: Experiment, seed: int, number: int) -> Floats:
+    """Error (6,) of one run, in degrees and units; poses, starts and noise as in the table."""
+    cv2.setNumThreads(1)
+    truth, start = draw(np.random.default_rng([seed, number]))
+    system, scenario, noise = _cell(experiment, seed, number)
+    measurements = measure(system, scenario, truth, noise, experiment.snr)
+    samples = system.body(scenario).sample(
+        experiment.samples,
+        antithetic=False,
+        common=experiment.common,
+        seed=int(noise.integers(2**31)),
+    )
+    measurements = [_without_negative(one, experiment.negative) for one in measurements]
+    paper, _ = sampled_objectives(system, measurements, samples)
+    steps = None if experiment.steps is None else np.repeat(experiment.steps, 3)
+    found = fmaxsearch(paper, start, steps, experiment.tolerance)
+    return np.asarray((found - truth) * DEGREES)
+
+
+def _cell(
+    experiment: Experiment, seed: int, number: int
+) -> tuple[System, Scenario, np.random.Generator]:
+    every = systems(experiment.spread)
+    i = [system.name for system in every].index(experiment.system)
+    j = [scenario.name for scenario in SCENARIOS].index(experiment.scenario)
+    return every[i], SCENARIOS[j], np.random.default_rng([seed, number, i, j])
+
+
+def _without_negative(measurement: Measurement, negative: Negative) -> Measurement:
+    values = measurement.values
+    if negative == "cut off":
+        values = np.maximum(values, np.float32(0))
+    elif negative == "shifted up":
+        values = values - values.min()
+    return replace(measurement, values=values)
+
+
+def run_experiments(runs: int, seed: int, console: Console) -> None:
+    """Run and print all experiments, each over `runs` runs or `MOST_RUNS`, whichever is less."""
+    runs = min(runs, MOST_RUNS)
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    shown = Table(title=f"Experiments: paper's estimate, {runs} runs", title_justify="left")
+    for heading in ("system", "scenario", "changed"):
+        shown.add_column(heading)
+    for heading in NUMBERS:
+        shown.add_column(heading, justify="right")
+    with (
+        Progress(console=console, disable=not console.is_terminal) as progress,
+        ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        task = progress.add_task("experiments", total=runs * len(EXPERIMENTS))
+        for experiment in EXPERIMENTS:
+            futures = [pool.submit(partial(error, experiment, seed), k) for k in range(runs)]
+            for _ in as_completed(futures):
+                progress.advance(task)
+            errors = np.array([future.result() for future in futures])
+            _add_row(shown, experiment, np.sqrt((errors**2).mean(axis=0)))
+    console.print(shown)
+
+
+def _add_row(shown: Table, experiment: Experiment, rms: Floats) -> None:
+    cell = (experiment.system, experiment.scenario)
+    shown.add_row(*cell, experiment.name, *(f"{x:.3g}" for x in rms))
+    published = PUBLISHED[experiment.system][experiment.scenario]
+    shown.add_row(*cell, "  published", *(f"{x:.3g}" for x in published), style="dim")

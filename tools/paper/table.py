@@ -1,0 +1,84 @@
+"""The accuracy table: many runs on all cores, RMS errors, JSON and print."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any, TypeAlias
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from paper.published import PUBLISHED
+from paper.runs import INDEPENDENT_EVERY, Errors, run
+from paper.systems import SCENARIOS, systems
+
+Row: TypeAlias = list[float] | None
+Cells: TypeAlias = dict[str, dict[str, dict[str, Row]]]
+
+COLUMNS = ("paper", "published", "independent", "matched", "oracle", "crlb", "ml-from-truth")
+NUMBERS = ("φ1 °", "φ2 °", "φ3 °", "w1", "w2", "w3")
+
+
+def collect(runs: int, seed: int, console: Console) -> list[Errors]:
+    """Errors of all runs, in order, with a progress bar where the console is a terminal."""
+    # one thread per process: the work is many small pieces
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    results: dict[int, Errors] = {}
+    with (
+        Progress(console=console, disable=not console.is_terminal) as progress,
+        ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool,
+    ):
+        task = progress.add_task("runs", total=runs)
+        pending = {pool.submit(run, seed, number): number for number in range(runs)}
+        for future in as_completed(pending):
+            results[pending[future]] = future.result()
+            progress.advance(task)
+    return [results[number] for number in range(runs)]
+
+
+def rms_table(results: Sequence[Errors]) -> Cells:
+    """RMS errors by system, scenario and estimator, beside the published ones."""
+    table: Cells = {}
+    for system in systems():
+        table[system.name] = {}
+        for scenario in SCENARIOS:
+            cells = [errors[system.name, scenario.name] for errors in results]
+            row: dict[str, Row] = dict.fromkeys(COLUMNS)
+            for name in cells[0]:
+                values = np.array([cell[name] for cell in cells if name in cell])
+                squares = values if name == "crlb" else values**2
+                row[name] = [float(x) for x in np.sqrt(squares.mean(axis=0))]
+            published = PUBLISHED[system.name].get(scenario.name)
+            row["published"] = None if published is None else list(published)
+            table[system.name][scenario.name] = row
+    return table
+
+
+def as_json(table: Cells, runs: int, seed: int) -> dict[str, Any]:
+    """What `--json` writes."""
+    compared = len(range(0, runs, INDEPENDENT_EVERY))
+    return {"runs": runs, "seed": seed, "independent_runs": compared, "table": table}
+
+
+def show(table: Cells, runs: int, console: Console) -> None:
+    """Print the table, a block per system and scenario."""
+    title = f"RMS errors over {runs} runs (independent: every {INDEPENDENT_EVERY}rd)"
+    shown = Table(title=title, title_justify="left")
+    shown.add_column("system")
+    shown.add_column("scenario")
+    shown.add_column("estimate")
+    for name in NUMBERS:
+        shown.add_column(name, justify="right")
+    for system, scenarios in table.items():
+        for scenario, row in scenarios.items():
+            for column in COLUMNS:
+                values = row[column]
+                if values is not None:
+                    shown.add_row(system, scenario, column, *(f"{x:.4g}" for x in values))
+            shown.add_section()
+    console.print(shown)

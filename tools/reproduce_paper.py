@@ -1,0 +1,49 @@
+"""Reproduce the paper's accuracy table and objective maps, beside those of mixpose.
+
+    python tools/reproduce_paper.py [--runs 300] [--seed 0] [--json FILE] [--figures DIR]
+                                    [--experiments]
+
+`docs/paper.md` says what is compared and why some of it differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from paper.table import as_json, collect, rms_table, show
+from rich.console import Console
+
+
+def main() -> None:
+    """Run what the options ask for."""
+    parser = argparse.ArgumentParser(description="Reproduce the paper's table and figures.")
+    parser.add_argument("--runs", type=int, default=300, help="simulation runs per cell")
+    parser.add_argument("--seed", type=int, default=0, help="of poses, starts and noise")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table to a file")
+    parser.add_argument("--figures", type=Path, metavar="DIR", help="draw the paper's figures")
+    parser.add_argument(
+        "--experiments", action="store_true", help="show where printed rows come from, too"
+    )
+    options = parser.parse_args()
+    if options.runs < 1:
+        parser.error(f"--runs: found {options.runs}, at least 1 is needed")
+    console = Console(width=None if Console().is_terminal else 110)
+    table = rms_table(collect(options.runs, options.seed, console))
+    show(table, options.runs, console)
+    if options.json is not None:
+        text = json.dumps(as_json(table, options.runs, options.seed), indent=2)
+        options.json.write_text(text + "\n", encoding="utf-8")
+    if options.experiments:
+        from paper.experiments import run_experiments  # noqa: PLC0415
+
+        run_experiments(options.runs, options.seed, console)
+    if options.figures is not None:
+        from paper.figures import draw_figures  # noqa: PLC0415
+
+        draw_figures(options.figures, options.seed)
+
+
+if __name__ == "__main__":
+    main()
