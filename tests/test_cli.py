@@ -365,6 +365,19 @@ def test_check_counts_the_papers_six_equal_orientations() -> None:
     assert "6 orientations look the same" in result.stdout
 
 
+def test_check_warns_of_a_body_that_almost_maps_onto_itself(recording: Path) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    head, _, rest = text.partition("points = [")
+    tail = rest.partition("\n]")[2]
+    # a rectangle with one corner 1.2 mm off, the error of a feature being 0.3: in exact terms without symmetry
+    points = "points = [[-40, -30, 0], [40, -30, 0], [40, 30, 0], [-40, 31.2, 0]]"
+    session.write_text(head + points + tail, encoding="utf-8")
+    result = mixpose("check", session)
+    assert result.returncode == 0, result.stderr
+    assert "warning   4 orientations look the same" in result.stdout
+
+
 def test_a_simulated_recording_is_played_and_estimated(tmp_path: Path) -> None:
     session = SYNTHETIC / "two_cameras" / "session.toml"
     folder = tmp_path / "new"

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mixpose.density import FLOOR, Density, Observation, Window, render, self_overlap
+from mixpose.density.atlas import render_atlas
 from mixpose.density.grid import EXACT_CHANNELS, remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -179,3 +180,26 @@ def test_an_empty_pattern_gives_a_density_of_zero() -> None:
 
 def test_opencv_is_new_enough_for_exact_remap() -> None:
     assert int(cv2.__version__.split(".")[0]) >= 5
+
+
+@pytest.mark.parametrize("m", [1, 2])
+def test_tiles_of_a_grid_pattern_are_sums_over_its_points(m: int) -> None:
+    place, sigma, blur, step = np.array([31.3, 24.8])[:m], 4.0, 3.0, 0.8
+    axes = [step * np.arange(80.0), step * np.arange(70.0)][:m]
+    bells = [np.exp(-0.5 * ((a - p) / sigma) ** 2) for a, p in zip(axes, place, strict=True)]
+    values = bells[0][None] if m == 1 else np.outer(bells[1], bells[0])
+    pattern = GridPattern(values.astype(np.float32), np.zeros(m), step)
+    y = place + np.array([[0.0, 0.0], [2.1, -1.3], [-3.3, 4.0]])[:, :m]
+    sampled, second = render_atlas(pattern, blur, y, 3 * blur).sample_all(y)
+    # a Gaussian blurred by a Gaussian is a Gaussian
+    variance = sigma**2 + blur**2
+    away = y - place
+    C = np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2 * np.pi * variance) ** (m / 2)
+    slope = -away * C[:, None] / variance
+    bend = C[:, None, None] * (
+        away[:, :, None] * away[:, None, :] / variance**2 - np.eye(m) / variance
+    )
+    # the centre of a tile is a grid point: only single precision and the cut at 6 sigma are left
+    assert sampled[:, 0] == pytest.approx(C, rel=1e-5)
+    assert sampled[:, 1:] == pytest.approx(slope, abs=1e-5 * C.max())
+    assert second == pytest.approx(bend, abs=1e-5 * C.max())

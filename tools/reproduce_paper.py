@@ -10,7 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
+
+# both cores run estimates; threads of the linear algebra within each would only wait
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from paper.table import as_json, collect, rms_table, show
 from rich.console import Console

@@ -9,11 +9,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.body import Body
 from mixpose.density import Observation
-from mixpose.objective import View
+from mixpose.estimation import EstimatorOptions, fit_near
+from mixpose.objective import View, matched_objective
+from mixpose.optimise import NewtonOptions, ascend
 from mixpose.records import GridPattern
+from mixpose.rigid import perturb
 from paper.bounds import cramer_rao, oracle
-from paper.matched import fit_grids, likeliest_near
 from paper.measurements import Measurement, measure
 from paper.sampled import sampled_objectives
 from paper.search import fmaxsearch
@@ -96,11 +99,22 @@ def _matched(
     """The matched estimate from the start; under noise also the likeliest pose near the truth."""
     body = system.body(scenario)
     seen = views(system, scenario, measurements)
-    fit = fit_grids(seen, body, pose(start), START_UNCERTAINTY)
+    fit = fit_near(
+        seen, body, pose(start), START_UNCERTAINTY, EstimatorOptions(), body.means[:, None]
+    )
     found = {"matched": parameters(fit.T_world_object)}
     if scenario.noisy:
         found["ml-from-truth"] = parameters(likeliest_near(seen, body, pose(truth)))
     return found
+
+
+def likeliest_near(seen: Sequence[View], body: Body, T_truth: Floats) -> Floats:
+    """The maximum of the likelihood that is reached from the true pose: a yardstick only."""
+    sigmas = [view.observation.sigma for view in seen]
+    likelihood = matched_objective(seen, body, sigmas, T_truth, fine=True)
+    options = NewtonOptions(iterations=60, tolerance=1e-11, value_error=1e-4)
+    free = np.ones(6, dtype=np.bool_)
+    return ascend(likelihood.linearise, perturb, T_truth, free, options).state
 
 
 def views(system: System, scenario: Scenario, measurements: Sequence[Measurement]) -> list[View]:

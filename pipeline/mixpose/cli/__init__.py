@@ -19,6 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _status(arguments: list[str]) -> int:
+    # the matrices here are small: threads of the linear algebra would wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # imported here, so that a program that only looks at this package does not wait for them
     import typer  # noqa: PLC0415
 

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from mixpose.body import symmetries
 from mixpose.estimation import expected_covariance, free_mask
-from mixpose.rigid import TWIST_NAMES
+from mixpose.rigid import TWIST_NAMES, transform
 from mixpose.runner import open_sources
 from mixpose.session import SensorSetup, Session, load_session
+
+_NOISE_OF_SIGMA = 0.2  # what centres of blobs err by, of σ_ε
 
 
 def check_session(path: Path) -> None:
@@ -45,7 +48,36 @@ def _object_lines(session: Session) -> list[str]:
         )
     else:
         lines.append("symmetry  none")
-    return lines
+    return lines + _near_symmetry_lines(session)
+
+
+def _near_symmetry_lines(session: Session) -> list[str]:
+    """A warning where the body almost maps onto itself, as far as the sensors can tell."""
+    blur = _blur_at_start(session)
+    body = session.body
+    if blur is None or blur <= 0:
+        return []
+    alike = len(symmetries(body.nodes.points, blur))
+    if alike <= len(body.symmetries):
+        return []
+    return [
+        f"warning   {alike} orientations look the same within {blur:.3g} {session.unit}, three "
+        "times the error of a feature: expect frames that are ambiguous, or move a marker"
+    ]
+
+
+def _blur_at_start(session: Session) -> float | None:
+    """Three times the error of a feature at the start, in length units, in the best sensor."""
+    if session.start is None:
+        return None
+    points = transform(session.start.T_world_object, session.body.means)
+    blurs = []
+    for setup in session.sensors:
+        _, J, seen = setup.sensor.linearise(points)
+        if seen.any():
+            largest = np.linalg.norm(J[seen], axis=2).mean()
+            blurs.append(3 * setup.extract.sigma * _NOISE_OF_SIGMA / float(largest))
+    return min(blurs, default=None)
 
 
 def _geometry(setup: SensorSetup) -> str:
@@ -65,7 +97,7 @@ def _extraction(setup: SensorSetup) -> str:
 
 def _accuracy_lines(session: Session) -> list[str]:
     if session.start is None:
-        return ["accuracy  needs a [start] to be predicted at", "start     none: a start is needed"]
+        return ["start     none: the first pose is searched for; with one, accuracy is predicted"]
     free = free_mask(session.estimator)
     covariance, counts = expected_covariance(
         [setup.sensor for setup in session.sensors],

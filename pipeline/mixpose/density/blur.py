@@ -18,6 +18,8 @@ from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_VANISHED = 50.0  # squared standard deviations at which a Gaussian is 1e-11 of its peak
+
 TRUNCATE = 5.0  # standard deviations at which filter kernels end; the tail holds 6e-7
 
 
@@ -83,8 +85,20 @@ def bell(
     away = ((axis - centres[:, None]) / sigma).astype(np.float32)
     squared = away * away
     values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
+    # products of far tails would be subnormal numbers, on which matrix products crawl
+    values[squared > _VANISHED] = 0.0
     slopes = values * away * np.float32(-1.0 / sigma)
     return values, slopes, values * (squared - 1) * np.float32(1.0 / sigma**2)
+
+
+def mass(pattern: GridPattern) -> float:
+    """What a grid pattern is normalised by: its integral, of absolute values.
+
+    Noise about zero stays as it is, and may outweigh the features; the plain integral might then
+    be anything.
+    """
+    absolute = float(np.abs(pattern.values).sum(dtype=np.float64))
+    return absolute * pattern.step ** len(pattern.origin)
 
 
 def _render_grid(
@@ -92,7 +106,7 @@ def _render_grid(
 ) -> NDArray[np.float32]:
     dimension = len(pattern.origin)
     # magnitudes: the plain sum of a profile with noise about zero may be nothing or negative
-    total = float(np.abs(pattern.values).sum(dtype=np.float64)) * pattern.step**dimension
+    total = mass(pattern)
     if total <= 0:
         return _nothing(window, gradient)
     source = _blocks(pattern, window, margin=TRUNCATE * sigma)

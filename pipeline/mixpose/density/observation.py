@@ -83,15 +83,19 @@ class Observation:
         """Make g blurred once more by sigma, with gradients, on a window over the box `within`."""
         return self._render(2 * sigma**2 - self.intrinsic**2, np.sqrt(2) * sigma, within, True)
 
-    def matched_near(self, sigma: float, centres: Floats) -> Atlas | None:
+    def matched_near(
+        self, sigma: float, centres: Floats, reach: float = TILE_REACH
+    ) -> Atlas | None:
         """As `matched`, finer, on tiles around expected features (n, m).
 
-        None where the pattern is a grid: it cannot be made finer than it is.
+        Tiles reach `reach` standard deviations of the matched density to each side.
+
+        None where a grid pattern is too coarse for the blur to be summed over its points.
         """
-        if not isinstance(self.pattern, PointPattern):
-            return None
         blur = float(np.sqrt(2 * sigma**2 - self.intrinsic**2))
-        return render_atlas(self.pattern, blur, centres, TILE_REACH * blur)
+        if not isinstance(self.pattern, PointPattern) and blur < self.pattern.step:
+            return None
+        return render_atlas(self.pattern, blur, centres, reach * np.sqrt(2) * sigma)
 
     def energy(self, sigma: float) -> float:
         """⟨g, g⟩ at the given standard deviation of a feature, over the whole pattern."""

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import STEPS_PER_SIGMA
 from mixpose.estimation.annealing import ladder
+from mixpose.estimation.guidance import all_grids, ascend_guided
 from mixpose.estimation.options import EstimatorOptions
+from mixpose.estimation.settling import settle
 from mixpose.objective import View, build_objective
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import TWIST_NAMES, perturb
@@ -22,7 +24,8 @@ Floats: TypeAlias = NDArray[np.float64]
 # bilinear values at four grid points per σ err by up to (1/4)²/8
 _VALUE_ERROR = 1.0 / (8 * STEPS_PER_SIGMA**2)
 COARSE = NewtonOptions(iterations=10, tolerance=1e-5, value_error=_VALUE_ERROR)
-FINE = NewtonOptions(iterations=40, tolerance=1e-11, value_error=_VALUE_ERROR)
+# tiles have four times as many
+FINE = NewtonOptions(iterations=40, tolerance=1e-11, value_error=_VALUE_ERROR / 16)
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,15 @@ class Fit:
     converged : bool
     sigmas : tuple of float
         The finest blur per view.
+    settled : bool
+        Whether the body did not fit, and the pose was fitted to freed features.
     """
 
     T_world_object: Floats
     value: float
     converged: bool
     sigmas: tuple[float, ...]
+    settled: bool = False
 
 
 def fit_near(
@@ -77,7 +83,12 @@ def fit_near(
             options.objective, views, body, samples, sigmas, ascent.state, fine=last
         )
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
-    return Fit(ascent.state, ascent.value, ascent.converged, tuple(levels[-1]))
+    T, settled = ascent.state, False
+    if options.objective == "matched" and all_grids(views):
+        T = ascend_guided(views, body, T, T_start, uncertainty, free)
+        T_settled = settle(views, body, T, free)
+        T, settled = T_settled, T_settled is not T
+    return Fit(T, ascent.value, ascent.converged, tuple(levels[-1]), settled)
 
 
 def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Atlas, Density, close_pairs, peak
+from mixpose.density import TILE_REACH, Atlas, Density, close_pairs, peak
 from mixpose.objective.base import (
     Quadratic,
     View,
@@ -251,6 +251,7 @@ def matched_objective(
     near: Floats | None = None,
     *,
     fine: bool = False,
+    reach: float = TILE_REACH,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -265,10 +266,12 @@ def matched_objective(
         Densities are made only around the projection of this pose; None: wherever a sensor sees.
     fine : bool
         Whether densities are wanted on fine tiles around the projection, for the last digits.
+    reach : float
+        Half-width of such tiles, in standard deviations of the matched density.
     """
     terms = []
     for view, sigma in zip(views, sigmas, strict=True):
-        matched = _matched_density(view, body, sigma, near, fine)
+        matched = _matched_density(view, body, sigma, near, reach if fine else None)
         if matched is None:
             continue
         energy = view.observation.energy(sigma)
@@ -282,7 +285,7 @@ def matched_objective(
 
 
 def _matched_density(
-    view: View, body: Body, sigma: float, near: Floats | None, fine: bool
+    view: View, body: Body, sigma: float, near: Floats | None, reach: float | None
 ) -> Density | Atlas | None:
     """C around a pose, or over the whole sensor; None where the sensor sees nothing of it."""
     if near is None:
@@ -290,8 +293,9 @@ def _matched_density(
     y, visible = view.sensor.project(transform(near, body.nodes.points))
     if not visible.any():
         return None
-    atlas = view.observation.matched_near(sigma, y) if fine else None
-    if atlas is not None:
-        return atlas
+    if reach is not None:
+        atlas = view.observation.matched_near(sigma, y, reach)
+        if atlas is not None:
+            return atlas
     box = region_of_interest(view.sensor, y[visible], REACH * np.sqrt(2) * sigma)
     return view.observation.matched(sigma, box)

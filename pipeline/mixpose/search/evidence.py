@@ -24,6 +24,7 @@ from mixpose.search.sightings import Sighting
 Floats: TypeAlias = NDArray[np.float64]
 
 _GATE = 3.0  # σ_ε within which a detection is met
+_NEIGHBOURS = int(__import__("os").environ.get("KN", "3"))
 _SHARPEST = 0.1  # of σ_ε: errors are not believed to be smaller
 _MISSED = np.log(0.3)  # a feature in view without a detection; half as many are common
 
@@ -42,13 +43,14 @@ def evidence(
         pattern = sighting.view.observation.pattern
         if not isinstance(pattern, PointPattern):
             continue
-        own, errors, seen = _pairs(sighting, pattern.points, body, poses)
+        rarity = _log_chance(sighting, pattern.points)
+        own, errors, seen, by_chance = _pairs(sighting, pattern.points, rarity, body, poses)
         m = pattern.points.shape[1]
         met += own
         missed += seen - own
         coordinates += m * own
         squared += errors
-        chance += own * _log_chance(sighting, pattern.points)
+        chance += by_chance
     spare = np.maximum(coordinates - free.sum(), 0.0)
     s2 = np.clip(squared / np.maximum(spare, 1e-9), _SHARPEST**2, 1.0)
     share = spare / np.maximum(coordinates, 1.0)
@@ -57,8 +59,8 @@ def evidence(
 
 
 def _pairs(
-    sighting: Sighting, points: Floats, body: Body, poses: Floats
-) -> tuple[Floats, Floats, Floats]:
+    sighting: Sighting, points: Floats, rarity: Floats, body: Body, poses: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Number of detections that are met, their squared errors in σ_ε², and features in view."""
     sensor = sighting.view.sensor
     world = transform(poses, body.means)
@@ -72,14 +74,21 @@ def _pairs(
     nearest = np.take_along_axis(away2, detection[..., None], axis=2)[..., 0]
     met = mutual & (nearest <= _GATE**2)
     errors = np.where(met, nearest, 0.0).sum(axis=1)
-    return met.sum(axis=1).astype(float), errors, seen.sum(axis=1).astype(float)
+    by_chance = np.where(met, rarity[detection], 0.0).sum(axis=1)
+    return met.sum(axis=1).astype(float), errors, seen.sum(axis=1).astype(float), by_chance
 
 
-def _log_chance(sighting: Sighting, points: Floats) -> float:
+def _log_chance(sighting: Sighting, points: Floats) -> Floats:
     """Logarithm of the chance that a point in view falls within σ_ε of a detection."""
     sensor, m = sighting.view.sensor, points.shape[1]
     sides = np.maximum(np.ptp(points, axis=0), 10 * sighting.sigma)
     whole = sensor.upper - sensor.lower
     sides = np.where(np.isfinite(whole), whole, sides)
     bell = (np.sqrt(2 * np.pi) * sighting.sigma) ** m
-    return min(float(np.log(len(points) * bell / np.prod(sides))), -0.1)
+    density = np.full(len(points), len(points) / np.prod(sides))
+    k = _NEIGHBOURS
+    if m == 2 and len(points) > k:
+        away = np.linalg.norm(points[:, None] - points, axis=-1)
+        reach = np.maximum(np.sort(away, axis=1)[:, k], 10 * sighting.sigma)
+        density = np.maximum(density, k / (np.pi * reach**2))
+    return np.minimum(np.log(density * bell), -0.1)

@@ -36,7 +36,7 @@ CONVINCING = 0.7
 SUFFICIENT = 0.45
 """Share at which guesses of lines of sight are not followed by all orientations."""
 
-OVERWHELMING = 40.0
+OVERWHELMING = 24.0
 """Evidence, in nats, at which several cameras leave no doubt: a million guesses make 14."""
 
 _FEW_FEATURES = 8  # with more, fewer guesses need to be kept
@@ -129,7 +129,7 @@ def search(
     poses, ranks = _found(task)
     if len(poses) and maps and _MANY_FEATURES <= len(body) <= _GRIDS:
         slips = _shortlist(task, [from_slips(body, poses[ranks.argmax()])])
-        found = descend(seen, body, slips, _sharp_plan(task), free)
+        found = _descended(task, slips)
         poses, ranks = np.concatenate([poses, found]), np.append(ranks, _rank(task, found))
     return _candidates(task, poses, ranks, count)
 
@@ -139,8 +139,7 @@ def _found(task: _Task) -> tuple[Floats, Floats]:
     poses, ranks, coverage = np.zeros((0, 4, 4)), np.zeros(0), 0.0
     for attempt in (_sharp_attempts, _blunt_attempt):
         for found in attempt(task):
-            both = np.concatenate([found, _sharpened(task, found)])
-            poses, ranks = np.concatenate([poses, both]), np.append(ranks, _rank(task, both))
+            poses, ranks = np.concatenate([poses, found]), np.append(ranks, _rank(task, found))
             coverage = _coverage(task, poses[ranks.argmax()]) if len(poses) else 0.0
             overwhelming = len(task.sightings) > 1 and ranks.max(initial=0.0) > OVERWHELMING
             if coverage >= (SUFFICIENT if overwhelming else CONVINCING):
@@ -148,17 +147,6 @@ def _found(task: _Task) -> tuple[Floats, Floats]:
         if coverage >= SUFFICIENT:
             break
     return poses, ranks
-
-
-def _sharpened(task: _Task, poses: Floats) -> Floats:
-    """The poses once more, at half the blur: clutter beside a feature pulls less there.
-
-    Where detections err by as much as σ_ε this is no gain, and the ranking keeps the others.
-    """
-    if not _is_seen_by_cameras(task):
-        return poses[:0]
-    stage = Stage([0.5] * len(task.sightings), 3, len(poses))
-    return descend(task.sightings, task.body, poses, [stage], task.constraint.free)
 
 
 def _is_seen_by_cameras(task: _Task) -> bool:
@@ -181,10 +169,27 @@ def _rank(task: _Task, poses: Floats) -> Floats:
     return np.asarray(scores(finest, task.body, poses).sum(axis=0))
 
 
-def _sharp_plan(task: _Task) -> list[Stage]:
-    """How guesses descend that are off by a few σ_ε."""
+def _descended(task: _Task, guesses: Floats) -> Floats:
+    """Guesses that are off by a few σ_ε, refined in two ways.
+
+    Once to σ_ε; and once from less to less, where clutter beside a feature pulls less.  Where
+    detections err by as much as σ_ε the second is no gain, and the ranking keeps the first.
+    """
+    plans = [((3.0, 1), (1.5, 2), (1.0, 3))]
+    if _is_seen_by_cameras(task):
+        plans.append(((1.5, 2), (0.75, 2), (0.4, 2)))
     count = len(task.sightings)
-    return [Stage([f] * count, n, SHORTLISTED) for f, n in ((3.0, 1), (1.5, 2), (1.0, 3))]
+    found = [
+        descend(
+            task.sightings,
+            task.body,
+            guesses,
+            [Stage([factor] * count, steps, SHORTLISTED) for factor, steps in plan],
+            task.constraint.free,
+        )
+        for plan in plans
+    ]
+    return np.concatenate(found)
 
 
 def _blunt_attempt(task: _Task) -> Iterator[Floats]:
@@ -195,7 +200,6 @@ def _blunt_attempt(task: _Task) -> Iterator[Floats]:
 
 def _sharp_attempts(task: _Task) -> Iterator[Floats]:
     """Refined poses of one kind of guess after the other, the quickest kind first."""
-    plan = _sharp_plan(task)
     if task.maps and _is_pointlike(task.body):
         kinds: list[Iterable[Floats]] = []
         if task.constraint.turns.sum() < 2:
@@ -204,7 +208,7 @@ def _sharp_attempts(task: _Task) -> Iterator[Floats]:
         for guesses in kinds:
             shortlist = _shortlist(task, guesses)
             if len(shortlist):
-                yield descend(task.sightings, task.body, shortlist, plan, task.constraint.free)
+                yield _descended(task, shortlist)
 
 
 def _shortlist(task: _Task, guesses: Iterable[Floats]) -> Floats:
