@@ -205,6 +205,27 @@ def test_a_moving_body_is_followed_and_found_again_after_an_occlusion(
     assert statuses[10:] == ["ok"] * 10
 
 
+def test_after_thirty_frames_of_occlusion_the_first_visible_frame_gives_the_pose(
+    body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for frame in range(3):
+        views = detect(pinhole_cameras, body, TRUTH, noise=0.1, seed=frame)
+        track, estimate = tracker.advance(track, frame, frame / 25, views)
+        assert estimate.status == "ok"
+    for frame in range(3, 33):
+        track, estimate = tracker.advance(track, frame, frame / 25, [])
+        assert estimate.status == "lost"
+        assert estimate.T_world_object is None
+    elsewhere = perturb(TRUTH, np.array([90.0, -60.0, 40.0, 1.5, -0.8, 2.0]))
+    views = detect(pinhole_cameras, body, elsewhere, noise=0.1, hidden=1, false=2)
+    _, estimate = tracker.advance(track, 33, 33 / 25, views)
+    assert estimate.status == "ok"
+    assert estimate.T_world_object is not None
+    assert rotation_angle_deg(estimate.T_world_object, elsewhere) < 0.3
+
+
 def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
     body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:

@@ -1,7 +1,7 @@
 """Reproduce the paper's accuracy table and objective maps, beside those of mixpose.
 
     python tools/reproduce_paper.py [--runs 300] [--seed 0] [--json FILE] [--figures DIR]
-                                    [--experiments]
+                                    [--markdown FILE] [--experiments]
 
 `docs/paper.md` says what is compared and why some of it differs.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 # both cores run estimates; threads of the linear algebra within each would only wait
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from paper.table import as_json, collect, rms_table, show
+from paper.table import as_json, as_markdown, collect, rms_table, show
 from rich.console import Console
 
 
@@ -27,6 +27,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of poses, starts and noise")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table to a file")
     parser.add_argument("--figures", type=Path, metavar="DIR", help="draw the paper's figures")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write it as Markdown")
     parser.add_argument(
         "--experiments", action="store_true", help="show where printed rows come from, too"
     )
@@ -39,6 +40,8 @@ def main() -> None:
     if options.json is not None:
         text = json.dumps(as_json(table, options.runs, options.seed), indent=2)
         options.json.write_text(text + "\n", encoding="utf-8")
+    if options.markdown is not None:
+        options.markdown.write_text(as_markdown(table), encoding="utf-8")
     if options.experiments:
         from paper.experiments import run_experiments  # noqa: PLC0415
 

@@ -65,6 +65,30 @@ def as_json(table: Cells, runs: int, seed: int) -> dict[str, Any]:
     return {"runs": runs, "seed": seed, "independent_runs": compared, "table": table}
 
 
+def as_markdown(table: Cells) -> str:
+    """A Markdown table per system."""
+    lines = []
+    for system, scenarios in table.items():
+        head = ["scenario", "estimate", *NUMBERS]
+        lines += [f"System {system}", "", _markdown_row(head), _markdown_row(["---"] * len(head))]
+        for scenario, row in scenarios.items():
+            for column in COLUMNS:
+                values = row[column]
+                if values is not None:
+                    lines.append(_markdown_row([scenario, column, *map(_short, values)]))
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _markdown_row(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _short(value: float) -> str:
+    """Three digits, and no more than six behind the point."""
+    return f"{value:.3g}" if value >= 1e-4 else "< 0.0001"
+
+
 def show(table: Cells, runs: int, console: Console) -> None:
     """Print the table, a block per system and scenario."""
     title = f"RMS errors over {runs} runs (independent: every {INDEPENDENT_EVERY}rd)"

@@ -7,7 +7,8 @@ do the features once each is freed from the body and has moved to where it expla
 is then fitted to these places.
 
 This is done only where freed features explain far more of the densities than noise would let them,
-and where each of them has a place to go to: then no correspondence is in doubt.
+where each of them has a place to go to, and where these are so far apart that each is known by
+itself: then no correspondence is in doubt.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.density import peak
 from mixpose.estimation.guidance import cell_variance
 from mixpose.estimation.meeting import LEAST_SHARE
 from mixpose.objective import Quadratic, View, matched_objective, pose_jacobian
@@ -37,6 +39,8 @@ NEGLIGIBLE = 1e-5
 
 _REACH = 4.0  # standard deviations of the matched density that freed features can see
 _FARTHEST = 5.5  # σ that a freed feature may have moved
+_PULL_FADES = 0.7  # σ: nearer features pull as in least squares anyway
+_APART = 0.3  # of the information that a feature without neighbours has about its place
 _OPTIONS = NewtonOptions(iterations=60, tolerance=1e-11, value_error=5e-4)
 
 
@@ -50,7 +54,7 @@ class Freed:
     bound, explained : float
         ⟨g, h⟩² / ⟨h, h⟩ of the features on the body, and freed.
     all_met : bool
-        Whether every feature has found something.
+        Whether every feature has found something of its own.
     """
 
     places: Floats
@@ -82,7 +86,7 @@ def settle(
     terms = matched_objective(views, body, sigmas, T_world_object, fine=True, reach=_REACH).terms
     if len(terms) != len(views):
         return T_world_object
-    freed, statistic, freedom, share = [], 0.0, -int(free.sum()), 0.0
+    freed, statistic, freedom, share, farthest = [], 0.0, -int(free.sum()), 0.0, 0.0
     for term, view in zip(terms, views, strict=True):
         y, seen = term.sensor.project(transform(T_world_object, body.nodes.points))
         one = free_features(term, y, body.nodes.weights)
@@ -93,9 +97,10 @@ def settle(
         statistic += gain / cell_variance(term, view.observation, one.explained)
         freedom += y.size
         share = max(share, gain / term.energy)
+        farthest = max(farthest, float(moved.max()))
         freed.append(one)
     misfit = (statistic - freedom) / np.sqrt(2 * max(freedom, 1))
-    if share < NEGLIGIBLE or misfit < MISFIT:
+    if share < NEGLIGIBLE or misfit < MISFIT or farthest < _PULL_FADES:
         return T_world_object
     return least_squares(terms, body, T_world_object, [one.places for one in freed], free)
 
@@ -125,7 +130,11 @@ def free_features(term: MatchedTerm, y: Floats, weights: Floats) -> Freed:
     ascent = ascend(model, move, y, np.ones(n * m, dtype=np.bool_), _OPTIONS)
     here = term.matched.sample(ascent.state)[:, 0]
     all_met = bool(here.min() > LEAST_SHARE * np.median(here) > 0)
-    return Freed(ascent.state, begun[0], ascent.value, all_met)
+    overlap = overlap_terms(ascent.state, select, weights, term.variance)
+    alone = np.repeat(weights**2, m) * peak(term.variance, m) / term.variance
+    scale = 1 / np.sqrt(alone)
+    apart = float(np.linalg.eigvalsh(overlap.gram * scale * scale[:, None])[0])
+    return Freed(ascent.state, begun[0], ascent.value, all_met and apart > _APART)
 
 
 def least_squares(

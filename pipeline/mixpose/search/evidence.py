@@ -1,8 +1,8 @@
 """How unlikely it is that a pose explains its detections by chance.
 
 A pose that meets K detections uses up half of its free directions' number of them; every other
-one fell by chance within s of a prediction with a probability of about ``M (2π s²)^(m/2) / V``
-for M detections in a field of view V.  The errors' own size s is estimated, up to σ_ε: four
+one fell by chance within s of a prediction with a probability of about ``ρ (2π s²)^(m/2)``, ρ
+being how densely detections lie.  The errors' own size s is estimated, up to σ_ε: four
 detections met to a tenth of a pixel are better evidence than five met to a pixel
 (a-contrario model selection, Moisan and Stival, IJCV 2004).
 """
@@ -61,7 +61,7 @@ def evidence(
 def _pairs(
     sighting: Sighting, points: Floats, rarity: Floats, body: Body, poses: Floats
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Number of detections that are met, their squared errors in σ_ε², and features in view."""
+    """Detections that are met, their squared errors in σ_ε², features in view, log-chances."""
     sensor = sighting.view.sensor
     world = transform(poses, body.means)
     y, seen = sensor.project(world)
@@ -79,7 +79,10 @@ def _pairs(
 
 
 def _log_chance(sighting: Sighting, points: Floats) -> Floats:
-    """Logarithm of the chance that a point in view falls within σ_ε of a detection."""
+    """Logarithms (M,) of the chance that a point falls within σ_ε of a detection.
+
+    Where detections crowd, one of them is met more easily.
+    """
     sensor, m = sighting.view.sensor, points.shape[1]
     sides = np.maximum(np.ptp(points, axis=0), 10 * sighting.sigma)
     whole = sensor.upper - sensor.lower
@@ -91,4 +94,4 @@ def _log_chance(sighting: Sighting, points: Floats) -> Floats:
         away = np.linalg.norm(points[:, None] - points, axis=-1)
         reach = np.maximum(np.sort(away, axis=1)[:, k], 10 * sighting.sigma)
         density = np.maximum(density, k / (np.pi * reach**2))
-    return np.minimum(np.log(density * bell), -0.1)
+    return np.asarray(np.minimum(np.log(density * bell), -0.1))
