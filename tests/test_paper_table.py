@@ -196,8 +196,12 @@ def test_the_papers_objective_is_biased_where_features_overlap(one_run: Errors) 
     assert np.abs(cell["matched"][:3]).max() < 1e-2
 
 
-def test_zero_runs_are_refused() -> None:
-    command = [sys.executable, str(TOOLS / "reproduce_paper.py"), "--runs", "0"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [("--runs", "0", "--runs: found 0"), ("--json", "no/such/place.json", "is no folder")],
+)
+def test_options_that_cannot_work_are_refused_at_once(option: str, value: str, said: str) -> None:
+    command = [sys.executable, str(TOOLS / "reproduce_paper.py"), option, value]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 2
-    assert "--runs: found 0" in done.stderr
+    assert said in done.stderr

@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 from pathlib import Path
@@ -32,10 +33,9 @@ def main() -> None:
         "--experiments", action="store_true", help="show where printed rows come from, too"
     )
     options = parser.parse_args()
-    if options.runs < 1:
-        parser.error(f"--runs: found {options.runs}, at least 1 is needed")
+    complain(parser, options)
     console = Console(width=None if Console().is_terminal else 110)
-    table = rms_table(collect(options.runs, options.seed, console))
+    table = rms_table(collect(options.runs, options.seed))
     show(table, options.runs, console)
     if options.json is not None:
         text = json.dumps(as_json(table, options.runs, options.seed), indent=2)
@@ -50,6 +50,20 @@ def main() -> None:
         from paper.figures import draw_figures  # noqa: PLC0415
 
         draw_figures(options.figures, options.seed)
+
+
+def complain(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Leave with one line on options that would fail after minutes of work."""
+    if options.runs < 1:
+        parser.error(f"--runs: found {options.runs}, at least 1 is needed")
+    for name in ("json", "markdown"):
+        path = getattr(options, name)
+        if path is not None and not path.absolute().parent.is_dir():
+            parser.error(f"--{name}: {path.parent} is no folder; make it first")
+    if options.figures is not None and options.figures.is_file():
+        parser.error(f"--figures: {options.figures} is a file; name a folder")
+    if options.figures is not None and importlib.util.find_spec("matplotlib") is None:
+        parser.error("--figures: matplotlib is missing; install mixpose[plots]")
 
 
 if __name__ == "__main__":

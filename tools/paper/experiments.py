@@ -147,9 +147,10 @@ def run_experiments(runs: int, seed: int, console: Console) -> None:
         shown.add_column(heading)
     for heading in NUMBERS:
         shown.add_column(heading, justify="right")
+    bar = Console(stderr=True)
     counts = [min(runs, experiment.most_runs) for experiment in EXPERIMENTS]
     with (
-        Progress(console=console, disable=not console.is_terminal) as progress,
+        Progress(console=bar, disable=not bar.is_terminal) as progress,
         ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool,
     ):
         task = progress.add_task("experiments", total=sum(counts))

@@ -24,8 +24,9 @@ COLUMNS = ("paper", "published", "independent", "matched", "oracle", "crlb", "ml
 NUMBERS = ("φ1 °", "φ2 °", "φ3 °", "w1", "w2", "w3")
 
 
-def collect(runs: int, seed: int, console: Console) -> list[Errors]:
-    """Errors of all runs, in order, with a progress bar where the console is a terminal."""
+def collect(runs: int, seed: int) -> list[Errors]:
+    """Errors of all runs, in order, with a progress bar on a terminal."""
+    console = Console(stderr=True)
     # one thread per process: the work is many small pieces
     os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
     results: dict[int, Errors] = {}
