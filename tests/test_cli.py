@@ -370,7 +370,7 @@ def test_check_warns_of_a_body_that_almost_maps_onto_itself(recording: Path) -> 
     text = session.read_text(encoding="utf-8")
     head, _, rest = text.partition("points = [")
     tail = rest.partition("\n]")[2]
-    # a rectangle with one corner 1.2 mm off, the error of a feature being 0.3: in exact terms without symmetry
+    # a rectangle with one corner 1.2 mm off, where a feature errs by 0.3: strictly not symmetric
     points = "points = [[-40, -30, 0], [40, -30, 0], [40, 30, 0], [-40, 31.2, 0]]"
     session.write_text(head + points + tail, encoding="utf-8")
     result = mixpose("check", session)
