@@ -34,6 +34,7 @@ INFORMATIVE = 100.0
 """Information of the data over that of the start, from which no guidance is needed."""
 
 _BELIEVED = 0.99  # share of the start's own distribution within which a peak is believed
+_VALUE_ERROR = 2e-3  # of bilinear values on tiles; below it the gradient judges
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 
 
@@ -93,24 +94,26 @@ def ascend_guided(
     spread = np.where(free, uncertainty, 1.0)
     information = np.where(free, 1.0 / spread**2, 0.0)
     farthest = float(chdtri(int(free.sum()), 1 - _BELIEVED))
-    T, step = T_world_object, 0
+    T, step, informative = T_world_object, 0, False
     while True:
         likelihood = MatchedObjective(_weighed(terms, observations, body, T), body)
         guided = _Guided(likelihood, T_start, FADING[step] * information)
         value = float(likelihood.value(T[None])[0])
         options = NewtonOptions(
-            iterations=60, tolerance=max(1e-11, _NATS / max(value, _NATS)), value_error=1e-4
+            iterations=60,
+            tolerance=max(1e-11, _NATS / max(value, _NATS)),
+            value_error=_VALUE_ERROR,
         )
         found = ascend(guided.linearise, perturb, T, free, options).state
         away = twist_between(T_start, found)
-        if step > 0 and away @ (information * away) > farthest:
+        if step > 0 and not informative and away @ (information * away) > farthest:
             return T
         T = found
         if FADING[step] == 0:
             return T
         scaled = likelihood.linearise(T).curvature * spread * spread[:, None]
-        least = float(np.linalg.eigvalsh(scaled[np.ix_(free, free)])[0])
-        step = len(FADING) - 1 if least > INFORMATIVE else step + 1
+        informative = bool(np.linalg.eigvalsh(scaled[np.ix_(free, free)])[0] > INFORMATIVE)
+        step = len(FADING) - 1 if informative else step + 1
 
 
 def cell_variance(term: MatchedTerm, observation: Observation, explained: float) -> float:

@@ -21,8 +21,8 @@ from mixpose.rigid import TWIST_NAMES, perturb
 
 Floats: TypeAlias = NDArray[np.float64]
 
-# bilinear values at four grid points per σ err by up to (1/4)²/8
-_VALUE_ERROR = 1.0 / (8 * STEPS_PER_SIGMA**2)
+# bilinear values at n grid points per σ are up to 1/(8 n²) low along each of two axes, and squared
+_VALUE_ERROR = 4.0 / (8 * STEPS_PER_SIGMA**2)
 COARSE = NewtonOptions(iterations=10, tolerance=1e-5, value_error=_VALUE_ERROR)
 # tiles have four times as many
 FINE = NewtonOptions(iterations=40, tolerance=1e-11, value_error=_VALUE_ERROR / 16)

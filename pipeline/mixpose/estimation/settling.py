@@ -41,7 +41,7 @@ _REACH = 4.0  # standard deviations of the matched density that freed features c
 _FARTHEST = 5.5  # σ that a freed feature may have moved
 _PULL_FADES = 0.7  # σ: nearer features pull as in least squares anyway
 _APART = 0.3  # of the information that a feature without neighbours has about its place
-_OPTIONS = NewtonOptions(iterations=60, tolerance=1e-11, value_error=5e-4)
+_OPTIONS = NewtonOptions(iterations=60, tolerance=1e-11, value_error=2e-3)
 
 
 @dataclass(frozen=True)
