@@ -23,7 +23,7 @@ from mixpose.objective import (
     pose_jacobian,
     sampled_terms,
 )
-from mixpose.objective.matched import overlap_terms
+from mixpose.objective.overlaps import overlap_terms
 from mixpose.objective.paper import SampledTerm
 from mixpose.records import PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform
@@ -134,7 +134,7 @@ def test_overlap_terms_agree_with_central_differences() -> None:
     variance = 4.0
 
     def norm(twist: Floats) -> float:
-        return overlap_terms(y + J @ twist, J, weights, variance).norm
+        return float(overlap_terms(y + J @ twist, J, weights, variance).norm)
 
     overlap = overlap_terms(y, J, weights, variance)
     step = 1e-4

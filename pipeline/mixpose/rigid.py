@@ -13,6 +13,7 @@ Rotations themselves are `scipy.spatial.transform.Rotation`.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -100,6 +101,12 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
     twist : (..., 6) array
         ``(x, y, z, rx, ry, rz)``, lengths and radians.
     """
+    if twist.ndim == 1 and T_world_object.ndim == 2:
+        # one pose after the other is what optimisers ask for: no time for broadcasting
+        T = T_world_object.copy()
+        T[:3, :3] = cv2.Rodrigues(twist[3:])[0] @ T_world_object[:3, :3]
+        T[:3, 3] += twist[:3]
+        return T
     rotation = rotation_matrix(twist[..., 3:]) @ T_world_object[..., :3, :3]
     return from_parts(rotation, T_world_object[..., :3, 3] + twist[..., :3])
 

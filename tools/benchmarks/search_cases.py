@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import GridPattern, PointPattern
-from mixpose.rigid import from_parts, transform
+from mixpose.records import GridPattern, Pattern, PointPattern
+from mixpose.rigid import from_parts, transform, twist_between
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -164,13 +164,16 @@ def trial(row: Row, seed: int, *, sigma: float = SIGMA_PX) -> Trial:
     return Trial(views, body, T, DISTANCE, *limits, labels)
 
 
-def _profile(name: str, sensor: Sensor, T: Floats, points: Floats) -> View:
+def range_profile(ranges: Floats) -> GridPattern:
     """A noiseless range profile, one unit per bin, features of standard deviation 5."""
-    ranges = sensor.project(transform(T, points))[0][:, 0]
     first = np.floor(ranges.min() - 60.0)
     bins = first + np.arange(int(ranges.max() - first + 60.0))
     bells = np.exp(-0.5 * ((bins - ranges[:, None]) / RANGE_SIGMA) ** 2)
-    pattern = GridPattern(bells.sum(axis=0, keepdims=True).astype(np.float32), bins[:1], 1.0)
+    return GridPattern(bells.sum(axis=0, keepdims=True).astype(np.float32), bins[:1], 1.0)
+
+
+def _profile(name: str, sensor: Sensor, T: Floats, points: Floats) -> View:
+    pattern = range_profile(sensor.project(transform(T, points))[0][:, 0])
     return View(name, sensor, Observation(pattern, RANGE_SIGMA, intrinsic=RANGE_SIGMA))
 
 
@@ -207,20 +210,27 @@ def false_detections(
     return np.where(np.arange(count)[:, None] % 2 == 0, anywhere, near)
 
 
-def absent(row: Row, seed: int, *, detections: int, sigma: float = SIGMA_PX) -> Trial:
-    """Frames of cameras that see false detections only, as many as given, and no body.
+def absent(row: Row, seed: int, *, sigma: float = SIGMA_PX) -> Trial:
+    """The frames of a row with the body gone, and as many false features as were seen of it.
 
-    The pose is that around whose bounding boxes half of the detections lie; nothing is there.
+    Half of them lie where it would have been.  The pose of the trial is nowhere to be found.
     """
     present = trial(row, seed, sigma=sigma)
-    rng = np.random.default_rng([seed, detections, 1])
-    views: list[View] = []
+    rng = np.random.default_rng([seed, row.features, row.false, 1])
+    count = row.features - row.hidden + row.false
+    views = []
     for view in present.views:
-        y, _ = view.sensor.project(transform(present.T_world_object, present.body.means))
-        points = false_detections(view.sensor, (y.min(axis=0), y.max(axis=0)), detections, rng)
-        pattern = PointPattern(points, np.ones(len(points)))
-        views.append(View(view.name, view.sensor, Observation(pattern, sigma)))
-    return Trial(views, present.body, present.T_world_object, DISTANCE)
+        if isinstance(view.sensor, RangeSensor):
+            ranges = rng.uniform(DISTANCE - RANGE_CUBE, DISTANCE + RANGE_CUBE, row.features)
+            pattern: Pattern = range_profile(ranges)
+        else:
+            y, _ = view.sensor.project(transform(present.T_world_object, present.body.means))
+            box = (y.min(axis=0), y.max(axis=0))
+            points = false_detections(view.sensor, box, count, rng)
+            pattern = PointPattern(points, rng.uniform(0.5, 2.0, count))
+        old = view.observation
+        views.append(replace(view, observation=replace(old, pattern=pattern)))
+    return replace(present, views=views)
 
 
 def errors(found: Floats, truth: Trial) -> tuple[float, float]:
@@ -234,6 +244,12 @@ def errors(found: Floats, truth: Trial) -> tuple[float, float]:
         shift = transform(found, centre[None])[0] - transform(T, centre[None])[0]
         best = min(best, (angle, float(np.linalg.norm(shift))))
     return best
+
+
+def errors_squared(found: Floats, covariance: Floats, truth: Trial) -> float:
+    """Squared error of a pose in standard deviations of its covariance, modulo symmetry."""
+    twists = twist_between(found, truth.T_world_object @ truth.body.symmetries)
+    return float(np.min((twists @ np.linalg.inv(covariance) * twists).sum(axis=1)))
 
 
 def is_right(found: Floats, truth: Trial) -> bool:

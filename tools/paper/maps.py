@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density import Window, render
-from mixpose.objective.matched import MatchedObjective, MatchedTerm
+from mixpose.objective.matched import MatchedObjective
+from mixpose.objective.stack import MatchedTerm
 from mixpose.records import GridPattern
 from paper.measurements import Measurement, measure
 from paper.runs import views

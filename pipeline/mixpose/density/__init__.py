@@ -5,16 +5,19 @@ from __future__ import annotations
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import render
 from mixpose.density.grid import FLOOR, Density, Window
+from mixpose.density.mixture import FEW, Mixture
 from mixpose.density.observation import STEPS_PER_SIGMA, TILE_REACH, Observation
 from mixpose.density.overlap import close_pairs, peak, self_overlap
 from mixpose.density.weighting import weighted
 
 __all__ = [
+    "FEW",
     "FLOOR",
     "STEPS_PER_SIGMA",
     "TILE_REACH",
     "Atlas",
     "Density",
+    "Mixture",
     "Observation",
     "Window",
     "close_pairs",

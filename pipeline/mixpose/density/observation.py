@@ -10,6 +10,7 @@ Two densities are made of a pattern g0 whose features have standard deviation σ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from mixpose.density.atlas import Atlas, render_atlas
 from mixpose.density.blur import TRUNCATE, odd_factor, render
 from mixpose.density.grid import Density, Window
-from mixpose.density.overlap import self_overlap
+from mixpose.density.mixture import Mixture, mixture
+from mixpose.density.overlap import self_overlap, squared_distances
 from mixpose.records import Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -84,16 +86,20 @@ class Observation:
         return self._render(2 * sigma**2 - self.intrinsic**2, np.sqrt(2) * sigma, within, True)
 
     def matched_near(
-        self, sigma: float, centres: Floats, reach: float = TILE_REACH
-    ) -> Atlas | None:
-        """As `matched`, finer, on tiles around expected features (n, m).
+        self, sigma: float, centres: Floats | None, reach: float = TILE_REACH
+    ) -> Atlas | Mixture | None:
+        """As `matched`, exact, around expected features (n, m), or None for anywhere.
 
-        Tiles reach `reach` standard deviations of the matched density to each side.
+        Detections are summed where they are asked for; grids are drawn finely on tiles that reach
+        `reach` standard deviations of the matched density to each side.
 
-        None where a grid pattern is too coarse for the blur to be summed over its points.
+        None where a grid pattern is too coarse for the blur to be summed over its points, or no
+        features are given.
         """
         blur = float(np.sqrt(2 * sigma**2 - self.intrinsic**2))
-        if not isinstance(self.pattern, PointPattern) and blur < self.pattern.step:
+        if isinstance(self.pattern, PointPattern):
+            return mixture(self.pattern, blur, centres, reach * blur)
+        if centres is None or blur < self.pattern.step:
             return None
         return render_atlas(self.pattern, blur, centres, reach * np.sqrt(2) * sigma)
 
@@ -103,13 +109,24 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(pattern, PointPattern):
-            weights = pattern.weights / pattern.weights.sum()
-            return self_overlap(pattern.points, weights, 2 * sigma**2)
+            return self_overlap(pattern.points, self._shares, 2 * sigma**2, self._apart)
         lower, upper = self.extent()
         margin = TRUNCATE * sigma
         g = self.density(sigma, (lower - margin, upper + margin))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
+
+    @cached_property
+    def _shares(self) -> Floats:
+        """Weights of detections, normalised."""
+        assert isinstance(self.pattern, PointPattern)
+        return np.asarray(self.pattern.weights / self.pattern.weights.sum())
+
+    @cached_property
+    def _apart(self) -> Floats | None:
+        """Squared distances of all detections from one another, where they are few."""
+        assert isinstance(self.pattern, PointPattern)
+        return squared_distances(self.pattern.points)
 
     def _render(
         self, variance: float, feature_sigma: float, within: tuple[Floats, Floats], gradient: bool

@@ -35,7 +35,17 @@ def _all_pairs(count: int) -> NDArray[np.intp]:
     return pairs
 
 
-def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
+def squared_distances(points: Floats) -> Floats | None:
+    """Between all points (n, m): (n, n); None where they are too many for that."""
+    if len(points) > _DENSE:
+        return None
+    away = points[:, None] - points
+    return np.asarray((away * away).sum(axis=2))
+
+
+def self_overlap(
+    points: Floats, weights: Floats, variance: float, squared: Floats | None = None
+) -> float:
     """Σ_ij w_i w_j N(y_i − y_j; 0, variance): the inner product of a mixture with itself.
 
     Parameters
@@ -44,9 +54,14 @@ def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     weights : (n,) array
     variance : float
         Sum of the variances of the two factors: 2σ² for features of standard deviation σ.
+    squared : (n, n) array or None
+        Squared distances of the points, where they are known.
     """
+    top = peak(variance, points.shape[1])
+    if squared is not None:
+        return float(weights @ np.exp(squared * (-0.5 / variance)) @ weights) * top
     pairs = close_pairs(points, variance)
     away = points[pairs[:, 0]] - points[pairs[:, 1]]
     bells = np.exp(-0.5 * np.einsum("pm,pm->p", away, away) / variance)
     cross = float(np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells))
-    return (float(np.sum(weights**2)) + 2 * cross) * peak(variance, points.shape[1])
+    return (float(np.sum(weights**2)) + 2 * cross) * top

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.objective import View, pose_jacobian
-from mixpose.rigid import transform
+from mixpose.objective import Gaze, View, gazes_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -26,7 +25,11 @@ _WIDEST_SHARE = 0.1  # of the observed extent: wider than that everything is one
 
 
 def ladder(
-    views: Sequence[View], body: Body, T_world_object: Floats, uncertainty: Floats
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    uncertainty: Floats,
+    gazes: Sequence[Gaze] | None = None,
 ) -> list[list[float]]:
     """Blurs per level and view, coarse to fine.
 
@@ -38,14 +41,24 @@ def ladder(
         Where the descent starts.
     uncertainty : (6,) array
         Standard deviations of the start, order of `mixpose.rigid`.
+    gazes : sequence of Gaze or None
+        Of the views' sensors at the body, where they are at hand.
 
     Returns
     -------
     list of list of float
         Standard deviation of a feature, per level and view; the last level is σ_ε.
     """
-    widest = [_projected_spread(view, body, T_world_object, uncertainty) for view in views]
+    if gazes is None:
+        gazes = gazes_of([view.sensor for view in views], body)
+    spreads = {}
+    for gaze in gazes:
+        for sensor, spread in zip(
+            gaze.sensors, _spreads(gaze, T_world_object, uncertainty), strict=True
+        ):
+            spreads[id(sensor)] = spread
     finest = [view.observation.sigma for view in views]
+    widest = [min(spreads[id(view.sensor)], _widest(view)) for view in views]
     largest = max(wide / fine for wide, fine in zip(widest, finest, strict=True))
     count = max(int(np.ceil(np.log(max(largest, 1.0)) / np.log(RATIO))), 0)
     levels = []
@@ -55,14 +68,15 @@ def ladder(
     return levels
 
 
-def _projected_spread(view: View, body: Body, T_world_object: Floats, uncertainty: Floats) -> float:
-    """Root mean square by which the projected features may be off, in sensor units."""
-    points = body.nodes.points
-    _, by_world, seen = view.sensor.linearise(transform(T_world_object, points))
-    if not seen.any():
-        return view.observation.sigma
-    J = pose_jacobian(by_world, T_world_object, points)[seen]
-    variance = float(np.einsum("nmk,k->nm", J**2, uncertainty**2).mean())
+def _spreads(gaze: Gaze, T_world_object: Floats, uncertainty: Floats) -> list[float]:
+    """Root mean square by which the features that each sensor sees may be off, sensor units."""
+    at = gaze.project(T_world_object)
+    variances = ((at.J * at.J) @ uncertainty**2).mean(axis=2)
+    counts = at.seen.sum(axis=1)
+    sums = (variances * at.seen).sum(axis=1)
+    return [float(v) for v in np.sqrt(sums / np.maximum(counts, 1))]
+
+
+def _widest(view: View) -> float:
     lower, upper = view.observation.extent()
-    widest = max(_WIDEST_SHARE * float((upper - lower).max()), view.observation.sigma)
-    return min(float(np.sqrt(variance)), widest)
+    return max(_WIDEST_SHARE * float((upper - lower).max()), view.observation.sigma)

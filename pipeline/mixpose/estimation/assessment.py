@@ -19,7 +19,7 @@ from mixpose.estimation.evidence import (
     log_evidence,
     noise_of,
 )
-from mixpose.estimation.meeting import meet
+from mixpose.estimation.meeting import Meeting, meet
 from mixpose.objective import View
 from mixpose.objective.matched import matched_objective
 from mixpose.records import SensorReport
@@ -48,6 +48,8 @@ class Assessment:
         Logarithm of the odds for this pose against mere clutter.
     noise : Noise
         Residuals of this frame and, fading, of those before it.
+    meetings : tuple of Meeting
+        The pose against each sensor that has some of the body in view.
     """
 
     sensors: dict[str, SensorReport]
@@ -57,6 +59,7 @@ class Assessment:
     covariance: Floats
     log_evidence: float
     noise: Noise
+    meetings: tuple[Meeting, ...] = ()
 
 
 def assess(
@@ -85,10 +88,11 @@ def assess(
     sigmas = [view.observation.sigma for view in views]
     objective = matched_objective(views, body, sigmas, T_world_object, fine=True)
     observations = {view.name: view.observation for view in views}
-    met = {
-        term.name: meet(term, observations[term.name], body, T_world_object)
-        for term in objective.terms
-    }
+    met: dict[str, Meeting] = {}
+    for stack in objective.stacks:
+        names = [term.name for term in stack.terms]
+        seen = meet(stack, [observations[name] for name in names], T_world_object)
+        met |= dict(zip(names, seen, strict=True))
     reports = {
         view.name: SensorReport(True, met[view.name].explained, met[view.name].rms)
         if view.name in met
@@ -110,4 +114,5 @@ def assess(
             meetings, information, noise, free, prior or flat_prior(body, free), blind
         ),
         noise=noise,
+        meetings=tuple(meetings),
     )

@@ -20,7 +20,7 @@ from scipy.special import chdtri
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.matched import MatchedTerm
+from mixpose.objective.stack import MatchedTerm
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.records import GridPattern
 from mixpose.rigid import perturb, twist_between

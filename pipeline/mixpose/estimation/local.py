@@ -15,7 +15,7 @@ from mixpose.estimation.annealing import ladder
 from mixpose.estimation.guidance import all_grids, ascend_guided
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.settling import settle
-from mixpose.objective import View, build_objective
+from mixpose.objective import View, build_objective, gazes_of
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import TWIST_NAMES, perturb
 
@@ -74,13 +74,14 @@ def fit_near(
         Samples of the body, for the objectives that integrate by sampling.
     """
     free = free_mask(options)
-    levels = ladder(views, body, T_start, np.where(free, uncertainty, 0.0))
+    gazes = gazes_of([view.sensor for view in views], body)
+    levels = ladder(views, body, T_start, np.where(free, uncertainty, 0.0), gazes)
     ascent = Ascent(T_start, 0.0, False, 0)
     for k, sigmas in enumerate(levels):
         last = k == len(levels) - 1
         newton = FINE if last else COARSE
         objective = build_objective(
-            options.objective, views, body, samples, sigmas, ascent.state, fine=last
+            options.objective, views, body, samples, sigmas, ascent.state, last, gazes
         )
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     T, settled = ascent.state, False

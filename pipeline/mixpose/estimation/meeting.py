@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import Body
 from mixpose.density import Observation, peak
-from mixpose.objective import pose_jacobian
-from mixpose.objective.base import facing
-from mixpose.objective.matched import MatchedTerm, overlap_terms
+from mixpose.objective import Projected
+from mixpose.objective.stack import MatchedTerm, Stack
 from mixpose.records import PointPattern
-from mixpose.rigid import transform
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -83,49 +81,56 @@ class Meeting:
 
 
 def meet(
-    term: MatchedTerm, observation: Observation, body: Body, T_world_object: Floats
-) -> Meeting:
-    """Compare what a pose predicts for a sensor with what was observed.
+    stack: Stack, observations: Sequence[Observation], T_world_object: Floats
+) -> list[Meeting]:
+    """Compare what a pose predicts for some sensors with what was observed.
 
     Parameters
     ----------
-    term : MatchedTerm
-        The sensor's matched density at σ_ε, on fine tiles around the pose.
-    observation : Observation
-    body : Body
+    stack : Stack
+        The sensors' matched densities at σ_ε, exact around the pose.
+    observations : sequence of Observation
+        Of the same sensors.
     T_world_object : (4, 4) array
 
     Returns
     -------
-    Meeting
+    list of Meeting
+        One per sensor.
     """
-    points, weights = body.nodes.points, body.nodes.weights
-    points_world = transform(T_world_object, points)
-    y, by_world, seen = term.sensor.linearise(points_world)
-    faced = facing(term.sensor, T_world_object, points_world, body.node_normals)
-    count = peak(term.variance, y.shape[1]) / term.energy
-    unseen = float(weights[faced & ~seen].sum())
-    seen &= faced
-    J = pose_jacobian(by_world[seen], T_world_object, points[seen])
-    sampled = term.matched.sample(y)[seen].astype(np.float64)
-    y, weights = y[seen], weights[seen]
+    at = stack.gaze.project(T_world_object)
+    sampled, _ = stack.look_up(at.y)
+    norms = stack.overlaps(at).norm
+    return [
+        _meeting(stack, observation, at, k, sampled[k], float(norms[k]))
+        for k, observation in enumerate(observations)
+    ]
+
+
+def _meeting(
+    stack: Stack, observation: Observation, at: Projected, k: int, sampled: Floats, norm: float
+) -> Meeting:
+    """The meeting with sensor k of a stack."""
+    term = stack.terms[k]
+    seen = at.seen[k]
+    y, weights, sampled = at.y[k][seen], at.weights[k][seen], sampled[seen]
     shares, offsets, explained = np.zeros(len(y)), np.zeros(y.shape), 0.0
     product = float(weights @ sampled[:, 0])
     if product > 0:
-        norm = overlap_terms(y, J, weights, term.variance).norm
         explained = min(product**2 / (term.energy * norm), 1.0)
         if isinstance(observation.pattern, PointPattern):
             shares, offsets = _nearest(observation.pattern, y, weights, term.variance)
         else:
             shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
     sigma = float(np.sqrt(term.variance / 2))
+    count = peak(term.variance, y.shape[1]) / term.energy
     return Meeting(
         explained=explained,
         shares=shares,
         offsets=offsets,
-        J=J,
+        J=at.J[k][seen],
         expected=float(weights.sum()),
-        unseen=unseen,
+        unseen=float(stack.gaze.weights[at.faced[k] & ~seen].sum()),
         sigma=sigma,
         crowd=_crowd(observation, y, sigma, count),
         count=_count(observation, count),

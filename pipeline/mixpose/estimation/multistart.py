@@ -26,7 +26,7 @@ NARROWING = 3.0
 """How much narrower a blur than the uncertainty the candidates are scored at, and start from."""
 
 
-def candidates(
+def starts_around(
     views: Sequence[View], body: Body, T_guess: Floats, uncertainty: Floats, *, seed: int
 ) -> list[Floats]:
     """The most promising poses around a guess, best first.

@@ -25,7 +25,8 @@ from mixpose.density import peak
 from mixpose.estimation.guidance import cell_variance
 from mixpose.estimation.meeting import LEAST_SHARE
 from mixpose.objective import Quadratic, View, matched_objective, pose_jacobian
-from mixpose.objective.matched import MatchedTerm, overlap_terms
+from mixpose.objective.overlaps import overlap_terms
+from mixpose.objective.stack import MatchedTerm
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, transform
 

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.estimation.assessment import Assessment, assess
 from mixpose.estimation.flips import flipped
-from mixpose.estimation.local import fit_near, free_mask
-from mixpose.estimation.multistart import NARROWING, candidates
+from mixpose.estimation.local import FINE, fit_near, free_mask
+from mixpose.estimation.multistart import NARROWING, starts_around
 from mixpose.estimation.options import EstimatorOptions
+from mixpose.estimation.sharpening import bent, sharpened
 from mixpose.estimation.track import (
     Branch,
     Prediction,
@@ -45,7 +46,7 @@ SURE = 7.0
 POSSIBLE = 0.0
 """Log odds from which a pose is worth telling, if only as one of several."""
 
-_DOUBTFUL = -3.0  # log odds from which it is, where most of the body is met
+_DOUBTFUL = -4.5  # log odds from which it is, where most of the body is met
 _MOST = 0.6
 
 RIVAL = 0.01
@@ -55,6 +56,7 @@ CONVINCING = 0.75
 """Share of the body that must be met for the prediction to be taken without looking elsewhere."""
 
 _LISTED = 0.001
+_OUTDONE = 10.0  # log odds by which a candidate of the search may be behind to be refined
 _SAME_ROTATION_DEG = 1.0
 _SAME_DISTANCE_SHARE = 0.02  # of the body's radius
 
@@ -167,11 +169,18 @@ class Tracker:
         T_reference = predictions[0].T_world_object if predictions else self.T_start
         rated: list[Rated] = []
 
-        def consider(T: Floats) -> None:
+        def judge(T: Floats) -> Rated:
             T = nearest_alike(T, self.body, T_reference)
             prior = prior_of(T, predictions, self.body, self.free, track.misses)
-            judged = assess(views, self.body, T, self.free, before=track.noise, prior=prior)
-            self._insert(rated, Rated(T, judged))
+            return Rated(T, assess(views, self.body, T, self.free, before=track.noise, prior=prior))
+
+        def consider(T: Floats) -> None:
+            new = judge(T)
+            if self.options.objective == "matched" and bent(new.assessment.meetings):
+                T_sharp = sharpened(views, self.body, T, self.free, FINE)
+                sharp = new if T_sharp is None else judge(T_sharp)
+                new = max(new, sharp, key=lambda one: one.assessment.log_evidence)
+            self._insert(rated, new)
 
         for prediction in predictions:
             consider(self._fit(views, prediction.T_world_object, prediction.uncertainty))
@@ -190,20 +199,22 @@ class Tracker:
                 self.free, np.maximum(prediction.uncertainty, self.start_uncertainty), 0
             )
             T = prediction.T_world_object
-            for start in candidates(views, self.body, T, wide, seed=self.options.seed):
+            for start in starts_around(views, self.body, T, wide, seed=self.options.seed):
                 found.append(self._fit(views, start, wide / NARROWING))
         T_reference = predictions[0].T_world_object if predictions else self.T_start
-        for candidate in search(
+        close = self.start_uncertainty / NARROWING**2
+        candidates = search(
             views,
             self.body,
             free=self.free,
             T_reference=T_reference,
             seed=self.options.seed,
-        ):
+        )
+        for candidate in candidates:
+            # far worse ones are rivals in name only, and are rated as the search leaves them
+            rival = candidate.evidence > candidates[0].evidence - _OUTDONE
             T = candidate.T_world_object
-            if self.options.objective != "matched":
-                T = self._fit(views, T, self.start_uncertainty / NARROWING**2)
-            found.append(T)
+            found.append(self._fit(views, T, close) if rival else T)
         return found
 
     def _fit(self, views: Sequence[View], T: Floats, uncertainty: Floats) -> Floats:

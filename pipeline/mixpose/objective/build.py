@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Objective, View
+from mixpose.objective.gaze import Gaze
 from mixpose.objective.matched import matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 
 Floats: TypeAlias = NDArray[np.float64]
 ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
 Builder: TypeAlias = Callable[
-    [Sequence[View], Body, Floats, Sequence[float], Floats, bool], Objective
+    [Sequence[View], Body, Floats, Sequence[float], Floats, bool, Sequence[Gaze]], Objective
 ]
 
 
@@ -27,8 +28,9 @@ def _matched(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
+    gazes: Sequence[Gaze],
 ) -> Objective:
-    return matched_objective(views, body, sigmas, near, fine=fine)
+    return matched_objective(views, body, sigmas, near, fine=fine, gazes=gazes)
 
 
 def _paper(
@@ -38,6 +40,7 @@ def _paper(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
+    gazes: Sequence[Gaze],
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
     return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
@@ -50,6 +53,7 @@ def _independent(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
+    gazes: Sequence[Gaze],
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
     return IndependentObjective(terms, samples, body.world_offsets(samples.shape[1]))
@@ -69,8 +73,8 @@ def build_objective(
     samples: Floats,
     sigmas: Sequence[float],
     near: Floats,
-    *,
     fine: bool = False,
+    gazes: Sequence[Gaze] = (),
 ) -> Objective:
     """Build an objective of the pose at one level of blur.
 
@@ -88,5 +92,7 @@ def build_objective(
         Pose around whose projection densities are made.
     fine : bool
         Whether the matched objective makes its densities on fine tiles, for the last digits.
+    gazes : sequence of Gaze
+        Of the views' sensors at the body, where they are at hand.
     """
-    return OBJECTIVES[name](views, body, samples, sigmas, near, fine)
+    return OBJECTIVES[name](views, body, samples, sigmas, near, fine, gazes)

@@ -14,56 +14,25 @@ is sampled at random.  The curvature is Gauss-Newton's of the residual g − a h
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import TILE_REACH, Atlas, Density, close_pairs, peak
-from mixpose.objective.base import (
-    Quadratic,
-    View,
-    facing,
-    pose_jacobian,
-    region_of_interest,
-)
+from mixpose.density import FEW, TILE_REACH, Atlas, Density, Mixture, peak
+from mixpose.objective.base import Quadratic, View, facing, region_of_interest
+from mixpose.objective.gaze import Gaze
+from mixpose.objective.stack import MatchedTerm, Stack
+from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
-
 REACH = 4.0
 """Margin of a window around the predicted features, in standard deviations of C."""
-
-
-@dataclass(frozen=True)
-class MatchedTerm:
-    """One sensor's share of the objective, at one level of blur.
-
-    Attributes
-    ----------
-    name : str
-    sensor : Sensor
-    matched : Density
-        C with its gradient.
-    variance : float
-        2σ², that of the product of two features, in squared sensor units.
-    energy : float
-        ⟨g, g⟩.
-    weight : float
-        ω_l.
-    """
-
-    name: str
-    sensor: Sensor
-    matched: Density | Atlas
-    variance: float
-    energy: float
-    weight: float
 
 
 class MatchedObjective:
@@ -75,10 +44,16 @@ class MatchedObjective:
     body : Body
         Its nodes are what is predicted; spreads Σ_i do not widen the prediction, as a template
         wider than the data is biased (see `docs/method.md`).
+    gazes : sequence of Gaze
+        Of the terms' sensors at the body, where they are at hand.
     """
 
-    def __init__(self, terms: Sequence[MatchedTerm], body: Body) -> None:
+    def __init__(
+        self, terms: Sequence[MatchedTerm], body: Body, gazes: Sequence[Gaze] = ()
+    ) -> None:
+        self._gazes = tuple(gazes)
         self.terms = tuple(terms)
+        self.body = body
         self.points = body.nodes.points
         self.weights = body.nodes.weights
         self.normals = body.node_normals
@@ -99,137 +74,34 @@ class MatchedObjective:
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and Gauss-Newton curvature at one pose (4, 4).
 
-        On fine tiles the Hessian is given too, but for the second derivatives of the projection,
-        which act on residuals only.
+        Where densities are exact the Hessian is given too, but for the second derivatives of the
+        projection, which act on residuals only.
         """
-        value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
-        hessian: Floats | None = np.zeros((6, 6))
-        points = transform(T_world_object, self.points)
-        for term in self.terms:
-            y, by_world, seen = term.sensor.linearise(points)
-            seen = seen & facing(term.sensor, T_world_object, points, self.normals)
-            if not seen.any():
-                continue
-            J = pose_jacobian(by_world[seen], T_world_object, self.points[seen])
-            sampled, second = _look_up(term.matched, y, seen)
-            share = _share(term, sampled, second, y[seen], J, self.weights[seen])
-            value += share.value
-            gradient += share.gradient
-            curvature += share.curvature
-            known = hessian is not None and share.hessian is not None
-            hessian = hessian + share.hessian if known else None  # type: ignore[operator]
-        return Quadratic(value, gradient, curvature, hessian)
-
-
-def _look_up(
-    matched: Density | Atlas, y: Floats, seen: NDArray[np.bool_]
-) -> tuple[Floats, Floats | None]:
-    """C with its gradient, and its second derivatives where they are known."""
-    if isinstance(matched, Density):
-        return matched.sample(y[seen]).astype(np.float64), None
-    sampled, second = matched.sample_all(y)
-    return sampled[seen].astype(np.float64), second[seen].astype(np.float64)
-
-
-def _share(
-    term: MatchedTerm,
-    sampled: Floats,
-    second: Floats | None,
-    y: Floats,
-    J: Floats,
-    weights: Floats,
-) -> Quadratic:
-    """One sensor's weighted share ω S with its derivatives; y (n, m), J (n, m, 6)."""
-    flat = (weights[:, None, None] * J).reshape(-1, J.shape[-1])
-    product = float(weights @ sampled[:, 0])
-    by_pose = sampled[:, 1:].reshape(-1) @ flat
-    overlap = overlap_terms(y, J, weights, term.variance)
-    amplitude = product / overlap.norm
-    scale = term.weight / term.energy
-    by_amplitude = (by_pose - 2 * amplitude * overlap.half_gradient) / overlap.norm
-    gradient = 2 * amplitude * (by_pose - amplitude * overlap.half_gradient)
-    curvature = overlap.gram - np.outer(overlap.half_gradient, overlap.half_gradient) / overlap.norm
-    hessian = None
-    if second is not None:
-        # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
-        bend = flat.T @ (second @ J).reshape(-1, J.shape[-1])
-        hessian = -scale * (
-            2 * overlap.norm * np.outer(by_amplitude, by_amplitude)
-            + 2 * amplitude * bend
-            - amplitude**2 * overlap.second
+        parts = [stack.linearise(T_world_object) for stack in self.stacks]
+        if len(parts) == 1:
+            return parts[0]
+        hessians = [part.hessian for part in parts if part.hessian is not None]
+        return Quadratic(
+            sum(part.value for part in parts),
+            np.sum([part.gradient for part in parts] or [np.zeros(6)], axis=0),
+            np.sum([part.curvature for part in parts] or [np.zeros((6, 6))], axis=0),
+            np.sum(hessians, axis=0) if parts and len(hessians) == len(parts) else None,
         )
-    return Quadratic(
-        scale * product * amplitude,
-        scale * gradient,
-        2 * scale * amplitude**2 * curvature,
-        hessian,
-    )
+
+    @cached_property
+    def stacks(self) -> list[Stack]:
+        """Terms side by side, those of cameras and those of ranges apart."""
+        stacks = []
+        for m in sorted({term.sensor.dimension for term in self.terms}):
+            terms = [term for term in self.terms if term.sensor.dimension == m]
+            sensors = [term.sensor for term in terms]
+            gaze = next((one for one in self._gazes if _are_same(one.sensors, sensors)), None)
+            stacks.append(Stack(terms, gaze or Gaze(sensors, self.body)))
+        return stacks
 
 
-@dataclass(frozen=True)
-class Overlap:
-    """Inner products of a predicted mixture h with itself and its derivatives by the pose.
-
-    Attributes
-    ----------
-    norm : float
-        ⟨h, h⟩.
-    half_gradient : (6,) array
-        ⟨h, ∂h⟩, half the gradient of the norm.
-    gram : (6, 6) array
-        ⟨∂h, ∂h⟩.
-    second : (6, 6) array
-        Second derivative of the norm, without those of the projection.
-    """
-
-    norm: float
-    half_gradient: Floats
-    gram: Floats
-    second: Floats
-
-
-def overlap_terms(y: Floats, J: Floats, weights: Floats, variance: float) -> Overlap:
-    """Overlap of the features of a predicted mixture.
-
-    Parameters
-    ----------
-    y : (n, m) array
-        Projected features.
-    J : (n, m, 6) array
-        Their Jacobians by the pose.
-    weights : (n,) array
-    variance : float
-        2σ².
-    """
-    top = peak(variance, y.shape[1])
-    size = J.shape[-1]
-    flat = (J * weights[:, None, None]).reshape(-1, size)
-    gram = flat.T @ flat * (top / variance)
-    own = float(weights @ weights)
-    pairs = close_pairs(y, variance)
-    away = y[pairs[:, 0]] - y[pairs[:, 1]]
-    exponent = (away * away).sum(axis=1) * (-0.5 / variance)
-    near = exponent > _NEGLIGIBLE
-    if not near.any():
-        return Overlap(top * own, np.zeros(size), gram, np.zeros((size, size)))
-    i, j = pairs[near, 0], pairs[near, 1]
-    away, bells = away[near], weights[i] * weights[j] * np.exp(exponent[near]) * top
-    J_i, J_j = J[i], J[j]
-    along_i = np.einsum("pm,pmk->pk", away, J_i)
-    along_j = np.einsum("pm,pmk->pk", away, J_j)
-    along = along_i - along_j
-    half_gradient = -(bells @ along) / variance
-    cross = _weighted(bells, J_i, J_j) / variance - (along_i.T * bells) @ along_j / variance**2
-    J_apart = J_i - J_j
-    second = (along.T * bells) @ along / variance**2 - _weighted(bells, J_apart, J_apart) / variance
-    norm = top * own + 2 * float(bells.sum())
-    return Overlap(norm, half_gradient, gram + cross + cross.T, 2 * second)
-
-
-def _weighted(weights: Floats, A: Floats, B: Floats) -> Floats:
-    """Σ_p w_p A_pᵀ B_p for A and B of shape (p, m, k)."""
-    size = A.shape[-1]
-    return np.asarray((A * weights[:, None, None]).reshape(-1, size).T @ B.reshape(-1, size))
+def _are_same(some: Sequence[Sensor], others: Sequence[Sensor]) -> bool:
+    return len(some) == len(others) and all(a is b for a, b in zip(some, others, strict=True))
 
 
 def _self_overlaps(y: Floats, weights: Floats, variance: float) -> Floats:
@@ -252,6 +124,7 @@ def matched_objective(
     *,
     fine: bool = False,
     reach: float = TILE_REACH,
+    gazes: Sequence[Gaze] = (),
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -265,9 +138,12 @@ def matched_objective(
     near : (4, 4) array or None
         Densities are made only around the projection of this pose; None: wherever a sensor sees.
     fine : bool
-        Whether densities are wanted on fine tiles around the projection, for the last digits.
+        Whether grids are wanted on fine tiles around the projection, for the last digits;
+        densities of detections are always exact.
     reach : float
         Half-width of such tiles, in standard deviations of the matched density.
+    gazes : sequence of Gaze
+        Of the views' sensors at the body, where they are at hand.
     """
     terms = []
     for view, sigma in zip(views, sigmas, strict=True):
@@ -281,21 +157,24 @@ def matched_objective(
         count = peak(variance, view.sensor.dimension) / energy
         weight = count / len(body)
         terms.append(MatchedTerm(view.name, view.sensor, matched, variance, energy, weight))
-    return MatchedObjective(terms, body)
+    return MatchedObjective(terms, body, gazes)
 
 
 def _matched_density(
     view: View, body: Body, sigma: float, near: Floats | None, reach: float | None
-) -> Density | Atlas | None:
+) -> Density | Atlas | Mixture | None:
     """C around a pose, or over the whole sensor; None where the sensor sees nothing of it."""
+    observation = view.observation
+    if isinstance(observation.pattern, PointPattern) and len(observation.pattern.points) <= FEW:
+        return observation.matched_near(sigma, None)
     if near is None:
-        return view.observation.matched(sigma, (view.sensor.lower, view.sensor.upper))
+        return observation.matched(sigma, (view.sensor.lower, view.sensor.upper))
     y, visible = view.sensor.project(transform(near, body.nodes.points))
     if not visible.any():
         return None
-    if reach is not None:
-        atlas = view.observation.matched_near(sigma, y, reach)
-        if atlas is not None:
-            return atlas
+    if reach is not None or isinstance(observation.pattern, PointPattern):
+        exact = observation.matched_near(sigma, y, reach or TILE_REACH)
+        if exact is not None:
+            return exact
     box = region_of_interest(view.sensor, y[visible], REACH * np.sqrt(2) * sigma)
-    return view.observation.matched(sigma, box)
+    return observation.matched(sigma, box)

@@ -12,9 +12,11 @@ from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv, dpotrf
 
 Floats: TypeAlias = NDArray[np.float64]
 _STUCK = 1e9  # damping at which steps no longer move anything
+_TINY = float(np.finfo(np.float64).tiny)
 _LEAST_CURVATURE = 1e-3  # of the diagonal: flatter Hessians would throw a step far away
 State = TypeVar("State")
 
@@ -124,26 +126,42 @@ def ascend(
 
 def _step(here: Model, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
     """Damped Newton step and the gain that the model expects of it."""
-    inner = np.ix_(free, free)
-    C, g = here.curvature[inner], here.gradient[free]
-    diagonal = np.diag(C)
+    C, g, hessian = here.curvature, here.gradient, here.hessian
+    everything = bool(free.all())
+    if not everything:
+        inner = np.ix_(free, free)
+        C, g = C[inner], g[free]
+        hessian = None if hessian is None else hessian[inner]
+    diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
-    floor = max(float(diagonal.max(initial=0.0)) * 1e-12, np.finfo(np.float64).tiny)
+    floor = max(float(diagonal.max(initial=0.0)) * 1e-12, _TINY)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, floor))
-    if here.hessian is not None and _is_definite(here.hessian[inner] * scale[:, None] * scale):
-        C = here.hessian[inner]
-    A = C * scale[:, None] * scale + (damping + 1e-12) * np.eye(len(g))
-    partial = scale * np.linalg.solve(A, scale * g)
+    scales = scale[:, None] * scale
+    if hessian is not None and _is_definite(hessian * scales):
+        C = hessian
+    A = C * scales
+    A.flat[:: len(g) + 1] += damping + 1e-12
+    partial = scale * _solved(A, scale * g)
+    gain = float(g @ partial - 0.5 * partial @ C @ partial)
+    if everything:
+        return partial, gain
     step = np.zeros(len(free))
     step[free] = partial
-    gain = float(g @ partial - 0.5 * partial @ C @ partial)
     return step, gain
+
+
+def _solved(A: Floats, b: Floats) -> Floats:
+    """X with A x = b, for A symmetric and as a rule positive definite."""
+    if not len(b):
+        return b
+    _, x, failure = dposv(A, b)
+    return np.asarray(np.linalg.solve(A, b) if failure else x)
 
 
 def _is_definite(scaled: Floats) -> bool:
     """Whether a matrix, scaled to a diagonal near 1, is safely positive definite."""
-    try:
-        np.linalg.cholesky(scaled - _LEAST_CURVATURE * np.eye(len(scaled)))
-    except np.linalg.LinAlgError:
+    if not len(scaled):
         return False
-    return True
+    shifted = scaled.copy()
+    shifted.flat[:: len(shifted) + 1] -= _LEAST_CURVATURE
+    return bool(dpotrf(shifted, overwrite_a=True)[1] == 0)

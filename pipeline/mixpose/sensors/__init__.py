@@ -5,6 +5,7 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 
 from __future__ import annotations
 
+from mixpose.sensors.bank import Bank, bank
 from mixpose.sensors.base import OUTSIDE, Sensor
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
@@ -21,9 +22,11 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
 __all__ = [
     "OUTSIDE",
     "SENSOR_MODELS",
+    "Bank",
     "FisheyeCamera",
     "ParallelBeam",
     "PinholeCamera",
     "RangeSensor",
     "Sensor",
+    "bank",
 ]

@@ -23,15 +23,15 @@ class LensDistortion:
 
     Attributes
     ----------
-    coefficients : (14,) float64
-        OpenCV's order, missing ones zero.
-    radius_limit : float
+    coefficients : (14,) or (14, ...) float64
+        OpenCV's order, missing ones zero; further axes broadcast against those of the points.
+    radius_limit : float or (...) float64
         Normalised radius up to which the radial polynomial grows.  Beyond it a model fitted to
         the image folds back and would show points that no lens images.
     """
 
     coefficients: Floats
-    radius_limit: float
+    radius_limit: float | Floats
 
     @classmethod
     def from_coefficients(cls, coefficients: ArrayLike) -> LensDistortion | None:
@@ -56,7 +56,7 @@ class LensDistortion:
         out = np.empty_like(xy)
         out[..., 0] = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x) + prism_x
         out[..., 1] = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y + prism_y
-        if k[12] or k[13]:
+        if np.any(k[12:]):
             M = _tilt_matrix(k[12], k[13])
             h = out @ M[:, :2].T + M[:, 2]
             out = h[..., :2] / h[..., 2:]
@@ -78,7 +78,7 @@ class LensDistortion:
         D[..., 0, 1] = 2 * y * (x * d_radial + d_prism_x) + 2 * k[2] * x + 2 * k[3] * y
         D[..., 1, 0] = 2 * x * (y * d_radial + d_prism_y) + 2 * k[2] * x + 2 * k[3] * y
         D[..., 1, 1] = radial + 2 * y * (y * d_radial + d_prism_y) + 6 * k[2] * y + 2 * k[3] * x
-        if k[12] or k[13]:
+        if np.any(k[12:]):
             D = self._tilt_derivative(xy) @ D
         return D
 
@@ -91,11 +91,11 @@ class LensDistortion:
         return np.asarray(inner / h[..., 2, None, None])
 
 
-def _polynomial(r2: Floats, a: float, b: float, c: float) -> Floats:
+def _polynomial(r2: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
     return np.asarray(1 + r2 * (a + r2 * (b + r2 * c)))
 
 
-def _derivative(r2: Floats, a: float, b: float, c: float) -> Floats:
+def _derivative(r2: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
     return np.asarray(a + r2 * (2 * b + 3 * r2 * c))
 
 

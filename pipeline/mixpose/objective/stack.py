@@ -1,0 +1,141 @@
+"""The matched terms of sensors of one dimension, evaluated side by side.
+
+Arrays have the sensors first: places y (L, n, m), Jacobians J (L, n, m, 6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.density import Atlas, Density, Mixture
+from mixpose.objective.base import Quadratic
+from mixpose.objective.gaze import Gaze, Projected
+from mixpose.objective.overlaps import Overlap, overlap_terms, overlaps_of_few
+from mixpose.sensors import Sensor
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_FEW = 40  # features up to which all pairs at once are faster than those that overlap
+_TINY = np.finfo(np.float64).tiny
+
+
+@dataclass(frozen=True)
+class MatchedTerm:
+    """One sensor's share of the matched objective, at one level of blur.
+
+    Attributes
+    ----------
+    name : str
+    sensor : Sensor
+    matched : Density, Atlas or Mixture
+        C with its gradient.
+    variance : float
+        2σ², that of the product of two features, in squared sensor units.
+    energy : float
+        ⟨g, g⟩.
+    weight : float
+        ω_l.
+    """
+
+    name: str
+    sensor: Sensor
+    matched: Density | Atlas | Mixture
+    variance: float
+    energy: float
+    weight: float
+
+
+class Stack:
+    """Terms of sensors of one dimension, as one function of the pose."""
+
+    def __init__(self, terms: Sequence[MatchedTerm], gaze: Gaze) -> None:
+        self.terms = tuple(terms)
+        self.gaze = gaze
+        self.variances = np.array([term.variance for term in terms])
+        self._scales = np.array([term.weight / term.energy for term in terms])
+        self._mixtures = _joined([term.matched for term in terms])
+
+    def look_up(self, y: Floats) -> tuple[Floats, Floats | None]:
+        """C with gradient (L, n, 1 + m) at places y, and second derivatives where known."""
+        if self._mixtures is not None:
+            return self._mixtures.sample_all(y)
+        values: list[NDArray[Any]] = []
+        seconds: list[NDArray[Any]] = []
+        for term, places in zip(self.terms, y, strict=True):
+            if isinstance(term.matched, Density):
+                values.append(term.matched.sample(places))
+            else:
+                value, second = term.matched.sample_all(places)
+                values.append(value)
+                seconds.append(second)
+        known = np.array(seconds, dtype=np.float64) if len(seconds) == len(values) else None
+        return np.array(values, dtype=np.float64), known
+
+    def overlaps(self, at: Projected) -> Overlap:
+        """Overlaps of the predicted mixture in every sensor, all with a leading axis L."""
+        if at.y.shape[1] <= _FEW:
+            return overlaps_of_few(at.y, at.J, at.weights, self.variances)
+        each = [
+            overlap_terms(y[seen], J[seen], weights[seen], variance)
+            for y, J, weights, seen, variance in zip(
+                at.y, at.J, at.weights, at.seen, self.variances.tolist(), strict=True
+            )
+        ]
+        return Overlap(
+            norm=np.array([one.norm for one in each]),
+            half_gradient=np.array([one.half_gradient for one in each]),
+            gram=np.array([one.gram for one in each]),
+            second=np.array([one.second for one in each]),
+        )
+
+    def linearise(self, T_world_object: Floats) -> Quadratic:
+        """Σ_l ω_l S_l at one pose, with its derivatives."""
+        at = self.gaze.project(T_world_object)
+        sampled, second = self.look_up(at.y)
+        overlap = self.overlaps(at)
+        # a sensor that sees no feature has neither product nor norm
+        norm = np.maximum(overlap.norm, _TINY)
+        flat = (at.J * at.weights[..., None, None]).reshape(len(at.J), -1, 6)
+        product = (at.weights * sampled[..., 0]).sum(axis=1)
+        pull = sampled[..., 1:].reshape(len(flat), 1, -1)
+        by_pose = (pull @ flat)[:, 0]
+        amplitude = product / norm
+        half = overlap.half_gradient
+        rest = by_pose - amplitude[:, None] * half
+        strength = 2 * self._scales * amplitude
+        gradient = strength @ rest
+        level = (strength * amplitude)[:, None, None]
+        across = half[:, :, None] * half[:, None, :]
+        curvature = (level * (overlap.gram - across / norm[:, None, None])).sum(axis=0)
+        hessian = None
+        if second is not None:
+            # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
+            by_amplitude = (rest - amplitude[:, None] * half) / norm[:, None]
+            bend = flat.swapaxes(1, 2) @ (second @ at.J).reshape(flat.shape)
+            squared = (2 * self._scales * norm)[:, None] * by_amplitude
+            hessian = 0.5 * level * overlap.second - strength[:, None, None] * bend
+            hessian = hessian.sum(axis=0) - squared.T @ by_amplitude
+        value = float(self._scales @ (product * amplitude))
+        return Quadratic(value, gradient, curvature, hessian)
+
+
+def _joined(parts: Sequence[Density | Atlas | Mixture]) -> Mixture | None:
+    """Mixtures of all sensors with a leading axis L; None where some are drawn on grids."""
+    mixtures = [part for part in parts if isinstance(part, Mixture)]
+    if len(mixtures) < len(parts):
+        return None
+    rows = max(mixture.points.shape[0] for mixture in mixtures)
+    most = max(mixture.points.shape[1] for mixture in mixtures)
+    points = np.zeros((len(parts), rows, most, mixtures[0].points.shape[2]))
+    heights = np.zeros((len(parts), rows, most))
+    for k, mixture in enumerate(mixtures):
+        count = mixture.points.shape[1]
+        points[k, :, :count] = mixture.points
+        heights[k, :, :count] = mixture.heights
+    variances = np.array([mixture.variance for mixture in mixtures])
+    return Mixture(points, heights, variances[:, None, None])

@@ -1,0 +1,134 @@
+"""Several sensors of one kind, linearised together.
+
+For a handful of points NumPy spends its time on calls, not on numbers: one matrix product for all
+cameras costs hardly more than for one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from mixpose.sensors.base import OUTSIDE, Floats, Mask, Sensor
+from mixpose.sensors.distortion import LensDistortion
+from mixpose.sensors.lateration import RangeSensor
+from mixpose.sensors.pinhole import NEAREST, PinholeCamera
+
+
+class Bank(Protocol):
+    """L sensors that measure the same number m of coordinates."""
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """Coordinates (L, n, m), Jacobians (L, n, m, 3) and visibility (L, n) of points (n, 3).
+
+        As `Sensor.linearise` gives them one by one.
+        """
+        ...
+
+
+def bank(sensors: Sequence[Sensor]) -> Bank:
+    """Put sensors of one dimension side by side."""
+    cameras = [sensor for sensor in sensors if isinstance(sensor, PinholeCamera)]
+    if len(cameras) == len(sensors) and not any(_is_tilted(camera) for camera in cameras):
+        return PinholeBank(cameras)
+    ranges = [sensor for sensor in sensors if isinstance(sensor, RangeSensor)]
+    if len(ranges) == len(sensors):
+        return RangeBank(ranges)
+    return MixedBank(sensors)
+
+
+class MixedBank:
+    """Sensors of any kinds, one after the other."""
+
+    def __init__(self, sensors: Sequence[Sensor]) -> None:
+        self._sensors = tuple(sensors)
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `Bank.linearise`."""
+        parts = [sensor.linearise(points_world) for sensor in self._sensors]
+        y, J, visible = (np.stack(part) for part in zip(*parts, strict=True))
+        return y, J, visible
+
+
+class RangeBank:
+    """Range sensors, one row of positions each."""
+
+    def __init__(self, sensors: Sequence[RangeSensor]) -> None:
+        self._positions = np.array([sensor.position for sensor in sensors])[:, None]
+        self._biases = np.array([sensor.range_bias for sensor in sensors])[:, None]
+        self._lower = np.array([sensor.lower for sensor in sensors])
+        self._upper = np.array([sensor.upper for sensor in sensors])
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `Bank.linearise`."""
+        away = points_world - self._positions
+        distance = np.sqrt((away * away).sum(axis=2))
+        y = distance + self._biases
+        J = away / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
+        visible = (y >= self._lower) & (y <= self._upper)
+        return _hidden(y[..., None], J[:, :, None, :], visible)
+
+
+class PinholeBank:
+    """Pinhole cameras without tilted sensors: one product projects the points into all."""
+
+    def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
+        T = np.array([camera.T_sensor_world for camera in cameras])
+        self._count = len(cameras)
+        self._R = T[:, :3, :3]
+        self._rows = self._R.reshape(-1, 3)
+        self._t = T[:, :3, 3].reshape(-1, 1)
+        K = np.array([camera.camera_matrix for camera in cameras])
+        self._K = K[:, None, :2, :2]
+        self._centre = K[:, None, :2, 2]
+        self._lower = np.array([camera.lower for camera in cameras])[:, None]
+        self._upper = np.array([camera.upper for camera in cameras])[:, None]
+        self._lens = _lenses(cameras)
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `Bank.linearise`."""
+        points = (self._rows @ points_world.T + self._t).reshape(self._count, 3, -1)
+        visible = points[:, 2] > NEAREST
+        inverse_depth = 1.0 / np.where(visible, points[:, 2], 1.0)
+        xy = np.swapaxes(points[:, :2] * inverse_depth[:, None], 1, 2)
+        M = self._K * inverse_depth[..., None, None]
+        lens = self._lens
+        ideal = xy
+        if lens is not None:
+            visible &= (xy * xy).sum(axis=2) < lens.radius_limit**2
+            # polynomials of huge radii overflow; hidden points are overwritten anyway
+            ideal = np.where(visible[..., None], xy, 0.0)
+            xy = lens.apply(ideal)
+            M = M @ lens.derivative(ideal)
+        y = np.matmul(self._K, xy[..., None])[..., 0] + self._centre
+        R = self._R[:, None]
+        J = M @ (R[:, :, :2] - ideal[..., None] * R[:, :, 2:])
+        visible &= ((y >= self._lower) & (y <= self._upper)).all(axis=2)
+        return _hidden(y, J, visible)
+
+
+def _hidden(y: Floats, J: Floats, visible: Mask) -> tuple[Floats, Floats, Mask]:
+    """Overwrite what is not visible, in place."""
+    if not visible.all():
+        y[~visible] = OUTSIDE
+        J[~visible] = 0.0
+    return y, J, visible
+
+
+def _is_tilted(camera: PinholeCamera) -> bool:
+    return camera.lens is not None and bool(camera.lens.coefficients[12:].any())
+
+
+def _lenses(cameras: Sequence[PinholeCamera]) -> LensDistortion | None:
+    """The lenses of all cameras with a column of coefficients each; None without any."""
+    if all(camera.lens is None for camera in cameras):
+        return None
+    coefficients = np.zeros((14, len(cameras), 1))
+    limits = np.full((len(cameras), 1), np.inf)
+    for k, camera in enumerate(cameras):
+        if camera.lens is not None:
+            coefficients[:, k, 0] = camera.lens.coefficients
+            limits[k] = camera.lens.radius_limit
+    return LensDistortion(coefficients, limits)
