@@ -48,7 +48,7 @@ def range_profile() -> GridPattern:
 )
 def test_every_density_integrates_to_one(pattern: Pattern, sigma: float) -> None:
     observation = Observation(pattern, sigma)
-    lower, upper = observation.extent()
+    lower, upper = observation.extent
     g = observation.density(sigma, (lower - 6 * sigma, upper + 6 * sigma))
     assert g.values.dtype == np.float32
     # the window ends at 5 sigma: the tails hold 1e-6, float32 sums another 1e-6
@@ -100,11 +100,11 @@ def test_coordinates_a_thousandth_of_a_step_apart_are_told_apart() -> None:
 def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Pattern) -> None:
     observation = Observation(pattern, 2.0)
     for density in (
-        observation.matched(2.0, observation.extent()),
-        observation.density(2.0, observation.extent(), gradient=True),
+        observation.matched(2.0, observation.extent),
+        observation.density(2.0, observation.extent, gradient=True),
     ):
         assert density.values.shape[2] in EXACT_CHANNELS
-        y = np.array([observation.extent()[0]])
+        y = np.array([observation.extent[0]])
         assert density.sample(y).shape == (1, 1 + density.dimension)
 
 
@@ -125,9 +125,9 @@ def test_outside_the_window_and_at_nan_is_the_floor() -> None:
 
 @pytest.mark.parametrize("pattern", [points_pattern(), image_pattern(), range_points()])
 def test_gradient_channels_are_the_derivative_of_the_density(pattern: Pattern) -> None:
-    sigma = 6.0 if len(Observation(pattern, 1.0).extent()[0]) == 2 else 0.6
+    sigma = 6.0 if len(Observation(pattern, 1.0).extent[0]) == 2 else 0.6
     observation = Observation(pattern, sigma)
-    lower, upper = observation.extent()
+    lower, upper = observation.extent
     g = observation.density(sigma, (lower - 5 * sigma, upper + 5 * sigma), gradient=True)
     h = g.window.step
     if g.dimension == 1:

@@ -71,7 +71,7 @@ def on_fine_grids(name: ObjectiveName, views: list[View], body: Body, sigma: flo
         return matched_objective(views, body, [sigma] * len(views), TRUTH, fine=True)
     terms = []
     for view in views:
-        lower, upper = view.observation.extent()
+        lower, upper = view.observation.extent
         window = Window.around(lower - 4 * sigma, upper + 4 * sigma, sigma / 16)
         density = render(view.observation.pattern, sigma, window, gradient=True)
         terms.append(SampledTerm(view.sensor, density))

@@ -47,25 +47,28 @@ class Mixture:
         """Density and gradient (..., n, 1 + m) at the places (..., n, m) of n features."""
         away = self.points - y[..., None, :]
         bells = self._bells(away)
-        pull = np.einsum("...k,...km->...m", bells, away) / self.variance
-        return np.concatenate([bells.sum(axis=-1)[..., None], pull], axis=-1)
+        sampled = np.empty((*y.shape[:-1], 1 + y.shape[-1]))
+        sampled[..., 0] = bells.sum(axis=-1)
+        sampled[..., 1:] = (bells[..., None, :] @ away)[..., 0, :] / self.variance
+        return sampled
 
     def sample_all(self, y: Floats) -> tuple[Floats, Floats]:
         """As `sample`, with the second derivatives (..., n, m, m)."""
+        m = y.shape[-1]
         away = self.points - y[..., None, :]
         bells = self._bells(away)
+        weighted = away * bells[..., None]
+        sampled = np.empty((*y.shape[:-1], 1 + m))
         C = bells.sum(axis=-1)
-        weighted = np.swapaxes(away * bells[..., None], -1, -2)
-        pull = weighted.sum(axis=-1) / self.variance
-        second = weighted @ away / self.variance[..., None]
-        second -= C[..., None, None] * np.eye(y.shape[-1])
-        second /= self.variance[..., None]
-        return np.concatenate([C[..., None], pull], axis=-1), second
+        sampled[..., 0] = C
+        sampled[..., 1:] = weighted.sum(axis=-2) / self.variance
+        second = weighted.swapaxes(-1, -2) @ away / self.variance[..., None]
+        second -= C[..., None, None] * np.eye(m)
+        return sampled, second / self.variance[..., None]
 
     def _bells(self, away: Floats) -> Floats:
-        bells = np.exp((away * away).sum(axis=-1) * (-0.5 / self.variance))
-        bells *= self.heights
-        return np.asarray(bells)
+        squared = (away * away).sum(axis=-1)
+        return np.asarray(np.exp(squared * (-0.5 / self.variance)) * self.heights)
 
 
 def mixture(pattern: PointPattern, sigma: float, centres: Floats | None, reach: float) -> Mixture:

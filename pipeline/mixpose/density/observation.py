@@ -67,6 +67,7 @@ class Observation:
             return len(self.pattern.points) == 0 or not self.pattern.weights.sum() > 0
         return not self.pattern.values.any()
 
+    @cached_property
     def extent(self) -> tuple[Floats, Floats]:
         """Smallest and largest sensor coordinates (m,) of the pattern."""
         pattern = self.pattern
@@ -110,7 +111,7 @@ class Observation:
             return 0.0
         if isinstance(pattern, PointPattern):
             return self_overlap(pattern.points, self._shares, 2 * sigma**2, self._apart)
-        lower, upper = self.extent()
+        lower, upper = self.extent
         margin = TRUNCATE * sigma
         g = self.density(sigma, (lower - margin, upper + margin))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
@@ -139,7 +140,7 @@ class Observation:
     def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
         """A window over the box, fine enough for the blur and within the budget of cells."""
         margin = TRUNCATE * feature_sigma
-        near, far = self.extent()
+        near, far = self.extent
         lower = np.maximum(within[0], near - margin)
         upper = np.maximum(np.minimum(within[1], far + margin), lower)
         affordable = float(np.prod(upper - lower) / MOST_CELLS) ** (1 / self.dimension)

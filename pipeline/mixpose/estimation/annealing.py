@@ -78,5 +78,5 @@ def _spreads(gaze: Gaze, T_world_object: Floats, uncertainty: Floats) -> list[fl
 
 
 def _widest(view: View) -> float:
-    lower, upper = view.observation.extent()
+    lower, upper = view.observation.extent
     return max(_WIDEST_SHARE * float((upper - lower).max()), view.observation.sigma)

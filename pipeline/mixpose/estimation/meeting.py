@@ -205,7 +205,7 @@ def _count(observation: Observation, participation: float) -> float:
 def _crowd(observation: Observation, y: Floats, sigma: float, count: float) -> float:
     """Density of observed features: over the whole pattern, or near the body if denser there."""
     smallest = _SMALLEST_REGION * sigma
-    lower, upper = observation.extent()
+    lower, upper = observation.extent
     overall = _count(observation, count) / float(np.prod(np.maximum(upper - lower, smallest)))
     if not isinstance(observation.pattern, PointPattern):
         return overall

@@ -57,6 +57,9 @@ class Gaze:
         self.weights = body.nodes.weights
         self.normals = body.node_normals
         self._bank = bank(self.sensors)
+        self._everything = np.ones((len(self.sensors), len(self.points)), dtype=np.bool_)
+        self._by_twist = np.zeros((len(self.points), 3, 6))
+        self._by_twist[:, :, :3] = np.eye(3)
 
     def project(self, T_world_object: Floats) -> Projected:
         """Where the sensors see the body at a pose (4, 4)."""
@@ -67,8 +70,7 @@ class Gaze:
             [facing(sensor, T_world_object, points_world, self.normals) for sensor in self.sensors]
         )
         seen &= faced
-        by_twist = np.empty((len(arms), 3, 6))
-        by_twist[:, :, :3] = np.eye(3)
+        by_twist = self._by_twist.copy()
         by_twist[:, :, 3:] = (arms @ _LIFT.T).reshape(-1, 3, 3)
         return Projected(y, by_world @ by_twist, seen, faced, self.weights * seen)
 

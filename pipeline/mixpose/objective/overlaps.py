@@ -100,8 +100,10 @@ def overlaps_of_few(y: Floats, J: Floats, weights: Floats, variances: Floats) ->
     away = y[:, :, None] - y[:, None]
     exponents = (away * away).sum(axis=3) * (-0.5 * scale)[:, None, None]
     together = exponents > _NEGLIGIBLE
-    together &= (weights[:, :, None] * weights[:, None]) > 0
-    if int(together.sum()) <= int((weights > 0).sum()):
+    if np.count_nonzero(together) > L * n:
+        # those that are not seen sit together far outside
+        together &= (weights[:, :, None] * weights[:, None]) > 0
+    if np.count_nonzero(together) <= L * n:
         gram = flat.swapaxes(1, 2) @ flat * (tops * scale)[:, None, None]
         norm = tops * (weights * weights).sum(axis=1)
         return Overlap(norm, np.zeros((L, 6)), gram, np.zeros((L, 6, 6)))

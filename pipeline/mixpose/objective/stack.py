@@ -94,34 +94,44 @@ class Stack:
         )
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Σ_l ω_l S_l at one pose, with its derivatives."""
+        """Σ_l ω_l S_l at one pose, with its derivatives.
+
+        Between detections the curvature is that of mean-shift, 2 a Σ_i C_i J_iᵀ J_i / 2σ²: every
+        feature is drawn to where the detections around it lie, and the value never falls.  On
+        grids, where features overlap, it is Gauss-Newton's of g − a h.
+        """
         at = self.gaze.project(T_world_object)
         sampled, second = self.look_up(at.y)
         overlap = self.overlaps(at)
         # a sensor that sees no feature has neither product nor norm
         norm = np.maximum(overlap.norm, _TINY)
-        flat = (at.J * at.weights[..., None, None]).reshape(len(at.J), -1, 6)
-        product = (at.weights * sampled[..., 0]).sum(axis=1)
-        pull = sampled[..., 1:].reshape(len(flat), 1, -1)
-        by_pose = (pull @ flat)[:, 0]
+        L = len(norm)
+        flat = (at.J * at.weights[..., None, None]).reshape(L, -1, 6)
+        C = sampled[..., 0]
+        product = (at.weights * C).sum(axis=1)
+        by_pose = (sampled[..., 1:].reshape(L, 1, -1) @ flat)[:, 0]
         amplitude = product / norm
         half = overlap.half_gradient
         rest = by_pose - amplitude[:, None] * half
         strength = 2 * self._scales * amplitude
-        gradient = strength @ rest
-        level = (strength * amplitude)[:, None, None]
-        across = half[:, :, None] * half[:, None, :]
-        curvature = (level * (overlap.gram - across / norm[:, None, None])).sum(axis=0)
+        level = strength * amplitude
         hessian = None
         if second is not None:
             # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
             by_amplitude = (rest - amplitude[:, None] * half) / norm[:, None]
-            bend = flat.swapaxes(1, 2) @ (second @ at.J).reshape(flat.shape)
-            squared = (2 * self._scales * norm)[:, None] * by_amplitude
-            hessian = 0.5 * level * overlap.second - strength[:, None, None] * bend
-            hessian = hessian.sum(axis=0) - squared.T @ by_amplitude
+            bend = (strength[:, None, None] * flat).swapaxes(1, 2) @ (second @ at.J).reshape(
+                L, -1, 6
+            )
+            hessian = (0.5 * level[:, None, None] * overlap.second - bend).sum(axis=0)
+            hessian -= ((2 * self._scales * norm)[:, None] * by_amplitude).T @ by_amplitude
+        if self._mixtures is not None:
+            drawn = ((strength / self.variances)[:, None] * C)[..., None, None] * at.J
+            curvature = flat.reshape(-1, 6).T @ drawn.reshape(-1, 6)
+        else:
+            across = half[:, :, None] * half[:, None, :] / norm[:, None, None]
+            curvature = (level[:, None, None] * (overlap.gram - across)).sum(axis=0)
         value = float(self._scales @ (product * amplitude))
-        return Quadratic(value, gradient, curvature, hessian)
+        return Quadratic(value, strength @ rest, curvature, hessian)
 
 
 def _joined(parts: Sequence[Density | Atlas | Mixture]) -> Mixture | None:
@@ -129,13 +139,17 @@ def _joined(parts: Sequence[Density | Atlas | Mixture]) -> Mixture | None:
     mixtures = [part for part in parts if isinstance(part, Mixture)]
     if len(mixtures) < len(parts):
         return None
-    rows = max(mixture.points.shape[0] for mixture in mixtures)
-    most = max(mixture.points.shape[1] for mixture in mixtures)
-    points = np.zeros((len(parts), rows, most, mixtures[0].points.shape[2]))
-    heights = np.zeros((len(parts), rows, most))
-    for k, mixture in enumerate(mixtures):
-        count = mixture.points.shape[1]
-        points[k, :, :count] = mixture.points
-        heights[k, :, :count] = mixture.heights
+    if len({mixture.points.shape for mixture in mixtures}) == 1:
+        points = np.array([mixture.points for mixture in mixtures])
+        heights = np.array([mixture.heights for mixture in mixtures])
+    else:
+        rows = max(mixture.points.shape[0] for mixture in mixtures)
+        most = max(mixture.points.shape[1] for mixture in mixtures)
+        points = np.zeros((len(parts), rows, most, mixtures[0].points.shape[2]))
+        heights = np.zeros((len(parts), rows, most))
+        for k, mixture in enumerate(mixtures):
+            count = mixture.points.shape[1]
+            points[k, :, :count] = mixture.points
+            heights[k, :, :count] = mixture.heights
     variances = np.array([mixture.variance for mixture in mixtures])
     return Mixture(points, heights, variances[:, None, None])

@@ -16,8 +16,9 @@ from scipy.linalg.lapack import dposv, dpotrf
 
 Floats: TypeAlias = NDArray[np.float64]
 _STUCK = 1e9  # damping at which steps no longer move anything
+_HELD_BACK = 1e-2  # damping after a step that led astray, at least
 _TINY = float(np.finfo(np.float64).tiny)
-_LEAST_CURVATURE = 1e-3  # of the diagonal: flatter Hessians would throw a step far away
+_LEAST_CURVATURE = 0.3  # of C: where a Hessian is flatter, its step would lead too far
 State = TypeVar("State")
 
 
@@ -54,7 +55,7 @@ class NewtonOptions:
     iterations : int
         Most evaluations of the model.
     tolerance : float
-        Stop when a step is expected to gain less than this share of the value.
+        The step that is expected to gain less than this share of the value is the last.
     damping : float
         First Levenberg-Marquardt damping, as a share of the curvature's diagonal.
     value_error : float
@@ -108,7 +109,8 @@ def ascend(
     step, gain = _step(here, free, damping)
     for iteration in range(1, options.iterations):
         if gain <= options.tolerance * abs(here.value):
-            return Ascent(state, here.value, True, iteration)
+            # so near, the model is right: its last step is taken unseen
+            return Ascent(move(state, step), here.value + gain, True, iteration)
         candidate = move(state, step)
         there = model(candidate)
         next_damping = max(damping / 10, 1e-9)
@@ -117,7 +119,7 @@ def ascend(
         if there.value > here.value or (close and next_gain < gain):
             state, here, damping, step, gain = candidate, there, next_damping, next_step, next_gain
             continue
-        damping *= 10
+        damping = max(10 * damping, _HELD_BACK)
         if damping > _STUCK:
             return Ascent(state, here.value, close, iteration)
         step, gain = _step(here, free, damping)
@@ -137,7 +139,7 @@ def _step(here: Model, free: NDArray[np.bool_], damping: float) -> tuple[Floats,
     floor = max(float(diagonal.max(initial=0.0)) * 1e-12, _TINY)
     scale = 1.0 / np.sqrt(np.maximum(diagonal, floor))
     scales = scale[:, None] * scale
-    if hessian is not None and _is_definite(hessian * scales):
+    if hessian is not None and _is_definite((hessian - _LEAST_CURVATURE * C) * scales):
         C = hessian
     A = C * scales
     A.flat[:: len(g) + 1] += damping + 1e-12
@@ -159,9 +161,5 @@ def _solved(A: Floats, b: Floats) -> Floats:
 
 
 def _is_definite(scaled: Floats) -> bool:
-    """Whether a matrix, scaled to a diagonal near 1, is safely positive definite."""
-    if not len(scaled):
-        return False
-    shifted = scaled.copy()
-    shifted.flat[:: len(shifted) + 1] -= _LEAST_CURVATURE
-    return bool(dpotrf(shifted, overwrite_a=True)[1] == 0)
+    """Whether a matrix, scaled to a diagonal near 1, is positive definite."""
+    return len(scaled) > 0 and bool(dpotrf(scaled)[1] == 0)

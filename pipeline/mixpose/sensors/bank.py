@@ -77,11 +77,12 @@ class PinholeBank:
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
         T = np.array([camera.T_sensor_world for camera in cameras])
         self._count = len(cameras)
-        self._R = T[:, :3, :3]
-        self._rows = self._R.reshape(-1, 3)
+        self._rows = T[:, :3, :3].reshape(-1, 3)
+        self._upper_rows, self._last_row = T[:, None, :2, :3], T[:, None, 2:3, :3]
         self._t = T[:, :3, 3].reshape(-1, 1)
         K = np.array([camera.camera_matrix for camera in cameras])
         self._K = K[:, None, :2, :2]
+        self._K_transposed = K[:, :2, :2].swapaxes(1, 2).copy()
         self._centre = K[:, None, :2, 2]
         self._lower = np.array([camera.lower for camera in cameras])[:, None]
         self._upper = np.array([camera.upper for camera in cameras])[:, None]
@@ -90,8 +91,9 @@ class PinholeBank:
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `Bank.linearise`."""
         points = (self._rows @ points_world.T + self._t).reshape(self._count, 3, -1)
-        visible = points[:, 2] > NEAREST
-        inverse_depth = 1.0 / np.where(visible, points[:, 2], 1.0)
+        depth = points[:, 2]
+        visible = depth > NEAREST
+        inverse_depth = 1.0 / (depth if visible.all() else np.where(visible, depth, 1.0))
         xy = np.swapaxes(points[:, :2] * inverse_depth[:, None], 1, 2)
         M = self._K * inverse_depth[..., None, None]
         lens = self._lens
@@ -102,9 +104,8 @@ class PinholeBank:
             ideal = np.where(visible[..., None], xy, 0.0)
             xy = lens.apply(ideal)
             M = M @ lens.derivative(ideal)
-        y = np.matmul(self._K, xy[..., None])[..., 0] + self._centre
-        R = self._R[:, None]
-        J = M @ (R[:, :, :2] - ideal[..., None] * R[:, :, 2:])
+        y = xy @ self._K_transposed + self._centre
+        J = M @ (self._upper_rows - ideal[..., None] * self._last_row)
         visible &= ((y >= self._lower) & (y <= self._upper)).all(axis=2)
         return _hidden(y, J, visible)
 
