@@ -21,9 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from benchmarks import search_rows  # noqa: E402
+from benchmarks import objective_case, pose_case, search_rows  # noqa: E402
 
 CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "objective": objective_case.run,
+    "pose": pose_case.run,
     "search": search_rows.run,
 }
 
