@@ -12,11 +12,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from paper.search import fmaxsearch
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 from scipy.stats import norm, qmc
-
-from paper.search import fmaxsearch
 
 Floats: TypeAlias = NDArray[np.float64]
 LookUp: TypeAlias = Callable[[Floats, Floats], Floats]

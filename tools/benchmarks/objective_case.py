@@ -13,6 +13,9 @@ from unittest import mock
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from paper.measurements import Measurement, measure
+from paper.runs import views
+from paper.systems import SCENARIOS, draw, pose, systems
 
 from benchmarks.literal import Camera, LiteralObjective
 from benchmarks.timing import medians, show
@@ -21,9 +24,6 @@ from mixpose.objective.base import region_of_interest
 from mixpose.objective.paper import REACH, PaperObjective, SampledTerm, sampled_terms
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam
-from paper.measurements import Measurement, measure
-from paper.runs import views
-from paper.systems import SCENARIOS, draw, pose, systems
 
 Floats: TypeAlias = NDArray[np.float64]
 

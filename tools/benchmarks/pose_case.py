@@ -10,12 +10,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from paper.measurements import sum_of_gaussians
+from paper.systems import POINTS, draw, pose
 from scipy.spatial.transform import Rotation
 
 from benchmarks.literal import Camera, LiteralObjective, samples_of
@@ -28,8 +31,6 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
-from paper.measurements import sum_of_gaussians
-from paper.systems import POINTS, draw, pose
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ class Trial:
         """Detections of the first camera in the order of the markers, for `cv2.solvePnP`."""
         y = self.sensors[0].project(transform(pose(self.truth), POINTS))[0]
         nearest = np.linalg.norm(self.detections[0] - y[:, None], axis=2).argmin(axis=1)
-        return self.detections[0][nearest]
+        return np.asarray(self.detections[0][nearest])
 
 
 def run(_: argparse.Namespace) -> dict[str, Any]:
@@ -78,8 +79,8 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
     sampled = [literal_objective(each, PAPER_SPREAD, PAPER_SAMPLES) for each in trials]
     literal = [f.estimate(t.start) for f, t in zip(sampled, trials, strict=True)]
     tasks = {
-        "two cameras": in_turn([lambda t=t: estimate(t.views, pose(t.start)) for t in trials]),
-        "one camera": in_turn([lambda t=t: estimate(t.views[:1], pose(t.start)) for t in trials]),
+        "two cameras": in_turn([partial(estimate, t.views, pose(t.start)) for t in trials]),
+        "one camera": in_turn([partial(estimate, t.views[:1], pose(t.start)) for t in trials]),
         "solvePnP": in_turn([solve_pnp(t) for t in trials]),
     }
     seconds = medians(tasks, rounds=15, calls=TRIALS)
@@ -161,8 +162,7 @@ def literal_objective(frame: Trial, spread: float, samples: int) -> LiteralObjec
 
 
 def searches(objectives: Sequence[LiteralObjective], trials: Sequence[Trial]) -> list[Task]:
-    pairs = zip(objectives, trials, strict=True)
-    return [lambda f=f, t=t: f.estimate(t.start) for f, t in pairs]
+    return [partial(f.estimate, t.start) for f, t in zip(objectives, trials, strict=True)]
 
 
 def solve_pnp(frame: Trial) -> Task:
@@ -190,7 +190,11 @@ def solve_pnp(frame: Trial) -> Task:
 def in_turn(tasks: Sequence[Task]) -> Task:
     """One task after the other, call by call, from the first again after the last."""
     endless = cycle(tasks)
-    return lambda: next(endless)()
+
+    def call_next() -> object:
+        return next(endless)()
+
+    return call_next
 
 
 def errors(found: Sequence[Floats], trials: Sequence[Trial], prefix: str) -> dict[str, float]:
