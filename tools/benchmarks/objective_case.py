@@ -6,7 +6,6 @@ System 2 of the paper, scenario I: two parallel-beam cameras, N = 6 features, R 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from typing import Any, TypeAlias
 from unittest import mock
 
@@ -18,7 +17,7 @@ from paper.runs import views
 from paper.systems import SCENARIOS, draw, pose, systems
 
 from benchmarks.literal import Camera, LiteralObjective
-from benchmarks.timing import medians, show
+from benchmarks.timing import Task, medians, show
 from mixpose.objective import View
 from mixpose.objective.base import region_of_interest
 from mixpose.objective.paper import REACH, PaperObjective, SampledTerm, sampled_terms
@@ -112,22 +111,34 @@ def cameras(measurements: list[Measurement]) -> list[Camera]:
     return found
 
 
-def remaps_in(evaluate: Callable[[], object]) -> Callable[[], None]:
+def remaps_in(evaluate: Task) -> Task:
     """The calls of cv2.remap that an evaluation makes, with the same arguments, to be repeated."""
-    calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
-    remap = cv2.remap
-
-    def record(*arguments: Any, **named: Any) -> Any:
-        calls.append((arguments, named))
-        return remap(*arguments, **named)
-
-    with mock.patch.object(cv2, "remap", record):
-        evaluate()
-    if not calls:
-        raise RuntimeError("no cv2.remap was called: there is nothing to compare with")
+    calls = remap_calls(evaluate)
 
     def repeat() -> None:
         for arguments, named in calls:
-            remap(*arguments, **named)
+            cv2.remap(*arguments, **named)
 
     return repeat
+
+
+def remap_calls(evaluate: Task) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Arguments of every call of cv2.remap while a function runs.
+
+    Raises
+    ------
+    RuntimeError
+        If there is none: then there is nothing to compare with.
+    """
+    calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
+    remap = cv2.remap
+
+    def take_down(*arguments: Any, **named: Any) -> Any:
+        calls.append((arguments, named))
+        return remap(*arguments, **named)
+
+    with mock.patch.object(cv2, "remap", take_down):
+        evaluate()
+    if not calls:
+        raise RuntimeError("no cv2.remap was called: there is nothing to compare with")
+    return calls
