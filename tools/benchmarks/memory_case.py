@@ -25,28 +25,6 @@ RESOLUTION = (64, 64)
 FOCAL = 170.0
 MARKERS = 4
 
-_MEASURE = """
-import os, sys
-from pathlib import Path
-from mixpose.cli.output import Output
-from mixpose.cli.run import header_of
-from mixpose.runner import run
-from mixpose.session import load_session
-
-def resident():
-    fields = Path("/proc/self/statm").read_text().split()
-    return int(fields[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-session = load_session(sys.argv[1])
-sizes = {}
-with Output(Path(os.devnull), "jsonl", header_of(session), append=False) as output:
-    for count, estimate in enumerate(run(session), 1):
-        output.write(estimate)
-        if str(count) in sys.argv[2:]:
-            sizes[count] = resident()
-print(sizes[int(sys.argv[2])], sizes[int(sys.argv[3])], estimate.status)
-"""
-
 
 def run(_: argparse.Namespace) -> dict[str, Any]:
     print(f"memory: {LATE} frames of {RESOLUTION[0]}x{RESOLUTION[1]}")
@@ -55,9 +33,10 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
         return {"growth_mb": None}
     with tempfile.TemporaryDirectory() as temporary:
         session = recording(Path(temporary))
-        command = [sys.executable, "-c", _MEASURE, str(session), str(EARLY), str(LATE)]
+        program = str(Path(__file__).with_name("long_run.py"))
+        command = [sys.executable, program, str(session), str(EARLY), str(LATE)]
         result = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    early, late = map(float, result.stdout.split()[:2])
+    early, late = map(float, result.stdout.split())
     show(f"resident after {EARLY} frames, MB", early)
     show(f"resident after {LATE} frames, MB", late)
     show("growth, MB", late - early, at_most=5)
