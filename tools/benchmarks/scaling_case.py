@@ -12,7 +12,7 @@ from paper.systems import SCENARIOS, pose, systems
 
 from benchmarks.objective_case import scene, value_terms
 from benchmarks.search_cases import looking_at
-from benchmarks.timing import Task, medians, show, slope
+from benchmarks.timing import PROCESSOR, Task, medians, show, slope
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.estimation import EstimatorOptions, fit_near
@@ -50,7 +50,7 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
 def measured(name: str, tasks: dict[float, Task], *, rounds: int, calls: int) -> dict[str, Any]:
     """Slope over all sizes, and the steepest between two that follow each other."""
     by_name = {f"{size:g}": task for size, task in tasks.items()}
-    seconds = list(medians(by_name, rounds=rounds, calls=calls).values())
+    seconds = list(medians(by_name, rounds=rounds, calls=calls, clock=PROCESSOR).values())
     sizes = list(tasks)
     for size, s in zip(sizes, seconds, strict=True):
         show(f"{size:g} {name}, ms", 1e3 * s)
