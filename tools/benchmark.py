@@ -21,10 +21,26 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
-from benchmarks import search_rows  # noqa: E402
+from benchmarks import (  # noqa: E402
+    memory_case,
+    objective_case,
+    pose_case,
+    scaling_case,
+    search_rows,
+    startup_case,
+    stream_case,
+    workers_case,
+)
 
 CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "objective": objective_case.run,
+    "pose": pose_case.run,
+    "stream": stream_case.run,
     "search": search_rows.run,
+    "scaling": scaling_case.run,
+    "memory": memory_case.run,
+    "workers": workers_case.run,
+    "startup": startup_case.run,
 }
 
 

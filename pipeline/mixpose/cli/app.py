@@ -48,9 +48,17 @@ def _common(
 
 @app.command()
 def run(
-    session: SessionFile,
+    sessions: Annotated[
+        list[Path], typer.Argument(metavar="SESSION.toml", help="One session file or several.")
+    ],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write poses here, not to stdout.")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Write poses here, not to stdout; with several sessions, the folder for a file "
+            "each, named after the session or, where that is session.toml, after its folder.",
+        ),
     ] = None,
     format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
     source: Annotated[
@@ -63,15 +71,24 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
+    workers: Annotated[int, typer.Option(min=1, help="How many sessions are run at a time.")] = 1,
 ) -> None:
     """Print a pose per frame."""
     from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
     from mixpose.runner import Selection  # noqa: PLC0415
 
-    run_session(
-        session,
-        RunRequest(output, format.value, tuple(source or ()), Selection(start, stop, step), resume),
-    )
+    selection = Selection(start, stop, step)
+    request = RunRequest(output, format.value, tuple(source or ()), selection, resume)
+    if len(sessions) == 1:
+        if workers > 1:
+            from mixpose.cli.notices import warn  # noqa: PLC0415
+
+            warn(f"--workers {workers}: one session is one process, frames follow each other")
+        run_session(sessions[0], request)
+        return
+    from mixpose.cli.several import run_sessions  # noqa: PLC0415
+
+    raise typer.Exit(run_sessions(sessions, request, workers))
 
 
 @app.command()

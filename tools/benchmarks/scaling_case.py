@@ -1,0 +1,91 @@
+"""How time grows with features and sensors of a warm estimate, and samples of the paper's value."""
+
+from __future__ import annotations
+
+import argparse
+from functools import partial
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from paper.systems import SCENARIOS, pose, systems
+
+from benchmarks.objective_case import scene, value_terms
+from benchmarks.search_cases import looking_at
+from benchmarks.timing import PROCESSOR, Task, medians, show, slope
+from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.estimation import EstimatorOptions, fit_near
+from mixpose.objective import View
+from mixpose.objective.paper import PaperObjective
+from mixpose.records import PointPattern
+from mixpose.rigid import perturb, transform
+from mixpose.sensors import PinholeCamera
+
+Floats: TypeAlias = NDArray[np.float64]
+
+FEATURES = (6, 20, 60, 200, 600)
+SENSORS = (1, 2, 4, 8)
+SAMPLES = (100, 300, 1000, 3000, 10000)
+CUBE = 300.0
+DISTANCE = 1000.0
+NOISE_PX = 0.2
+SIGMA_PX = 1.5
+OFF = np.array([2.0, -1.5, 1.0, 0.006, -0.008, 0.004])  # mm and radians: about 3 px
+UNCERTAINTY = np.array([3.0] * 3 + [np.radians(1.0)] * 3)
+
+
+def run(_: argparse.Namespace) -> dict[str, Any]:
+    print("scaling: slopes of time, both axes in logarithms; 1 is proportional")
+    features = {float(n): estimate_task(n, 2) for n in FEATURES}
+    sensors = {float(n): estimate_task(6, n) for n in SENSORS}
+    samples = {float(n): value_task(n) for n in SAMPLES}
+    return {
+        **measured("features", features, rounds=5, calls=1),
+        **measured("sensors", sensors, rounds=9, calls=3),
+        **measured("samples", samples, rounds=15, calls=5),
+    }
+
+
+def measured(name: str, tasks: dict[float, Task], *, rounds: int, calls: int) -> dict[str, Any]:
+    """Slope over all sizes, and the steepest between two that follow each other."""
+    by_name = {f"{size:g}": task for size, task in tasks.items()}
+    seconds = list(medians(by_name, rounds=rounds, calls=calls, clock=PROCESSOR).values())
+    sizes = list(tasks)
+    for size, s in zip(sizes, seconds, strict=True):
+        show(f"{size:g} {name}, ms", 1e3 * s)
+    steepest = max(slope(sizes[k : k + 2], seconds[k : k + 2]) for k in range(len(sizes) - 1))
+    figure = slope(sizes, seconds)
+    show(f"slope over {name}", figure, at_most=1.1)
+    show("the steepest between neighbours", steepest)
+    ms = {f"{size:g}": 1e3 * s for size, s in zip(sizes, seconds, strict=True)}
+    return {f"{name}_slope": figure, f"{name}_steepest": steepest, f"{name}_ms": ms}
+
+
+def estimate_task(features: int, sensors: int) -> Task:
+    """A warm estimate of a body of random points, seen by cameras on a circle around it."""
+    rng = np.random.default_rng([features, sensors])
+    points = rng.uniform(-CUBE / 2, CUBE / 2, (features, 3))
+    body = Body("random", tuple(PointFeature(point) for point in points))
+    T = perturb(np.eye(4), np.array([5.0, -8.0, 3.0, 0.2, -0.3, 0.4]))
+    K = np.array([[900.0, 0, 639.5], [0, 900.0, 511.5], [0, 0, 1]])
+    views = []
+    for k in range(sensors):
+        angle = 2.4 * k  # never two cameras opposite each other
+        eye = DISTANCE * np.array([np.sin(angle), -np.cos(angle), 0.2])
+        sensor = PinholeCamera(K, np.zeros(0), (1280, 1024), looking_at(eye, np.zeros(3)))
+        y, seen = sensor.project(transform(T, points))
+        assert seen.all(), "the body is in full view"
+        found = rng.permutation(y + NOISE_PX * rng.standard_normal(y.shape))
+        pattern = PointPattern(found, np.ones(features))
+        views.append(View(f"camera {k}", sensor, Observation(pattern, SIGMA_PX)))
+    start, options = perturb(T, OFF), EstimatorOptions()
+    return partial(fit_near, views, body, start, UNCERTAINTY, options, points[:, None])
+
+
+def value_task(samples: int) -> Task:
+    """One value of the paper's objective, as in the case `objective`, with R samples."""
+    beta, seen, _, _ = scene()
+    drawn = systems()[1].body(SCENARIOS[0]).sample(samples, seed=0)
+    T = pose(beta)
+    return partial(PaperObjective(value_terms(seen, drawn, T), drawn).value, T)
