@@ -9,7 +9,7 @@ without the terms that can make it indefinite).  Order and axes of the six numbe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,7 @@ class View:
     observation: Observation
 
 
-@dataclass(frozen=True)
-class Quadratic:
+class Quadratic(NamedTuple):
     """Second-order model of an objective at a pose: value + gᵀδ − ½ δᵀCδ.
 
     Attributes
