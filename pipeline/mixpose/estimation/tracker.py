@@ -176,11 +176,12 @@ class Tracker:
 
         def consider(T: Floats) -> None:
             new = judge(T)
-            if self.options.objective == "matched" and bent(new.assessment.meetings):
-                T_sharp = sharpened(views, self.body, T, self.free, FINE)
-                sharp = new if T_sharp is None else judge(T_sharp)
-                new = max(new, sharp, key=lambda one: one.assessment.log_evidence)
             self._insert(rated, new)
+            if self.options.objective == "matched" and bent(new.assessment.meetings):
+                meetings = new.assessment.meetings
+                T_sharp = sharpened(views, self.body, T, meetings, self.free, FINE)
+                if T_sharp is not None:
+                    self._insert(rated, judge(T_sharp))
 
         for prediction in predictions:
             consider(self._fit(views, prediction.T_world_object, prediction.uncertainty))
