@@ -75,11 +75,16 @@ def run(
 
 
 @app.command()
-def check(session: SessionFile) -> None:
-    """Read everything, estimate nothing: sensors, recordings, symmetries, expected accuracy."""
+def check(
+    session: SessionFile,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
+    ] = False,
+) -> None:
+    """Read every frame, estimate nothing: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session)
+    check_session(session, quick=quick)
 
 
 @app.command()
