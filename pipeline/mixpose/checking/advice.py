@@ -11,7 +11,7 @@ from mixpose.extraction import METHODS, ExtractOptions, extract
 from mixpose.records import Image, PointPattern
 
 _FEW = 0.6  # of the expected features: fewer are too few
-_MANY, _MANY_MORE = 4.0, 20  # times as many as expected, and so many more, are too many
+_MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
 
 
 def judge(count: float, expected: int) -> str | None:

@@ -87,6 +87,8 @@ def _no_common_view(session: Session) -> list[str]:
     if len(cameras) < 2 or not blind:
         return []
     text = f"{_names(blind)} would not see the body where the other sensors look"
+    if len(blind) == len(cameras):
+        text = f"no place was found that is in view of {_names(cameras)}"
     flipped = replace(
         session, sensors=tuple(replace(s, sensor=_with_inverse(s.sensor)) for s in cameras)
     )

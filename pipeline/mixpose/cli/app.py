@@ -55,7 +55,11 @@ def run(
     format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
     source: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+        typer.Option(
+            metavar="NAME=PATH",
+            help="Recording of a sensor in place of the session's, relative to the working "
+            "directory; may be given several times.",
+        ),
     ] = None,
     start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
     stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,

@@ -142,15 +142,18 @@ def _say_sensor(
 def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> None:
     """Frames that other sensors have."""
     own = {*surveys[name].numbers, *surveys[name].damaged}
-    everyone = own.union(*(each.numbers for each in surveys.values()))
-    missing = sorted(everyone - own)
-    if not missing:
-        return
-    report.say("", f"missing: {_numbers(missing)} of the {len(everyone)} frames of all sensors")
-    if len(missing) > 0.5 * len(everyone):
+    others = [each for other, each in surveys.items() if other != name]
+    known = set().union(*(each.numbers for each in others))
+    missing = sorted(known - own)
+    if missing:
+        everyone = len(known | own)
+        report.say("", f"missing: {_numbers(missing)} of the {everyone} frames of all sensors")
+    pairs = len(own & known)
+    if known and pairs < 0.5 * min(len(own), len(known)):
         report.warnings.append(
-            f"sensor {name!r}: has {len(own)} of {len(everyone)} frames: frames are paired by "
-            "the number that their names end in; rename them, or list them under source"
+            f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other sensors: "
+            "frames are paired by the number that their names end in; rename them, or list them "
+            "under source"
         )
 
 
