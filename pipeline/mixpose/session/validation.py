@@ -47,7 +47,7 @@ def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
 def _problem(root: type[BaseModel], finding: ErrorDetails) -> BadKeyError:
     place = _locate(root, finding["loc"])
     kind, value = finding["type"], finding["input"]
-    allowed = _allowed(place.field)
+    allowed = allowed_for(place.field)
     if kind == "extra_forbidden":
         return BadKeyError(_unknown_key(root, place), *place.key)
     if kind.startswith("union_tag"):
@@ -104,7 +104,8 @@ def _literals(field: FieldInfo | None) -> list[str]:
     return list(words(field.annotation)) if field else []
 
 
-def _allowed(field: FieldInfo | None) -> str:
+def allowed_for(field: FieldInfo | None) -> str:
+    """What a key may be, for people; empty where nothing is said."""
     if field is None:
         return ""
     carried = (getattr(mark, "description", None) for mark in field.metadata)
