@@ -55,7 +55,12 @@ def test_the_smallest_session_on_the_page_can_be_read(tmp_path: Path) -> None:
 
 def test_every_command_and_option_is_on_the_page() -> None:
     page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
-    for words in ("## `mixpose run SESSION.toml", "`-o, --output PATH`", "`--source NAME=PATH`", "`--quick`",
-                  "`--format jsonl|csv|tum|bop`: Format of the poses. Default: jsonl.",
-                  "`--frames N`: Number of frames. Needed, at least 1."):  # fmt: skip
+    for words in (
+        "## `mixpose run SESSION.toml",
+        "`-o, --output PATH`",
+        "`--source NAME=PATH`",
+        "`--quick`",
+        "`--format jsonl|csv|tum|bop`: Format of the poses. Default: jsonl.",
+        "`--frames N`: Number of frames. Needed, at least 1.",
+    ):
         assert words in page
