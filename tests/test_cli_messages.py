@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -91,3 +94,17 @@ def test_a_run_of_the_sessions_own_recording_names_no_sources(
     poses = tmp_path / "poses.jsonl"
     said(capsys, 0, "run", SESSION, "-o", str(poses), "--stop", "1")
     assert "sources" not in json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    def completed(words: str) -> list[str]:
+        asked = {"_MIXPOSE_COMPLETE": "complete_bash", "COMP_WORDS": words}
+        result = subprocess.run(
+            [sys.executable, "-m", "mixpose"], capture_output=True, text=True, check=False,
+            env=os.environ | asked | {"COMP_CWORD": str(words.count(" "))},
+        )  # fmt: skip
+        return result.stdout.split()
+
+    assert "check" in completed("mixpose ch")
+    assert "--quick" in completed("mixpose check --")
+    assert completed("mixpose run s.toml --format ") == ["jsonl", "csv", "tum", "bop"]

@@ -57,8 +57,7 @@ def run(
         list[str] | None,
         typer.Option(
             metavar="NAME=PATH",
-            help="Recording of a sensor in place of the session's, relative to the working "
-            "directory; may be given several times.",
+            help="Another recording of a sensor, relative to the working folder; repeatable.",
         ),
     ] = None,
     start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
