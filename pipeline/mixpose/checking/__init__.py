@@ -8,7 +8,7 @@ poses that the sensors could not tell apart, `typical` poses where the session n
 from __future__ import annotations
 
 from mixpose.checking.advice import advice, judge
-from mixpose.checking.lookalikes import LookAlike, look_alikes
+from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.checking.recordings import Survey, image_of, survey
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
@@ -22,6 +22,7 @@ __all__ = [
     "image_of",
     "judge",
     "look_alikes",
+    "noise_of",
     "placement_lines",
     "placement_warnings",
     "survey",

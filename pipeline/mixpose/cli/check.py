@@ -20,6 +20,7 @@ from mixpose.checking import (
     image_of,
     judge,
     look_alikes,
+    noise_of,
     placement_lines,
     placement_warnings,
     survey,
@@ -152,8 +153,7 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> N
     if known and pairs < 0.5 * min(len(own), len(known)):
         report.warnings.append(
             f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other sensors: "
-            "frames are paired by the number that their names end in; rename them, or list them "
-            "under source"
+            "frames are paired by the number that their names end in; rename the files"
         )
 
 
@@ -177,9 +177,11 @@ def _say_features(
     judgement = judge(middle, expected)
     if judgement is not None:
         number = found.typical_frame
-        image = None if number is None else image_of(source, number)
+        assert number is not None, "there are counts"
+        image = image_of(source, number)
+        count = found.counts[found.numbers.index(number)]
         report.warnings.append(
-            f"{where}: {judgement} features, {middle:g} in frame {number} where "
+            f"{where}: {judgement} features, {count} in frame {number} where "
             f"{expected} are expected: {advice(image, setup.extract, expected, session.folder)}"
         )
     elif found.empty:
@@ -262,19 +264,22 @@ def _say_accuracy_at(
     ]
     found = [alike for alike in others if alike]
     if found:
-        report.warnings.append(_look_alike_text(found, len(poses), where))
+        report.warnings.append(_look_alike_text(session, found, len(poses), where))
     return bool(found)
 
 
-def _look_alike_text(found: list[list[LookAlike]], tried: int, where: str) -> str:
+def _look_alike_text(session: Session, found: list[list[LookAlike]], tried: int, where: str) -> str:
     best = min((alike[0] for alike in found), key=lambda other: other.difference)
     orientations = f" in {len(found)} of {tried} orientations" if tried > 1 else ""
     count = max(map(len, found))
     poses = "another pose looks" if count == 1 else f"{count} other poses look"
+    largest = max(session.sensors, key=noise_of)
+    unit = "px" if largest.sensor.unit == "px" else session.unit
     return (
-        f"{where}{orientations}, {poses} the same but for noise (turned by {best.turn_deg:.0f} "
-        f"deg, {best.difference:.1f} standard deviations apart): expect frames that are "
-        "ambiguous, or move a marker out of line and plane, come closer, or add a sensor"
+        f"{where}{orientations}, {poses} the same where features err by "
+        f"{noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
+        f"{best.difference:.1f} standard deviations apart): expect ambiguous frames, or move a "
+        "marker out of line and plane, come closer, or add a sensor"
     )
 
 
