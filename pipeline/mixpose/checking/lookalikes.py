@@ -26,7 +26,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 NOISE_OF_SIGMA = 0.2
 """What centres of blobs and corners err by, of σ_ε; ranges err by σ_ε."""
 
-_LIMIT = 4.0  # standard deviations between two poses that are confused in one frame of forty
+_LIMIT = 5.0  # standard deviations between poses that some frames confuse, noise being a guess
 _PROMISING = 10.0  # the same of one feature, before each is given one of its own
 _STEP_RAD = 0.5  # between the orientations that are tried
 _STEPS, _LAST_STEPS = 12, 8
