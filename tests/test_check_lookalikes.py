@@ -96,7 +96,7 @@ def test_a_hundred_features_take_less_than_a_second() -> None:
     body = body_of(rng.uniform(-60, 60, (100, 3)))
     began = time.perf_counter()
     assert look_alikes([camera()], body, facing_camera(500.0), ALL) == []
-    assert time.perf_counter() - began < 1.0  # 0.2 s on one core of 2024
+    assert time.perf_counter() - began < 1.0  # what check may take for it; measured: 0.3 s
 
 
 def test_typical_poses_are_in_view_at_the_distance_asked_for() -> None:

@@ -162,3 +162,14 @@ def test_clutter_is_no_mistake_but_a_flood_is(
     count: float, expected: int, verdict: str | None
 ) -> None:
     assert judge(count, expected) == verdict
+
+
+def test_of_a_stream_only_its_beginning_is_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = SYNTHETIC / "one_camera_video"
+    text = (source / "session.toml").read_text(encoding="utf-8")
+    stream = f"file://{(source / 'camera.avi').as_posix()}"
+    session = tmp_path / "session.toml"
+    session.write_text(text.replace("camera.avi", stream), encoding="utf-8")
+    assert "camera.avi; looked at 5" in report_on(session, capsys)

@@ -13,6 +13,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.images import ImageSequence
 from mixpose.frames.prefetch import prefetch
+from mixpose.frames.video import Video
 from mixpose.records import Image, PointPattern, RawFrame
 from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
@@ -39,6 +40,8 @@ class Survey:
         Why a frame could not be read, a line each.
     damaged : tuple of int
         Their numbers, as far as known.
+    is_whole : bool
+        Whether all frames were looked at.
     """
 
     numbers: tuple[int, ...]
@@ -47,6 +50,7 @@ class Survey:
     size: tuple[int, int] | None = None
     damage: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
+    is_whole: bool = True
 
     @property
     def typical_frame(self) -> int | None:
@@ -74,7 +78,7 @@ def survey(
     source : Source
         The sensor's recording.
     quick : bool
-        Look at a few frames only.
+        Look at a few frames only, as is always done of a stream, which has no end.
     done : callable
         Called after each frame.
 
@@ -83,6 +87,7 @@ def survey(
     SessionError
         If a function of the user's that extracts features fails.
     """
+    quick = quick or (isinstance(source, Video) and source.size is None)
     damage: list[tuple[int | None, str]] = []
     counts: dict[int, int | None] = {}
     empty: list[int] = []
@@ -110,6 +115,7 @@ def survey(
         size=size,
         damage=tuple(text for _, text in damage),
         damaged=tuple(number for number, _ in damage if number is not None),
+        is_whole=not quick,
     )
 
 

@@ -86,7 +86,7 @@ def check_session(path: Path, *, quick: bool = False) -> None:
                 session, setup, sources[setup.name], quick=quick, done=done
             )
     for setup in session.sensors:
-        _say_sensor(report, session, setup, sources[setup.name], surveys, quick=quick)
+        _say_sensor(report, session, setup, sources[setup.name], surveys)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += placement_warnings(sized)
     _say_accuracy(report, sized)
@@ -117,15 +117,13 @@ def _say_sensor(
     setup: SensorSetup,
     source: Source,
     surveys: Mapping[str, Survey],
-    *,
-    quick: bool,
 ) -> None:
     found = surveys[setup.name]
     report.say("sensor", f"{setup.name}: {_geometry(setup)}, {_extraction(setup)}")
     for line in placement_lines(setup, session.unit):
         report.say("", line)
     total = len(found.numbers) + len(found.damage)
-    read = f"looked at {total}" if quick else "all read"
+    read = "all read" if found.is_whole else f"looked at {total}"
     if found.damage:
         read = f"{len(found.damage)} of the {total} looked at cannot be read"
     report.say("", f"{source.describe()}; {read}" if not found.damage or found.numbers else read)
@@ -135,7 +133,7 @@ def _say_sensor(
     caution = source.caution()
     if caution:
         report.warnings.append(f"{where}: {caution}")
-    if not quick:
+    if all(each.is_whole for each in surveys.values()):
         _say_missing(report, setup.name, surveys)
     _say_features(report, session, setup, source, found)
 
