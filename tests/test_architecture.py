@@ -31,6 +31,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
+    "checking": GROUND
+    | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
     "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
 }
 EDGE = {"cli", "__init__", "__main__"}

@@ -63,7 +63,10 @@ def run(
     format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
     source: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+        typer.Option(
+            metavar="NAME=PATH",
+            help="Another recording of a sensor, relative to the working folder; repeatable.",
+        ),
     ] = None,
     start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
     stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
@@ -92,11 +95,16 @@ def run(
 
 
 @app.command()
-def check(session: SessionFile) -> None:
-    """Read everything, estimate nothing: sensors, recordings, symmetries, expected accuracy."""
+def check(
+    session: SessionFile,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
+    ] = False,
+) -> None:
+    """Read every frame, estimate nothing: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session)
+    check_session(session, quick=quick)
 
 
 @app.command()

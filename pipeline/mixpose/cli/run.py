@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,9 +41,10 @@ def run_session(path: Path, request: RunRequest) -> None:
         If the recording cannot be read; frames already estimated stay written.
     """
     session = load_session(path)
-    header = header_of(session)
+    replaced = _sources(request.sources)
+    header = header_of(session, replaced)
     selection, T_start, resumed = request.selection, None, False
-    opened = open_sources(session, _sources(request.sources))
+    opened = open_sources(session, replaced)
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
@@ -79,8 +80,8 @@ def _inputs(session: Session) -> Iterator[Path]:
             yield setup.times
 
 
-def header_of(session: Session) -> Header:
-    """The first line of the poses of a session."""
+def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Header:
+    """The first line of the poses of a session, with the recordings given in place of its own."""
     return Header(
         unit=session.unit,
         session=str(session.path),
@@ -88,6 +89,7 @@ def header_of(session: Session) -> Header:
         mixpose=__version__,
         seed=session.estimator.seed,
         symmetries={session.body.name: session.body.symmetries},
+        sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
     )
 

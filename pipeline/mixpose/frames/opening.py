@@ -23,6 +23,8 @@ from mixpose.frames.video import open_video
 # A scheme has two letters or more; one letter is a drive.
 _STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
+_SHOWN = 4  # names of files that a message lists
+
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
     "video": lambda spec, places, clock: open_video(spec, places[0], clock),
@@ -99,7 +101,9 @@ def _listed(spec: SourceSpec, source: Sequence[str]) -> list[Path]:
     paths = [spec.base / name for name in source]
     for path in paths:
         if not path.is_file():
-            raise RecordingError(f"{path}: no such file, named in the source of {spec.sensor!r}")
+            raise RecordingError(
+                f"{path}: no such file, named in the source of {spec.sensor!r}; {_looked_in(path)}"
+            )
     return paths
 
 
@@ -120,13 +124,35 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
             f"{path}: matches {len(files)} files and none is an image (the first is "
             f"{min(files).name}); allowed are images or one other file"
         )
-    raise RecordingError(f"{path}: no such file, and nothing matches; source of {spec.sensor!r}")
+    raise RecordingError(
+        f"{path}: no such file, and nothing matches; source of {spec.sensor!r}; {_looked_in(path)}"
+    )
+
+
+def _looked_in(path: Path) -> str:
+    """The folder where a file was looked for, and what lies there instead."""
+    folder = path.parent
+    while not folder.is_dir() and folder != folder.parent:
+        folder = folder.parent
+    # dots and the working directory are spelled out: they may be the mistake
+    text = f"looked in {folder.resolve()}"
+    if folder != path.parent and not glob.has_magic(str(path.parent)):
+        return f"there is no folder {path.parent.resolve()}"
+    try:
+        names = natural_order([each for each in folder.iterdir() if each.name[:1] != "."])
+    except OSError as error:
+        return f"{text}, which cannot be read: {error.strerror}"
+    # files numbered alike are shown by their first
+    kinds = {re.sub(r"[0-9]+", "0", each.name): each.name for each in reversed(names)}
+    shown = ", ".join(list(kinds.values())[::-1][:_SHOWN])
+    more = f", ... ({len(names)} in all)" if len(names) > min(len(kinds), _SHOWN) else ""
+    return f"{text}, where there is {shown}{more}" if names else f"{text}, which is empty"
 
 
 def _images_in(folder: Path) -> list[Path]:
     images = [path for path in folder.iterdir() if _is_image(path) and path.is_file()]
     if not images:
-        raise RecordingError(f"{folder}: no images in this folder")
+        raise RecordingError(f"{folder}: no images in this folder; {_looked_in(folder / '*')}")
     return natural_order(images)
 
 

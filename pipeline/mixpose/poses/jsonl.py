@@ -57,7 +57,7 @@ class JsonlWriter:
 
 
 def _header_line(header: Header) -> dict[str, Any]:
-    return {
+    line: dict[str, Any] = {
         "type": "header",
         "format": FORMAT,
         "version": VERSION,
@@ -69,6 +69,9 @@ def _header_line(header: Header) -> dict[str, Any]:
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
     }
+    if header.sources:
+        line["sources"] = dict(header.sources)
+    return line
 
 
 def _pose_line(estimate: Estimate) -> dict[str, Any]:
@@ -163,7 +166,7 @@ def resume_point(path: str | Path, header: Header) -> int | None:
     Raises
     ------
     SessionError
-        If the file is of another session, seed, unit or version of mixpose.
+        If the file is of another session, seed, unit, recording or version of mixpose.
     RecordingError
         If the file is not a poses file; it is left as it is.
     """
@@ -197,6 +200,18 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
                 f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
                 f"{line[key]!r}; leave out --resume to start afresh, or name another file with -o"
             )
+    before, now = (_sources_text(each.get("sources")) for each in (found, line))
+    if before != now:
+        raise SessionError(
+            f"--resume: {path} was written with {before}, this run has {now}; give the same, or "
+            "leave out --resume to start afresh, or name another file with -o"
+        )
+
+
+def _sources_text(sources: object) -> str:
+    if not isinstance(sources, dict) or not sources:
+        return "no --source"
+    return " ".join(f"--source {name}={sources[name]}" for name in sorted(sources))
 
 
 def _read_bytes(path: Path) -> bytes:
