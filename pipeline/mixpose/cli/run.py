@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from mixpose import __version__
 from mixpose.cli.notices import Summary, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import SessionError
+from mixpose.frames import Source
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
@@ -47,6 +48,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
+        _refuse_live(opened)
         selection, T_start, resumed = _resumed(request, header)
     warn_of_sources(opened)
     summary = Summary()
@@ -100,6 +102,15 @@ def _sources(named: Iterable[str]) -> dict[str, str]:
             raise SessionError(f"--source {text}: found no NAME=PATH, as in --source left=frames/")
         sources[name] = path
     return sources
+
+
+def _refuse_live(opened: Mapping[str, Source]) -> None:
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
+                "and name another file with -o"
+            )
 
 
 def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | None, bool]:

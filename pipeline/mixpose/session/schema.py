@@ -78,7 +78,9 @@ def _threshold(value: Any) -> str | float:
 
 
 def _source(value: Any) -> str | tuple[str, ...]:
-    allowed = "a glob, a folder or a file as text, or a list of files"
+    allowed = "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return f"camera:{value}"
     texts = value if isinstance(value, list) else [value]
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
         raise BadKeyError(found(value, allowed))

@@ -109,7 +109,7 @@ def _places(data: dict[str, Any]) -> Iterator[_Place]:
         name = sensor["name"]
         if isinstance(sensor.get("source"), list):
             yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
-        elif "source" in sensor:
+        elif isinstance(sensor.get("source"), str):
             yield sensor, "source", "source", name
         if "times" in sensor:
             yield sensor, "times", "times", name
