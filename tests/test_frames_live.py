@@ -327,5 +327,5 @@ def test_number_as_source_is_a_camera(tmp_path: Path) -> None:
     path.write_text(text.replace('source = "camera.avi"', "source = 2"))
     assert load_session(path).sensors[0].source == "camera:2"
     path.write_text(text.replace('source = "camera.avi"', "source = -1"))
-    with pytest.raises(SessionError, match="source: found -1; allowed: .*a camera's number"):
+    with pytest.raises(SessionError, match=r"source: found -1; allowed: .*a camera's number"):
         load_session(path)
