@@ -33,6 +33,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
 }
+MAY_IMPORT["rerun_file"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "frames",
+    "poses",
+    "session",
+    "runner",
+}
 EDGE = {"cli", "__init__", "__main__"}
 
 

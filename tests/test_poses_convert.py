@@ -168,8 +168,9 @@ def bop_rows(path: Path) -> list[dict[str, Any]]:
         scene_id, im_id, obj_id, score, R, t, time = cells
         rotation = np.array([float(word) for word in R.split()]).reshape(3, 3)
         translation = np.array([float(word) for word in t.split()]).reshape(3, 1)
-        row = {"scene_id": int(scene_id), "im_id": int(im_id), "obj_id": int(obj_id)}
-        rows.append(row | {"score": float(score), "R": rotation, "t": translation[:, 0]})
+        row: dict[str, Any] = {"scene_id": int(scene_id), "im_id": int(im_id)}
+        row |= {"obj_id": int(obj_id), "score": float(score)}
+        rows.append(row | {"R": rotation, "t": translation[:, 0]})
         rows[-1]["time"] = float(time)
     times: dict[tuple[int, int], float] = {}
     for row in rows:  # all estimates of an image carry one time
@@ -259,8 +260,8 @@ def test_first_of_several_right_answers_is_written(
 def test_unit_is_asked_for_where_no_header_says_it(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    bare = {"frame": 0, "object": "a", "T_world_object": np.diag([1.0] * 4).tolist()}
-    bare["T_world_object"][0][3] = 5.0  # type: ignore[index]
+    bare: dict[str, Any] = {"frame": 0, "object": "a", "T_world_object": np.eye(4).tolist()}
+    bare["T_world_object"][0][3] = 5.0
     path = tmp_path / "truth.jsonl"
     path.write_text(json.dumps(bare) + "\n")
     assert "add --unit, one of m, cm, mm, um" in refused(capfd, path, "--format", "tum")

@@ -62,7 +62,7 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
     if name == "rerun":
         from mixpose.cli.rerun import write_rerun  # noqa: PLC0415
 
-        write_rerun(poses, lines, request)
+        write_rerun(poses, lines, request.output, request.session, request.sources)
     else:
         _write(poses, lines, name, request)
     if request.output is not None:

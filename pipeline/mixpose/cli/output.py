@@ -113,7 +113,8 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
         beginning = stream.read(4096).decode("utf-8", errors="replace")
     first = beginning.partition("\n")[0]
     numbers_only = first and all(_is_number(word) for word in first.split())
-    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only):
+    is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
+    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
         raise SessionError(
             f"-o {path}: holds something that mixpose did not write; name another file"
         )
