@@ -17,6 +17,7 @@ from mixpose.poses.evaluate import evaluate_files
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter, read_poses
 from mixpose.records import Estimate, SensorReport
+from mixpose.session import load_session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 TRUTH = SYNTHETIC / "one_camera_video" / "truth.jsonl"
@@ -298,6 +299,9 @@ def test_several_objects_are_no_trajectory(
         (["--format", "tum", "--unit", "m"], "says that its unit is mm"),
         (["--format", "tum", "--unit", "inch"], "--unit inch: allowed are m, cm, mm, um"),
         (["--format", "ros2"], "--format"),
+        (["--format", "csv", "--relative-to", "left"], "belongs to --format bop or ros or tum"),
+        (["--format", "tum", "--session", "s.toml"], "--session: belongs to"),
+        (["--format", "tum", "--relative-to", "left"], "its session s.toml is not there"),
     ],
 )
 def test_wrong_options_are_told(
@@ -319,3 +323,37 @@ def test_nothing_of_the_users_is_overwritten(
     for name in ("poses.yaml", "poses.tum", "poses.csv", "again.jsonl"):
         assert convert(poses, "-o", tmp_path / name) == 0
         assert convert(poses, "-o", tmp_path / name) == 0  # its own output it replaces
+
+
+def test_poses_relative_to_a_camera_are_seen_by_it_where_the_object_is(tmp_path: Path) -> None:
+    session = load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    right = session.sensors[1].sensor
+    T_sensor_world = right.T_sensor_world  # type: ignore[attr-defined]
+    assert not np.allclose(T_sensor_world, np.eye(4))
+    source = estimate(3)
+    poses = written(tmp_path / "poses.jsonl", source)
+    options = ("--relative-to", session.sensors[1].name, "--session", session.path)
+    convert(poses, "--format", "bop", "-o", tmp_path / "bop.csv", *options)
+    row = bop_rows(tmp_path / "bop.csv")[0]
+    assert source.T_world_object is not None
+    x_object = np.array([7.0, -8.0, 9.0])
+    x_world = source.T_world_object @ [*x_object, 1.0]
+    np.testing.assert_allclose(
+        row["R"] @ x_object + row["t"], (T_sensor_world @ x_world)[:3], rtol=1e-9
+    )
+
+    convert(poses, "-o", tmp_path / "poses.yaml", *options)
+    message = next(yaml.safe_load_all((tmp_path / "poses.yaml").read_text()))
+    assert message["header"]["frame_id"] == session.sensors[1].name
+    # a small motion in the world's axes, drawn from the covariance, is the same motion in the
+    # sensor's axes: compare by finite differences
+    twist = np.array([1.0, -2.0, 0.5, 1e-6, 2e-6, -3e-6])
+    moved = T_sensor_world @ rigid.perturb(source.T_world_object, twist)
+    seen = rigid.twist_between(T_sensor_world @ source.T_world_object, moved)
+    scale = np.array([1e-3] * 3 + [1.0] * 3)
+    found = np.array(message["pose"]["covariance"]).reshape(6, 6) / np.outer(scale, scale)
+    assert source.covariance is not None
+    # Mahalanobis lengths do not depend on the axes
+    assert seen @ np.linalg.solve(found, seen) == pytest.approx(
+        twist @ np.linalg.solve(source.covariance, twist), rel=1e-4
+    )

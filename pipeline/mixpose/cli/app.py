@@ -186,8 +186,12 @@ def convert(
     ] = False,
     scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None,
     obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None,
+    relative_to: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
+    ] = None,
     session: Annotated[
-        Path | None, typer.Option(help="rerun: the session, where POSES does not lead to it.")
+        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
     ] = None,
     source: Annotated[
         list[str] | None,
@@ -205,6 +209,7 @@ def convert(
         only_ok=only_ok,
         scene_id=scene_id,
         obj_id=obj_id,
+        relative_to=relative_to,
         session=session,
         sources=tuple(source or ()),
     )

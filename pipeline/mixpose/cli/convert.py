@@ -8,14 +8,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from mixpose import __version__
 from mixpose.cli.notices import warn
 from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
-from mixpose.poses.estimates import estimate_of, first_answers, header_of
+from mixpose.poses.estimates import estimate_of, first_answers, header_of, relative_to
 from mixpose.poses.header import UNITS_PER_METRE
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
+from mixpose.records import Floats
+from mixpose.sensors import RangeSensor
 
 _BY_SUFFIX = {
     ".jsonl": "jsonl",
@@ -39,6 +44,7 @@ class ConvertRequest:
     only_ok: bool
     scene_id: int | None
     obj_id: int | None
+    relative_to: str | None
     session: Path | None
     sources: tuple[str, ...]
 
@@ -70,12 +76,31 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
 
 
 def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
-    ids = {"scene_id": request.scene_id, "obj_id": request.obj_id}
-    options = {key: value for key, value in ids.items() if value is not None}
+    T_sensor_world = _T_sensor_world(poses, request)
+    given = {"scene_id": request.scene_id, "obj_id": request.obj_id}
+    options: dict[str, int | str] = {
+        key: value for key, value in given.items() if value is not None
+    }
+    if name == "ros" and request.relative_to is not None:
+        options["frame_id"] = request.relative_to
     header = header_of(poses, _unit(poses, request), __version__)
     with Output(request.output, name, header, options=options) as output:
         for line in lines:
-            output.write(estimate_of(line))
+            output.write(relative_to(T_sensor_world, estimate_of(line)))
+
+
+def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
+    """What poses are moved by before they are written; identity for poses in the world."""
+    if request.relative_to is None:
+        return np.eye(4)
+    session = session_of(poses, request.session)
+    for setup in session.sensors:
+        if setup.name == request.relative_to and not isinstance(setup.sensor, RangeSensor):
+            return np.asarray(setup.sensor.T_sensor_world)  # type: ignore[attr-defined]
+    cameras = [s.name for s in session.sensors if not isinstance(s.sensor, RangeSensor)]
+    raise SessionError(
+        f"--relative-to {request.relative_to}: no such camera, allowed: {', '.join(cameras)}"
+    )
 
 
 def _format(request: ConvertRequest) -> str:
@@ -93,14 +118,18 @@ def _format(request: ConvertRequest) -> str:
 
 def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None:
     given = {
-        "--scene-id": (request.scene_id, "bop"),
-        "--obj-id": (request.obj_id, "bop"),
-        "--session": (request.session, "rerun"),
-        "--source": (request.sources or None, "rerun"),
+        "--scene-id": (request.scene_id, ("bop",)),
+        "--obj-id": (request.obj_id, ("bop",)),
+        "--relative-to": (request.relative_to, ("bop", "ros", "tum")),
+        "--source": (request.sources or None, ("rerun",)),
     }
-    for option, (value, owner) in given.items():
-        if value is not None and name != owner:
-            raise SessionError(f"{option}: belongs to --format {owner}, found --format {name}")
+    for option, (value, owners) in given.items():
+        if value is not None and name not in owners:
+            raise SessionError(
+                f"{option}: belongs to --format {' or '.join(owners)}, found --format {name}"
+            )
+    if request.session is not None and name != "rerun" and request.relative_to is None:
+        raise SessionError("--session: belongs to --format rerun and to --relative-to")
 
 
 def _unit(poses: PoseFile, request: ConvertRequest) -> str:

@@ -43,7 +43,7 @@ class Output:
         header: Header,
         *,
         append: bool = False,
-        options: Mapping[str, int] | None = None,
+        options: Mapping[str, int | str] | None = None,
     ) -> None:
         self._path, self._format, self._header = path, format_name, header
         self._append, self._options = append, options or {}

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from mixpose.cli.notices import warn
 from mixpose.cli.run import named_sources
+from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
 from mixpose.runner import open_sources
-from mixpose.session import Session, load_session
 
 
 def write_rerun(
@@ -39,7 +38,7 @@ def write_rerun(
             "--format rerun: needs the package rerun-sdk; install it with: "
             "python -m pip install 'mixpose[rerun]'"
         )
-    session = _session(poses, session_file)
+    session = session_of(poses, session_file)
     opened = open_sources(session, named_sources(sources))
     for name, source in opened.items():
         if source.kind == "live":
@@ -56,27 +55,3 @@ def write_rerun(
         os.replace(half, output)  # noqa: PTH105 - also where the file exists, on every system
     finally:
         half.unlink(missing_ok=True)
-
-
-def _session(poses: PoseFile, named: Path | None) -> Session:
-    """The session that the poses were estimated with."""
-    path = named
-    if path is None:
-        found = poses.header.get("session")
-        if not isinstance(found, str):
-            raise SessionError(f"{poses.path}: names no session; add --session SESSION.toml")
-        path = Path(found)
-        if not path.is_file():
-            path = poses.path.parent / found  # as in truth files, beside their session
-        if not path.is_file():
-            raise SessionError(
-                f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
-            )
-    session = load_session(path)
-    if poses.unit not in (None, session.unit):
-        raise SessionError(
-            f"--session {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"
-        )
-    if poses.header.get("session_sha256") not in (None, session.sha256):
-        warn(f"{path} is not as it was when {poses.path} was written")
-    return session

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
 
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate
+from mixpose.records import Estimate, Floats
 
 
 def header_of(poses: PoseFile, unit: str, version: str) -> Header:
@@ -38,6 +41,25 @@ def estimate_of(line: PoseLine) -> Estimate:
         sensors=line.sensors,
         hypotheses=line.hypotheses,
         latency_ms=0.0 if line.latency_ms is None else line.latency_ms,
+    )
+
+
+def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
+    """An estimate in the axes of a sensor, (4, 4): its pose is then T_sensor_object."""
+    if estimate.T_world_object is None:
+        return estimate
+    covariance = estimate.covariance
+    if covariance is not None:
+        turn = np.kron(np.eye(2), T_sensor_world[:3, :3])  # lengths and turns alike
+        covariance = turn @ covariance @ turn.T
+    return replace(
+        estimate,
+        T_world_object=T_sensor_world @ estimate.T_world_object,
+        covariance=covariance,
+        hypotheses=tuple(
+            replace(rival, T_world_object=T_sensor_world @ rival.T_world_object)
+            for rival in estimate.hypotheses
+        ),
     )
 
 

@@ -6,6 +6,7 @@ https://docs.ros.org/en/rolling/p/geometry_msgs/msg/PoseWithCovarianceStamped.ht
 
 from __future__ import annotations
 
+import json
 from typing import TextIO
 
 import numpy as np
@@ -66,7 +67,7 @@ class RosWriter:
             "  stamp:\n"
             f"    sec: {second}\n"
             f"    nanosec: {nanosecond}\n"
-            f"  frame_id: {self._frame_id}\n"
+            f"  frame_id: {json.dumps(self._frame_id)}\n"
             "pose:\n"
             "  pose:\n"
             "    position:\n"
