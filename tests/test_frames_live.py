@@ -85,7 +85,7 @@ def server() -> Iterator[str]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture, "PATIENCE_S", 0.4)
+    monkeypatch.setattr(capture, "PATIENCE_S", 1.0)
 
 
 @contextmanager
@@ -146,7 +146,7 @@ def test_descriptors_of_pipes_are_given_back(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("impatient")
 def test_pipe_that_nobody_writes_to_is_told(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left")
-    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 0\.4 s"):
+    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 1 s"):
         next(opened(tmp_path / "left").frames())
 
 
@@ -162,7 +162,7 @@ def test_pipe_whose_writer_falls_silent_is_told_after_the_frames_that_came(tmp_p
 
     with piped(tmp_path / "left", write) as pipe:
         found: list[RawFrame] = []
-        with pytest.raises(RecordingError, match=r"left: no frame came for 0\.4 s"):
+        with pytest.raises(RecordingError, match=r"left: no frame came for 1 s"):
             found.extend(opened(pipe).frames())
         enough.set()
     assert 15 < len(found) < 40  # 200 of 470 kB hold about 25 of the 60 frames
@@ -193,9 +193,9 @@ def test_slow_consumer_of_a_live_stream_gets_the_newest_frame(server: str) -> No
     numbers = []
     for frame in opened(f"{server}/live").frames():
         numbers.append(frame.number)
-        time.sleep(5.5 * Camera.period_s)
+        time.sleep(10 * Camera.period_s)
     assert numbers[-1] == Camera.frames - 1
-    assert len(numbers) <= 6  # 20 frames, of which about five come during each sleep
+    assert len(numbers) <= 10  # of 20; three or four where the machine is not busy
 
 
 def test_live_cameras_are_paired_by_arrival_and_end_with_the_last(server: str) -> None:
