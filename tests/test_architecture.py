@@ -35,6 +35,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
     "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
 }
+MAY_IMPORT["rerun_file"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "frames",
+    "poses",
+    "session",
+    "runner",
+}
 EDGE = {"cli", "__init__", "__main__"}
 
 

@@ -27,6 +27,18 @@ class Format(StrEnum):
     csv = "csv"
     tum = "tum"
     bop = "bop"
+    ros = "ros"
+
+
+class ConvertFormat(StrEnum):
+    """Formats that poses are converted to."""
+
+    jsonl = "jsonl"
+    csv = "csv"
+    tum = "tum"
+    bop = "bop"
+    ros = "ros"
+    rerun = "rerun"
 
 
 def _version(wanted: bool) -> None:
@@ -178,3 +190,60 @@ def evaluate(
     from mixpose.cli.evaluate import evaluate_poses  # noqa: PLC0415
 
     evaluate_poses(poses, truth, as_json=json)
+
+
+@app.command()
+def convert(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout.")
+    ] = None,
+    format: Annotated[
+        ConvertFormat | None,
+        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun)."),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
+    ] = None,
+    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None,
+    only_ok: Annotated[
+        bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")
+    ] = False,
+    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None,
+    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None,
+    relative_to: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
+    ] = None,
+    session: Annotated[
+        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
+    ] = None,
+) -> None:
+    """Write poses in the format of another program."""
+    from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
+
+    request = ConvertRequest(
+        output=output,
+        format=None if format is None else format.value,
+        unit=unit,
+        object=object,
+        only_ok=only_ok,
+        scene_id=scene_id,
+        obj_id=obj_id,
+        relative_to=relative_to,
+        session=session,
+        sources=tuple(source or ()),
+    )
+    convert_poses(poses, request)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of pose lines."""
+    from mixpose.poses.schema import schema_text  # noqa: PLC0415
+
+    typer.echo(schema_text(), nl=False)

@@ -12,6 +12,7 @@ from mixpose import __version__
 from mixpose.cli.notices import Summary, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import SessionError
+from mixpose.frames import Source
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
@@ -41,13 +42,14 @@ def run_session(path: Path, request: RunRequest) -> None:
         If the recording cannot be read; frames already estimated stay written.
     """
     session = load_session(path)
-    replaced = _sources(request.sources)
+    replaced = named_sources(request.sources)
     header = header_of(session, replaced)
     selection, T_start, resumed = request.selection, None, False
     opened = open_sources(session, replaced)
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
+        _refuse_live(opened)
         selection, T_start, resumed = _resumed(request, header)
     warn_of_sources(opened)
     summary = Summary()
@@ -94,7 +96,14 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
     )
 
 
-def _sources(named: Iterable[str]) -> dict[str, str]:
+def named_sources(named: Iterable[str]) -> dict[str, str]:
+    """Recordings by sensor name, from texts like ``left=frames/``.
+
+    Raises
+    ------
+    SessionError
+        If a text is not of this form.
+    """
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")
@@ -102,6 +111,15 @@ def _sources(named: Iterable[str]) -> dict[str, str]:
             raise SessionError(f"--source {text}: found no NAME=PATH, as in --source left=frames/")
         sources[name] = path
     return sources
+
+
+def _refuse_live(opened: Mapping[str, Source]) -> None:
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
+                "and name another file with -o"
+            )
 
 
 def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | None, bool]:

@@ -1,7 +1,7 @@
 """From what the session says to the source that reads it.
 
 A new kind of source is one file with its class, one line in `_OPENERS` and one rule in
-`_recognise`.  A camera by its index would be recognised there, beside the streams.
+`_recognise`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mixpose.errors import RecordingError, SessionError
+from mixpose.frames.capture import is_pipe
 from mixpose.frames.csv_rows import csv_rows
 from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
+from mixpose.frames.live import LiveSource, live_address
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
 from mixpose.frames.tables import open_table
@@ -28,14 +30,15 @@ _SHOWN = 4  # names of files that a message lists
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
     "video": lambda spec, places, clock: open_video(spec, places[0], clock),
+    "live": lambda spec, places, clock: _open_live(spec, places[0], clock),
     "detections": lambda spec, places, clock: open_table(spec, Path(places[0]), clock),
     "profiles": lambda spec, places, clock: open_profiles(spec, Path(places[0]), clock),
 }
 
 _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
     "camera": (
-        {"images", "video", "detections"},
-        "images, a video or a .csv table of detections with columns u,v",
+        {"images", "video", "live", "detections"},
+        "images, a video, a camera or a .csv table of detections with columns u,v",
     ),
     "lateration": (
         {"detections", "profiles"},
@@ -73,8 +76,17 @@ def open_source(spec: SourceSpec) -> Source:
     return _OPENERS[kind](spec, places, clock)
 
 
+def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
+    """A camera or a stream, opened when its frames are asked for."""
+    address = live_address(source)
+    assert address is not None, "recognised as live"
+    return LiveSource(address, spec.resolution, clock)
+
+
 def _recognise(spec: SourceSpec, source: str | tuple[str, ...]) -> tuple[SourceKind, list[str]]:
     """Kind of a source, and the files or the address it is read from."""
+    if isinstance(source, str) and live_address(source) is not None:
+        return "live", [source]
     if isinstance(source, str) and _STREAM.match(source):
         return "video", [source]
     kind, paths = _recognise_files(spec, source)
@@ -89,6 +101,8 @@ def _recognise_files(
     path = spec.base / source
     if source and path.is_dir():
         return "images", _images_in(path)
+    if is_pipe(str(path)):
+        return "video", [path]
     if path.is_file():
         return _kind_of_file(spec, path), [path]
     return _matches(spec, source)

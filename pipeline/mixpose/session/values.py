@@ -20,7 +20,9 @@ _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
 SIGMA_ALLOWED = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
 FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
-SOURCE_ALLOWED = "a glob, a folder or a file as text, or a list of files"
+SOURCE_ALLOWED = (
+    "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
+)
 THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
 
 
@@ -67,7 +69,9 @@ def read_threshold(value: Any) -> str | float:
 
 
 def read_source(value: Any) -> str | tuple[str, ...]:
-    """Text, or a list of texts as a tuple."""
+    """Text, or a list of texts as a tuple; the number of a camera as text."""
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return f"camera:{value}"
     texts = value if isinstance(value, list) else [value]
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
         raise BadKeyError(found(value, SOURCE_ALLOWED))
