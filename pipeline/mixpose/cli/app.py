@@ -63,14 +63,19 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
+    ] = None,
 ) -> None:
     """Print a pose per frame."""
     from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
     from mixpose.runner import Selection  # noqa: PLC0415
 
+    selection = Selection(start, stop, step)
     run_session(
         session,
-        RunRequest(output, format.value, tuple(source or ()), Selection(start, stop, step), resume),
+        RunRequest(output, format.value, tuple(source or ()), selection, resume, overlay),
     )
 
 

@@ -31,18 +31,29 @@ def displayable(image: NDArray[Any]) -> Picture:
     (H, W, 3) uint8
         Blue, green and red alike.
     """
+    low, high, exponent = _stretch(image)
+
+    def curve(values: NDArray[Any]) -> NDArray[np.uint8]:
+        share = (values.astype(np.float32) - np.float32(low)) / np.float32(high - low)
+        return np.asarray(np.round(255 * np.clip(share, 0, 1) ** exponent), dtype=np.uint8)
+
+    if np.issubdtype(image.dtype, np.unsignedinteger):
+        grey = curve(np.arange(np.iinfo(image.dtype).max + 1))[image]  # a look-up is fast
+    else:
+        grey = curve(image)
+    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+
+
+def _stretch(image: NDArray[Any]) -> tuple[float, float, float]:
+    """Grey values that become black and white, and the exponent in between."""
     step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
     sample = np.asarray(image[::step, ::step], dtype=np.float64)
     low, middle = np.quantile(sample, [_DARKEST, 0.5])
-    high = _bright_end(image)
-    span = max(high - low, 1e-12 if np.issubdtype(image.dtype, np.floating) else 1.0)
-    share = float(np.clip((middle - low) / span, 1e-4, 1.0))
-    exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0)) if share < 1 else 1
-    scaled = np.clip((image.astype(np.float32) - np.float32(low)) / np.float32(span), 0, 1)
-    if exponent < 1:
-        scaled = cv2.pow(scaled, exponent)
-    grey = np.round(255 * scaled).astype(np.uint8)
-    return np.asarray(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), dtype=np.uint8)
+    least = 1.0 if np.issubdtype(image.dtype, np.integer) else 1e-12 * max(abs(low), 1e-300)
+    high = max(_bright_end(image), low + least)
+    share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
+    exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
+    return float(low), float(high), exponent
 
 
 def _bright_end(image: NDArray[Any]) -> float:

@@ -45,7 +45,8 @@ CHI2_95 = {1: 3.841, 2: 5.991}
 """Squared standard deviations that hold 95 % of a Gaussian of one or two coordinates."""
 
 _AXIS_SHARE = 0.5  # of the body's radius
-_AXIS_PIECES = 12  # an axis is bent by the lens
+_LEAST_AXIS_PX = 55.0  # of the longest one in the picture
+_AXIS_PIECES = 24  # an axis is bent by the lens
 _MARK_PX = 7.0
 _CLEAR_SHARE = 0.3  # of the distance to the next feature that a mark takes
 _MOST_NUMBERS = 30  # features with their numbers beside them
@@ -124,10 +125,10 @@ def draw_pose(
             saltire(picture, place, _MARK_PX / 2 * stroke(picture), FOUND)
     if T_world_object is not None:
         colour = STATUS_COLOURS[status] if status is not None else STATUS_COLOURS["ok"]
-        _draw_axes(picture, sensor, body, T_world_object, part)
         _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
         _draw_features(picture, sensor, body, T_world_object, part, colour)
-    _caption(picture, status, frame)
+        _draw_axes(picture, sensor, body, T_world_object, part)
+    caption(picture, status, frame)
     return picture
 
 
@@ -220,22 +221,35 @@ def _draw_ellipses(
 
 def _draw_axes(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> None:
     """The object's axes at its origin, or amid the features where that is out of view."""
-    length = _AXIS_SHARE * body.radius
     origin = np.zeros(3)
     if not sensor.project(transform(T, origin[None]))[1].all():
         origin = body.means.mean(axis=0)
+    length = _AXIS_SHARE * body.radius
+    ends, seen = sensor.project(transform(T, origin + length * np.vstack([np.eye(3), np.zeros(3)])))
+    if not seen[3]:
+        return
+    start = part.places(ends[3])
+    longest = float(np.linalg.norm(part.places(ends[:3]) - start, axis=1)[seen[:3]].max(initial=0))
+    if longest > 0:
+        length *= max(_LEAST_AXIS_PX * stroke(picture) / longest, 1.0)
+    # a feature at the origin stays visible
+    y, _, seen = projected_features(sensor, body, T)
+    radius = mark_radius(picture, sensor, body, T, part)
+    marked = np.linalg.norm(part.places(y[seen]) - start, axis=1).min(initial=np.inf) < radius
     along = np.linspace(0.0, length, _AXIS_PIECES)[:, None]
     for k, (name, colour) in enumerate(AXES):
         y, inside = sensor.project(transform(T, origin + along * np.eye(3)[k]))
-        if inside[0]:
-            whole = len(inside) if inside.all() else int(np.argmin(inside))
-            line = part.places(y[:whole])
-            polyline(picture, line, colour, width=2)
-            shift = 0.3 * line_height(picture)
-            words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
+        line = part.places(y[: len(inside) if inside.all() else int(np.argmin(inside))])
+        line = line[np.linalg.norm(line - start, axis=1) >= (1.3 * radius if marked else 0)]
+        if len(line) < 2:
+            continue
+        polyline(picture, line, colour, width=2)
+        shift = 0.3 * line_height(picture)
+        words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
 
 
-def _caption(picture: Picture, status: Status | None, frame: int | None) -> None:
+def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
+    """Write number and status of a frame into the upper left corner, in place."""
     u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
     if frame is not None:
         u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
