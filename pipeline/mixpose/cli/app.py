@@ -88,6 +88,28 @@ def check(session: SessionFile) -> None:
 
 
 @app.command()
+def inspect(
+    session: SessionFile,
+    frame: Annotated[int, typer.Option(help="Number of the frame.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="POSES.jsonl", help="Take the pose from a run, not from this frame alone."
+        ),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
+    from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
+
+    inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
+
+
+@app.command()
 def simulate(
     session: SessionFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the recording.")],

@@ -44,7 +44,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     session = load_session(path)
     header = header_of(session)
     selection, T_start, resumed = request.selection, None, False
-    opened = open_sources(session, _sources(request.sources))
+    opened = open_sources(session, named_sources(request.sources))
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
@@ -103,7 +103,8 @@ def header_of(session: Session) -> Header:
     )
 
 
-def _sources(named: Iterable[str]) -> dict[str, str]:
+def named_sources(named: Iterable[str]) -> dict[str, str]:
+    """Recordings by sensor name from ``NAME=PATH``, as of the option ``--source``."""
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")

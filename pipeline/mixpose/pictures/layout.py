@@ -19,24 +19,30 @@ def columns_for(count: int) -> int:
 
 
 def fit_into(picture: Picture, size: tuple[int, int]) -> Picture:
-    """A picture on black of exactly that width and height, shrunk where it is larger."""
+    """A picture amid black of exactly that width and height, shrunk where it is larger."""
     width, height = size
     zoom = min(width / picture.shape[1], height / picture.shape[0], 1.0)
     if zoom < 1.0:
         shrunk = max(int(picture.shape[1] * zoom), 1), max(int(picture.shape[0] * zoom), 1)
         picture = np.asarray(cv2.resize(picture, shrunk, interpolation=cv2.INTER_AREA), np.uint8)
     canvas = np.zeros((height, width, 3), np.uint8)
-    canvas[: picture.shape[0], : picture.shape[1]] = picture
+    v, u = (height - picture.shape[0]) // 2, (width - picture.shape[1]) // 2
+    canvas[v : v + picture.shape[0], u : u + picture.shape[1]] = picture
     return canvas
 
 
-def in_grid(pictures: Sequence[Picture], columns: int) -> Picture:
-    """Pictures from left to right, row by row, with gaps between them."""
-    width = max(picture.shape[1] for picture in pictures)
+def in_grid(
+    pictures: Sequence[Picture], columns: int, cell: tuple[int, int] | None = None
+) -> Picture:
+    """Pictures from left to right, row by row, with gaps between them.
+
+    Cells are of the given width and height, else as wide as the widest and as high as their row.
+    """
+    width = cell[0] if cell else max(picture.shape[1] for picture in pictures)
     rows = []
     for k in range(0, len(pictures), columns):
         row = list(pictures[k : k + columns])
-        height = max(picture.shape[0] for picture in row)
+        height = cell[1] if cell else max(picture.shape[0] for picture in row)
         cells = [fit_into(picture, (width, height)) for picture in row]
         cells += [np.zeros((height, width, 3), np.uint8)] * (columns - len(cells))
         rows.append(_joined(cells, axis=1))

@@ -62,9 +62,11 @@ def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Pic
 
 
 def backdrop(
-    setup: SensorSetup, frame: RawFrame | None, room: tuple[int, int]
+    setup: SensorSetup, frame: RawFrame | None, room: tuple[int, int] | None
 ) -> tuple[Picture, Part]:
     """A camera's frame as a picture that fits into some room, before anything is drawn on it.
+
+    Without a room it keeps its size.
 
     Where the camera has detections in place of images they are dots on a dark ground.
     """
@@ -87,8 +89,10 @@ def backdrop(
     return displayable(data), Part()
 
 
-def _zoom(size: tuple[int, int], room: tuple[int, int]) -> float:
+def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
     """Factor by which a picture fits into some room; small ones grow a little, by whole pixels."""
+    if room is None:
+        return 1.0
     zoom = min(room[0] / size[0], room[1] / size[1])
     return zoom if zoom < 1 else float(min(int(zoom), _MOST_ENLARGED))
 
