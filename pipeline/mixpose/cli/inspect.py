@@ -13,7 +13,7 @@ from mixpose.frames import Source, pair
 from mixpose.pictures.advice import describe
 from mixpose.pictures.finding import Finding, find
 from mixpose.pictures.plots import require_matplotlib
-from mixpose.pictures.sheet import inspection_pictures
+from mixpose.pictures.sheet import inspection_pictures, possible_names
 from mixpose.pictures.signature import refuse_foreign, write_png
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet
@@ -48,7 +48,7 @@ def inspect_frame(
     """
     session = load_session(path)
     require_matplotlib()
-    _check_folder(folder)
+    _check_folder(folder, session)
     frame_set = _frame(open_sources(session, named_sources(sources)), number)
     views = observe(session, frame_set)
     tracker, track = begin(session)
@@ -58,8 +58,6 @@ def inspect_frame(
         estimate = _from_file(poses, session, number)
     findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
     pictures = inspection_pictures(session, tracker, findings, estimate)
-    for name in pictures:
-        refuse_foreign(folder / name, "-o")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -71,11 +69,13 @@ def inspect_frame(
     sys.stdout.write("\n".join(lines) + "\n")
 
 
-def _check_folder(folder: Path) -> None:
+def _check_folder(folder: Path, session: Session) -> None:
     if folder.exists() and not folder.is_dir():
         raise SessionError(f"-o {folder}: is a file; name a folder for the pictures")
     if not folder.parent.is_dir():
         raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
+    for name in possible_names(session.sensors):
+        refuse_foreign(folder / name, "-o")
 
 
 def _frame(opened: Mapping[str, Source], number: int) -> FrameSet:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from mixpose.pictures.canvas import Picture
 
-# Grey levels are stretched from this share of the pixels to that: a hot pixel or two do not count,
-# a few small spots in a dark frame do.
-_DARKEST, _BRIGHTEST = 0.005, 0.99998
+# This share of the pixels may be darker than black or brighter than white: a hot pixel or two do
+# not count, a few small spots do.
+_BEYOND = 2e-5
+_LEAST_SPAN = 16.0  # grey levels of an integer image, lest noise fill the picture
 _MIDDLE = 0.2  # where the median grey value of a dark frame is brought to
 _STRONGEST = 0.45  # exponent, lest noise is all one sees
 _SAMPLES = 200_000
@@ -48,16 +49,12 @@ def _stretch(image: NDArray[Any]) -> tuple[float, float, float]:
     """Grey values that become black and white, and the exponent in between."""
     step = max(int(np.sqrt(image.size / _SAMPLES)), 1)
     sample = np.asarray(image[::step, ::step], dtype=np.float64)
-    low, middle = np.quantile(sample, [_DARKEST, 0.5])
-    least = 1.0 if np.issubdtype(image.dtype, np.integer) else 1e-12 * max(abs(low), 1e-300)
-    high = max(_bright_end(image), low + least)
+    middle = float(np.median(sample))
+    few = int(_BEYOND * image.size)
+    low, high = np.partition(image.ravel(), [few, image.size - 1 - few])[[few, -1 - few]]
+    low, high = float(low), float(high)
+    whole = np.issubdtype(image.dtype, np.integer)
+    high = max(high, low + (_LEAST_SPAN if whole else 1e-6 * max(abs(low), 1e-30)))
     share = float(np.clip((middle - low) / (high - low), 1e-4, 0.999))
     exponent = float(np.clip(np.log(_MIDDLE) / np.log(share), _STRONGEST, 1.0))
-    return float(low), float(high), exponent
-
-
-def _bright_end(image: NDArray[Any]) -> float:
-    """The grey value that all but a few pixels stay below."""
-    few = max(int((1 - _BRIGHTEST) * image.size), 1)
-    flat = image.ravel()
-    return float(np.partition(flat, flat.size - 1 - few)[flat.size - 1 - few])
+    return low, high, exponent

@@ -25,7 +25,7 @@ from mixpose.pictures.stages import (
     threshold_picture,
 )
 from mixpose.records import Estimate
-from mixpose.session import Session
+from mixpose.session import SensorSetup, Session
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def inspection_pictures(
     blurs = blur_levels(views, tracker, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
-    names = _file_names(findings)
+    names = _file_names(session.sensors)
     for finding, name in zip(findings, names, strict=True):
         if finding.setup.sensor.dimension != 2:
             continue
@@ -93,6 +93,13 @@ def inspection_pictures(
         pictures["objective.png"] = picture
         rows.append(picture)
     return {"sheet.png": stacked(rows), **pictures}
+
+
+def possible_names(setups: Sequence[SensorSetup]) -> list[str]:
+    """Names of all files that `inspection_pictures` may make."""
+    stages = ("features", "threshold", "density", "pose")
+    names = [f"{name}_{stage}.png" for name in _file_names(setups) for stage in stages]
+    return ["sheet.png", "objective.png", "ranges.png", *names]
 
 
 def blur_levels(
@@ -155,11 +162,11 @@ def _ends(sigmas: Sequence[float]) -> list[float]:
     return list(dict.fromkeys([sigmas[0], sigmas[-1]])) if sigmas else []
 
 
-def _file_names(findings: Sequence[Finding]) -> list[str]:
+def _file_names(setups: Sequence[SensorSetup]) -> list[str]:
     """Names of sensors that any file system takes, no two alike."""
     names: list[str] = []
-    for finding in findings:
-        name = re.sub(r"[^\w.-]", "_", finding.name)
+    for setup in setups:
+        name = re.sub(r"[^\w.-]", "_", setup.name)
         taken = {one.casefold() for one in names}
         names.append(name if name.casefold() not in taken else f"{name}_{len(names)}")
     return names

@@ -86,7 +86,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         # a pixel of the picture is marked if any of those behind it is
         shown = cv2.resize(cv2.dilate(mask, _block(part.zoom)), size, None, 0, 0, cv2.INTER_NEAREST)
         picture[shown > 0] = ABOVE
-        title = "above the threshold"
+        title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
         return _titled(picture, f"{options.method}: its own threshold")
     if options.method != "intensity":
