@@ -231,13 +231,16 @@ def test_the_objective_peaks_at_the_pose_in_every_slice_and_map(
     assert [one.direction for one in slices] == list(range(6))
     for one in slices:
         assert one.values.shape == (2, len(one.offsets))
-        assert one.offsets[one.values.argmax(axis=1)] == pytest.approx([0, 0], abs=1e-12)
+        # densities are looked up on grids of a quarter of a blur; a slice ends at 8 of the finest
+        coarse, fine = np.abs(one.offsets[one.values.argmax(axis=1)] / one.offsets[-1])
+        assert coarse < 0.25 * 4 / 8
+        assert fine < 0.25 / 8
         # the coarser level reaches farther
         assert one.values[0].mean() > one.values[1].mean()
     for surface in maps:
         row, column = np.unravel_index(surface.values.argmax(), surface.values.shape)
-        assert surface.offsets[0][column] == pytest.approx(0, abs=1e-12)
-        assert surface.offsets[1][row] == pytest.approx(0, abs=1e-12)
+        assert abs(row - 20) <= 1  # of 41, half a blur apart at most
+        assert abs(column - 20) <= 1
 
 
 def test_directions_that_are_held_have_no_slice(

@@ -171,7 +171,7 @@ def test_a_run_is_watched_frame_by_frame_and_finds_the_same_poses(recording: Pat
         watched.append((frame_set.number, list(frame_set.frames), names, estimate.frame))
 
     plain = list(run(session))
-    seen = []
+    seen: list[Estimate] = []
     for estimate in run(session, watch=watch):
         assert len(watched) == len(seen) + 1  # before the estimate is handed out
         seen.append(estimate)
@@ -240,8 +240,8 @@ def test_a_place_for_the_overlay_that_will_not_do_is_one_line(
 ) -> None:
     (recording / "film.mp4").write_bytes(b"somebody's film")
     poses = recording / "p.jsonl"
-    arguments = ["-o", poses, "--overlay", recording / overlay, *options]
-    assert command("run", recording / "session.toml", *arguments) == 2
+    session = recording / "session.toml"
+    assert command("run", session, "-o", poses, "--overlay", recording / overlay, *options) == 2
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1
     assert words in error
