@@ -55,9 +55,9 @@ def describe(finding: Finding, body: Body, unit: str) -> list[str]:
 def _counts(finding: Finding, body: Body, unit: str) -> str:
     unit = "px" if finding.setup.sensor.unit == "px" else unit
     if finding.points is None:
-        found = f"light of about {finding.count:.1f} features"
+        found = f"light as of {finding.count:.1f} points"
         if finding.setup.sensor.dimension == 1:
-            found = f"echoes of about {finding.count:.1f} features"
+            found = f"echoes as of {finding.count:.1f} points"
     else:
         found = f"{len(finding.points)} feature{'s' * (len(finding.points) != 1)} found"
     expected = finding.expectation
@@ -241,12 +241,14 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
         few, many = bool(lost), bool(expected.unexplained.any())
         missing = f"not met: {_some(lost)}" if lost else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
-    name = "threshold" if options.method == "corners" else f"what {options.method} asks for"
+    lower = raised = f"{options.method} does not tell them"
+    if options.method == "corners":
+        lower, raised = (_direction(options, lower=way) for way in (True, False))
     lines = []
     if few:
-        lines.append(f"{missing}; hidden, or lower {name} (a grey level finds fainter ones)")
+        lines.append(f"{missing}; hidden, or {lower}")
     if many:
-        lines.append(f"{extra}; clutter is allowed for, or raise {name}")
+        lines.append(f"{extra}; clutter is allowed for, or {raised}")
     return lines
 
 
@@ -338,7 +340,7 @@ def _stricter(options: ExtractOptions) -> str:
 
 def _direction(options: ExtractOptions, *, lower: bool) -> str:
     """How the threshold is to be moved, which for dark features is the other way round."""
-    down = lower == (options.polarity == "bright")
+    down = lower == (options.polarity == "bright" or options.method == "corners")
     now = options.threshold
     if isinstance(now, str):
         return f'{"lower" if down else "raise"} threshold = "{now}" by giving a grey level'

@@ -63,7 +63,7 @@ class Finding:
     points : (M, m) float64 or None
         The features, where the extraction gives points.
     count : float
-        Number of features found: of points, or of equal features that give the same energy.
+        Number of points found, or of as many points of light as give the energy of a grid.
     expectation : Expectation or None
         None without a pose or without features.
     """

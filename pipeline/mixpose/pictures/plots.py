@@ -224,7 +224,7 @@ def _span(finding: Finding) -> tuple[float, float]:
 
 def _range_title(finding: Finding) -> str:
     if finding.points is None:
-        return f"{finding.name}: echoes of about {finding.count:.1f} features"
+        return f"{finding.name}: echoes as of {finding.count:.1f} points"
     return f"{finding.name}: {len(finding.points)} ranges"
 
 

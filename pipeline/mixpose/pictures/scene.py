@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.pictures.canvas import GREY, WHITE, Picture, line_height, ring, stroke, words
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, line_height, ring, stroke, words
 from mixpose.pictures.display import displayable
 from mixpose.pictures.layout import columns_for, in_grid, stacked
 from mixpose.pictures.overlay import FOUND, Part, caption, draw_pose
@@ -49,9 +49,11 @@ def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Pic
         columns = columns_for(len(cameras))
         room = LARGEST[0] // columns, LARGEST[1] // -(-len(cameras) // columns)
         panels = [_camera(session.body, one, frame_set, estimate, room) for one in cameras]
-        if len(cameras) > 1:
-            for panel, setup in zip(panels, cameras, strict=True):
-                _name(panel, setup.name)
+        for panel, setup in zip(panels, cameras, strict=True):
+            if setup.name not in frame_set.frames:
+                _name(panel, f"{setup.name}: no frame", GREY)
+            elif len(cameras) > 1:
+                _name(panel, setup.name, WHITE)
         rows.append(in_grid(panels, columns))
     else:
         head = np.full((36, STRIP_SIZE[0], 3), BACKGROUND, np.uint8)
@@ -110,9 +112,6 @@ def _camera(
 ) -> Picture:
     frame = frame_set.frames.get(setup.name)
     picture, part = backdrop(setup, frame, room)
-    if frame is None:
-        centre = 0.4 * picture.shape[1], 0.5 * picture.shape[0]
-        words(picture, "no frame", centre, GREY)
     return draw_pose(
         picture,
         setup.sensor,
@@ -139,7 +138,7 @@ def _strip(body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estima
     )
 
 
-def _name(picture: Picture, name: str) -> None:
+def _name(picture: Picture, name: str, colour: Colour) -> None:
     """Write a sensor's name below the caption."""
     place = 0.5 * line_height(picture), 2.1 * line_height(picture)
-    words(picture, name, place, WHITE, size=0.9)
+    words(picture, name, place, colour, size=0.9)

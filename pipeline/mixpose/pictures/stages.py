@@ -38,6 +38,7 @@ from mixpose.pictures.overlay import (
 )
 from mixpose.pictures.scene import backdrop
 from mixpose.records import Estimate, GridPattern, PointPattern
+from mixpose.rigid import transform
 
 Floats: TypeAlias = NDArray[np.float64]
 Size: TypeAlias = tuple[int, int]
@@ -58,7 +59,7 @@ def features_picture(finding: Finding, room: Size) -> Picture:
     picture, part = backdrop(finding.setup, finding.frame, room)
     _mark(picture, part, finding.points)
     count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
-    text = f"{count} found" if finding.points is not None else f"light of about {count} features"
+    text = f"{count} found" if finding.points is not None else f"light as of {count} points"
     return _titled(picture, f"{finding.name}: {text}")
 
 
@@ -182,7 +183,7 @@ def _box(view: View, body: Body, T: Floats | None, margin: float | None) -> tupl
     """The part of a camera's image around the body, or around all that was found."""
     y = np.zeros((0, 2))
     if T is not None:
-        y, _, seen = projected_features(view.sensor, body, T)
+        y, seen = view.sensor.project(transform(T, body.nodes.points))
         y = y[seen]
     if not len(y):
         y = np.stack(view.observation.extent()) if not view.observation.is_empty else y
