@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TypeAlias
 
 import cv2
@@ -115,58 +116,63 @@ def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
 def _about_missing(
     finding: Finding, expected: Expectation, image: Image, scene: Foreground
 ) -> list[str]:
-    """Why expected features were not met: nothing there, too faint, too small, too large."""
+    """Why expected features were not met, and what would find them."""
     options = finding.setup.extract
-    labels, areas = _pieces(scene)
-    nothing: list[int] = []
-    faint: list[tuple[int, float]] = []
-    small: list[tuple[int, int]] = []
-    large: list[tuple[int, int]] = []
-    other: list[tuple[int, int]] = []
     raw = _bright(image, options)
-    for i in np.flatnonzero(expected.seen & ~expected.met):
-        place = expected.y[i]
-        region = _around(place, _NEAR_SIGMAS * finding.sigma, scene.grey.shape)
-        signal = float(scene.grey[region].max()) - scene.zero
-        if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
-            nothing.append(int(i))
-        elif signal <= scene.level:
-            faint.append((int(i), float(raw[region].max())))
-        else:
-            area = int(areas[np.unique(labels[region])[-1]])
-            kind = small if area < options.min_area else other
-            if options.max_area is not None and area > options.max_area:
-                kind = large
-            kind.append((int(i), area))
+    missing = _sorted_out(finding, expected, scene, raw)
     lines = []
-    if nothing:
+    if found := missing["nothing"]:
         lines.append(
-            f"not met and dark there: {_some(nothing)}; hidden, out of light, or the pose is wrong"
+            f"not met and dark there: {_some(found)}; hidden, out of light, or the pose is wrong"
         )
-    if faint:
-        level = _between(min(peak for _, peak in faint), raw)
+    if found := missing["faint"]:
+        level = _between(min(found.values()), raw)
         lines.append(
-            f"not met, fainter than the threshold: {_some([i for i, _ in faint])}; "
+            f"not met, fainter than the threshold: {_some(found)}; "
             f"{_looser(options, level, raw, image)}"
         )
-    if small:
-        least = min(area for _, area in small)
+    if found := missing["small"]:
         lines.append(
-            f"not met, too small: {_some([i for i, _ in small])}; lower min_area = "
-            f"{options.min_area:g} to {least}, or {_direction(options, lower=True)}"
+            f"not met, too small: {_some(found)}; lower min_area = {options.min_area:g} to "
+            f"{min(found.values()):g}, or {_direction(options, lower=True)}"
         )
-    if large:
-        most = max(area for _, area in large)
+    if found := missing["large"]:
         lines.append(
-            f"not met, too large: {_some([i for i, _ in large])}; raise max_area = "
-            f"{options.max_area:g} to {most}"
+            f"not met, too large: {_some(found)}; raise max_area = {options.max_area:g} to "
+            f"{max(found.values()):g}"
         )
-    if other:
+    if found := missing["other"]:
         lines.append(
-            f"not met though bright there: {_some([i for i, _ in other])}; they run into something "
+            f"not met though bright there: {_some(found)}; they run into something "
             f"else, are partly hidden, or have no clear shape; {_direction(options, lower=False)}"
         )
     return lines
+
+
+def _sorted_out(
+    finding: Finding, expected: Expectation, scene: Foreground, raw: Floats
+) -> dict[str, dict[int, float]]:
+    """Features that were not met, by why: nothing there, faint (with its peak), or by its area."""
+    options = finding.setup.extract
+    labels, areas = _pieces(scene)
+    kinds: dict[str, dict[int, float]] = {
+        kind: {} for kind in ("nothing", "faint", "small", "large", "other")
+    }
+    for i in np.flatnonzero(expected.seen & ~expected.met).tolist():
+        region = _around(expected.y[i], _NEAR_SIGMAS * finding.sigma, scene.grey.shape)
+        signal = float(scene.grey[region].max()) - scene.zero
+        area = float(areas[labels[region]].max())
+        if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
+            kinds["nothing"][i] = signal
+        elif signal <= scene.level:
+            kinds["faint"][i] = float(raw[region].max())
+        elif area < options.min_area:
+            kinds["small"][i] = area
+        elif options.max_area is not None and area > options.max_area:
+            kinds["large"][i] = area
+        else:
+            kinds["other"][i] = area
+    return kinds
 
 
 def _about_extra(
@@ -347,8 +353,9 @@ def _direction(options: ExtractOptions, *, lower: bool) -> str:
     return f"{'lower' if down else 'raise'} threshold = {now:g}"
 
 
-def _some(features: list[int]) -> str:
+def _some(features: Iterable[int]) -> str:
     """Numbers of features, for people."""
+    features = list(features)
     shown = ", ".join(str(i) for i in features[:_LISTED])
     more = len(features) - _LISTED
     return f"feature{'s' * (len(features) != 1)} {shown}" + (f" and {more} more" * (more > 0))

@@ -12,7 +12,8 @@ from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.pictures.canvas import Picture
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.overlay import CHI2_95, ellipse_95, projected_covariances
+from mixpose.pictures.overlay import ellipse_95
+from mixpose.pictures.ranges import half_widths_95
 from mixpose.pictures.slices import Map, Slice
 from mixpose.records import Estimate, GridPattern, PointPattern
 from mixpose.rigid import TWIST_NAMES
@@ -194,12 +195,8 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
     expected = finding.expectation
     if expected is None or estimate.T_world_object is None:
         return
-    spread = np.zeros(len(body))
-    if estimate.covariance is not None and np.isfinite(estimate.covariance).all():
-        variances = projected_covariances(
-            finding.setup.sensor, body, estimate.T_world_object, estimate.covariance
-        )
-        spread = np.sqrt(CHI2_95[1] * np.maximum(variances[:, 0, 0], 0))
+    sensor, T = finding.setup.sensor, estimate.T_world_object
+    spread = half_widths_95(sensor, body, T, estimate.covariance)
     for n, i in enumerate(np.flatnonzero(expected.seen)):
         r = float(expected.y[i, 0])
         label = "pose, 95 %" if n == 0 else None

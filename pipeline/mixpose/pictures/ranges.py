@@ -78,12 +78,19 @@ def draw_ranges(
             _draw_bar(picture, u, _TOP, _BASE, FOUND)
     if T_world_object is not None:
         colour = STATUS_COLOURS[status or "ok"]
-        spread = np.zeros(len(body))
-        if covariance is not None and np.isfinite(covariance).all():
-            variances = projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
-            spread = np.sqrt(CHI2_95[1] * np.maximum(variances, 0)) * width / (high - low)
-        _draw_expected(picture, across(expected), spread, colour)
+        spread = half_widths_95(sensor, body, T_world_object, covariance)
+        _draw_expected(picture, across(expected), spread * width / (high - low), colour)
     return picture
+
+
+def half_widths_95(
+    sensor: Sensor, body: Body, T_world_object: Floats, covariance: Floats | None
+) -> Floats:
+    """Half-widths (N,) of the intervals that hold a feature's range with 95 %; 0 if not known."""
+    if covariance is None or not np.isfinite(covariance).all():
+        return np.zeros(len(body))
+    variances = projected_covariances(sensor, body, T_world_object, covariance)[:, 0, 0]
+    return np.asarray(np.sqrt(CHI2_95[1] * np.maximum(variances, 0)))
 
 
 def _span(sensor: Sensor, pattern: Pattern | None, expected: Floats) -> tuple[float, float]:

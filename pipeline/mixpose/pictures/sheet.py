@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -56,7 +56,7 @@ def inspection_pictures(
     dict of str to (H, W, 3) uint8
         By file name, ``sheet.png`` first.
     """
-    body = session.body
+    body, C = session.body, estimate.covariance
     views = [
         finding.view
         for finding in findings
@@ -80,19 +80,23 @@ def inspection_pictures(
         picture = ranges_picture(ranged, ends, body, estimate, session.unit, _WIDTH, height)
         pictures["ranges.png"] = picture
         rows.append(picture)
-    T = estimate.T_world_object
-    if T is not None and views:
-        levels = list(zip(*(blurs[view.name] for view in views), strict=True))
-        slices, maps = objective_around(
-            views, body, T, estimate.covariance, session.estimator, levels
-        )
-        factors = [max(a / b for a, b in zip(level, levels[-1])) for level in levels]
-        picture = objective_picture(
-            slices, maps, factors, estimate.covariance, session.unit, _WIDTH
-        )
-        pictures["objective.png"] = picture
-        rows.append(picture)
+    if estimate.T_world_object is not None and views:
+        pictures["objective.png"] = _objective(session, views, blurs, estimate.T_world_object, C)
+        rows.append(pictures["objective.png"])
     return {"sheet.png": stacked(rows), **pictures}
+
+
+def _objective(
+    session: Session,
+    views: Sequence[View],
+    blurs: Mapping[str, Sequence[float]],
+    T: Floats,
+    covariance: Floats | None,
+) -> Picture:
+    levels = list(zip(*(blurs[view.name] for view in views), strict=True))
+    slices, maps = objective_around(views, session.body, T, covariance, session.estimator, levels)
+    factors = [max(a / b for a, b in zip(level, levels[-1])) for level in levels]
+    return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
 
 
 def possible_names(setups: Sequence[SensorSetup]) -> list[str]:
