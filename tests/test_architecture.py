@@ -28,6 +28,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "search": GROUND | {"sensors", "body", "density", "objective", "optimise"},
     "estimation": GROUND | {"sensors", "body", "density", "objective", "optimise", "search"},
     "frames": GROUND,
+    "pictures": GROUND
+    | {"sensors", "body", "density", "extraction", "objective", "estimation", "session"},
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},

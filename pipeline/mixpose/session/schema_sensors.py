@@ -72,8 +72,8 @@ class SensorTable(Table):
     ] = ()
     """The recording, relative to the session file: images, a video, a table of detections
     (`frame` or `time_s`, then `u,v` or `range`, and optionally `weight`), or range profiles
-    (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, a stream's address,
-    a named pipe.
+    (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the address of
+    a stream, a named pipe.
 
     Example: `source = "left*.png"`
     """
