@@ -34,6 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
+    "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 EDGE = {"cli", "__init__", "__main__"}
 

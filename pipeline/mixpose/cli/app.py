@@ -153,3 +153,17 @@ def evaluate(
     from mixpose.cli.evaluate import evaluate_poses  # noqa: PLC0415
 
     evaluate_poses(poses, truth, as_json=json)
+
+
+@app.command()
+def report(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
+    truth: Annotated[
+        Path | None, typer.Argument(metavar="[TRUTH.jsonl]", help="True poses.")
+    ] = None,
+) -> None:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+    from mixpose.cli.report import write_report  # noqa: PLC0415
+
+    write_report(poses, truth, output)
