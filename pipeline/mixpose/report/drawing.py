@@ -6,6 +6,7 @@ the reader's fonts and light or dark background.
 
 from __future__ import annotations
 
+import hashlib
 import io
 import re
 from typing import TYPE_CHECKING, Any
@@ -204,6 +205,9 @@ def drawn(figure: Figure) -> str:
     width, height = 72 * figure.get_size_inches()
     inside = text[text.index(">", text.index("<svg")) + 1 :]
     inside = re.sub(r"<style.*?</style>|<!--.*?-->", "", inside, flags=re.DOTALL)
-    inside = re.sub(r'<g id="[^"]*"', "<g", inside)  # names that every figure would share
+    inside = re.sub(r'<g id="[^"]*"', "<g", inside)
+    # figures share a page, so the names of their parts must differ
+    prefix = hashlib.sha256(inside.encode()).hexdigest()[:12]
+    inside = re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{prefix}-", inside)
     inside = inside.replace(_INK, "var(--ink)").replace(_RULE, "var(--rule)")
     return f'<svg viewBox="0 0 {width:g} {height:g}" aria-hidden="true">{inside.strip()}'

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from mixpose import __version__
 from mixpose.errors import SessionError
 from mixpose.poses.evaluate import Evaluation, evaluate
 from mixpose.poses.jsonl import PoseFile
@@ -59,12 +58,12 @@ def require_libraries() -> None:
         import matplotlib  # noqa: F401, PLC0415
     except ImportError as error:
         raise SessionError(
-            f"report: found no {error.name}, which draws the page; install it with "
-            "python -m pip install 'mixpose[report]'"
+            f"report: found no {error.name}, which makes the page; install it with the extra "
+            "'report': python -m pip install 'mixpose[report]'"
         ) from error
 
 
-def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool) -> str:
+def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
     """The report of a run as one HTML page without anything outside it.
 
     Parameters
@@ -73,6 +72,8 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool) -> str:
     truth : PoseFile or None
     cut : bool
         Whether the last line of the poses was cut off.
+    version : str
+        Of mixpose, which makes the page.
 
     Raises
     ------
@@ -91,7 +92,9 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(_TEMPLATE).render(_content(poses, truth, cut))
+    return environment.get_template(_TEMPLATE).render(
+        mark=MARK, version=version, **_content(poses, truth, cut)
+    )
 
 
 def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, Any]:
@@ -110,8 +113,6 @@ def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, An
     unit_of = _unit_of(origin, series)
     has_poses = bool(np.any(series.status != "lost"))
     return {
-        "mark": MARK,
-        "version": __version__,
         "name": _name(poses),
         "poses": poses,
         "truth": truth,
@@ -126,7 +127,7 @@ def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, An
         "error_charts": [] if errors is None else figures.errors_over_time(series, errors),
         "trajectory_charts": figures.trajectory(series, errors) if has_poses else [],
         "motion_charts": figures.motion(series, errors) if has_poses else [],
-        "sensor_charts": figures.sensors(series, unit_of),
+        "sensor_charts": figures.sensors(series, unit_of) if has_poses else [],
         "latency_charts": figures.latency(series),
         "overlays": overlays,
         "overlay_notices": overlay_notices,
