@@ -159,9 +159,7 @@ def evaluate(
 def report(
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
-    truth: Annotated[
-        Path | None, typer.Argument(metavar="[TRUTH.jsonl]", help="True poses.")
-    ] = None,
+    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
 ) -> None:
     """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
     from mixpose.cli.report import write_report  # noqa: PLC0415

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -51,9 +51,6 @@ class Chart:
     title: str
     alt: str
     svg: str
-
-
-Maker: TypeAlias = Callable[[], Chart]
 
 
 def trajectory(series: Series, errors: Errors | None) -> list[Chart]:
