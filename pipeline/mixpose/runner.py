@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mixpose.session import SensorSetup, Session
 
 Floats: TypeAlias = NDArray[np.float64]
+Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ def run(
     opened: Mapping[str, Source] | None = None,
     selection: Selection = Selection(),
     T_start: Floats | None = None,
+    watch: Watch | None = None,
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
@@ -64,6 +66,9 @@ def run(
     selection : Selection
     T_start : (4, 4) array or None
         Pose to begin at in place of the session's ``[start]``.
+    watch : callable or None
+        Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
+        raw frames and the features found in them; its time is not in the latency.
 
     Yields
     ------
@@ -81,7 +86,7 @@ def run(
     if opened is None:
         opened = open_sources(session, sources or {})
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    return _estimates(session, tracker, track, frames)
+    return _estimates(session, tracker, track, frames, watch)
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
@@ -140,7 +145,11 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 
 
 def _estimates(
-    session: Session, tracker: Tracker, track: Track, frames: Generator[FrameSet, None, None]
+    session: Session,
+    tracker: Tracker,
+    track: Track,
+    frames: Generator[FrameSet, None, None],
+    watch: Watch | None,
 ) -> Generator[Estimate, None, None]:
     with closing(frames):
         for frame_set in frames:
@@ -148,7 +157,10 @@ def _estimates(
             views = observe(session, frame_set)
             track, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
             estimate = _with_silent_sensors(estimate, session.sensors)
-            yield replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+            estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+            if watch is not None:
+                watch(frame_set, views, estimate)
+            yield estimate
 
 
 def observe(session: Session, frame_set: FrameSet) -> list[View]:

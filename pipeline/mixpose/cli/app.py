@@ -63,14 +63,19 @@ def run(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
+    ] = None,
 ) -> None:
     """Print a pose per frame."""
     from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
     from mixpose.runner import Selection  # noqa: PLC0415
 
+    selection = Selection(start, stop, step)
     run_session(
         session,
-        RunRequest(output, format.value, tuple(source or ()), Selection(start, stop, step), resume),
+        RunRequest(output, format.value, tuple(source or ()), selection, resume, overlay),
     )
 
 
@@ -80,6 +85,28 @@ def check(session: SessionFile) -> None:
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
     check_session(session)
+
+
+@app.command()
+def inspect(
+    session: SessionFile,
+    frame: Annotated[int, typer.Option(help="Number of the frame.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="POSES.jsonl", help="Take the pose from a run, not from this frame alone."
+        ),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
+    from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
+
+    inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
 
 
 @app.command()

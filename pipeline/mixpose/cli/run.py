@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from mixpose.errors import SessionError
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
-from mixpose.runner import Selection, open_sources, run
+from mixpose.runner import Selection, Watch, open_sources, run
 from mixpose.session import Session, load_session
 
 
@@ -28,6 +28,7 @@ class RunRequest:
     sources: tuple[str, ...]
     selection: Selection
     resume: bool
+    overlay: Path | None = None
 
 
 def run_session(path: Path, request: RunRequest) -> None:
@@ -43,22 +44,32 @@ def run_session(path: Path, request: RunRequest) -> None:
     session = load_session(path)
     header = header_of(session)
     selection, T_start, resumed = request.selection, None, False
-    opened = open_sources(session, _sources(request.sources))
+    opened = open_sources(session, named_sources(request.sources))
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
         selection, T_start, resumed = _resumed(request, header)
     warn_of_sources(opened)
     summary = Summary()
-    estimates = run(session, opened=opened, selection=selection, T_start=T_start)
-    with (
-        closing(estimates),
-        Output(request.output, request.format, header, append=resumed) as output,
-    ):
+    with ExitStack() as stack:
+        watch = _overlay(stack, session, request)
+        estimates = run(session, opened=opened, selection=selection, T_start=T_start, watch=watch)
+        stack.enter_context(closing(estimates))
+        output = Output(request.output, request.format, header, append=resumed)
+        stack.enter_context(output)
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
             summary.add(estimate)
     summary.say("" if request.output is None else f" -> {request.output}")
+
+
+def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
+    """What draws each frame, finished with the stack; None where nothing is to be drawn."""
+    if request.overlay is None:
+        return None
+    from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
+
+    return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
 
 
 def _is_device(path: Path) -> bool:
@@ -92,7 +103,8 @@ def header_of(session: Session) -> Header:
     )
 
 
-def _sources(named: Iterable[str]) -> dict[str, str]:
+def named_sources(named: Iterable[str]) -> dict[str, str]:
+    """Recordings by sensor name from ``NAME=PATH``, as of the option ``--source``."""
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")

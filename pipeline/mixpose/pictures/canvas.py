@@ -52,17 +52,11 @@ def ring(picture: Picture, place: Floats, radius: float, colour: Colour) -> None
     polyline(picture, circle, colour, closed=True)
 
 
-def cross(picture: Picture, place: Floats, reach: float, colour: Colour) -> None:
-    """Draw an upright cross that leaves its middle free, arms from a third of `reach` px on."""
+def cross(picture: Picture, place: Floats, inner: float, outer: float, colour: Colour) -> None:
+    """Draw an upright cross that leaves its middle free, arms from `inner` to `outer` px."""
     for direction in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        arm = np.array([[reach / 3], [reach]]) * np.array(direction)
+        arm = np.array([[inner], [outer]]) * np.array(direction)
         polyline(picture, place + arm, colour)
-
-
-def saltire(picture: Picture, place: Floats, reach: float, colour: Colour) -> None:
-    """Draw a cross of two diagonals."""
-    for direction in ((1, 1), (1, -1)):
-        polyline(picture, place + reach * np.array([[-1.0], [1.0]]) * direction, colour)
 
 
 def words(

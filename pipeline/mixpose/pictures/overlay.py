@@ -16,10 +16,10 @@ from mixpose.pictures.canvas import (
     WHITE,
     Colour,
     Picture,
+    cross,
     line_height,
     polyline,
     ring,
-    saltire,
     stroke,
     words,
 )
@@ -45,7 +45,7 @@ CHI2_95 = {1: 3.841, 2: 5.991}
 """Squared standard deviations that hold 95 % of a Gaussian of one or two coordinates."""
 
 _AXIS_SHARE = 0.5  # of the body's radius
-_AXIS_PIECES = 12  # an axis is bent by the lens
+_AXIS_PIECES = 24  # an axis is bent by the lens
 _MARK_PX = 7.0
 _CLEAR_SHARE = 0.3  # of the distance to the next feature that a mark takes
 _MOST_NUMBERS = 30  # features with their numbers beside them
@@ -60,12 +60,12 @@ class Part:
     ----------
     zoom : float
         Pixels of the picture per pixel of the sensor.
-    corner : (int, int)
+    corner : (float, float)
         The sensor's pixel (u, v) in the upper left.
     """
 
     zoom: float = 1.0
-    corner: tuple[int, int] = (0, 0)
+    corner: tuple[float, float] = (0.0, 0.0)
 
     def places(self, y: Floats) -> Floats:
         """Places on the picture of sensor coordinates (..., 2)."""
@@ -119,15 +119,17 @@ def draw_pose(
         A new picture.
     """
     picture = np.ascontiguousarray(image_bgr).copy()
-    if found is not None:
-        for place in part.places(found):
-            saltire(picture, place, _MARK_PX / 2 * stroke(picture), FOUND)
+    radius = _MARK_PX * stroke(picture)
+    if T_world_object is not None:
+        radius = mark_radius(picture, sensor, body, T_world_object, part)
+    for place in part.places(found) if found is not None else ():
+        cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
     if T_world_object is not None:
         colour = STATUS_COLOURS[status] if status is not None else STATUS_COLOURS["ok"]
-        _draw_axes(picture, sensor, body, T_world_object, part)
         _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
         _draw_features(picture, sensor, body, T_world_object, part, colour)
-    _caption(picture, status, frame)
+        _draw_axes(picture, sensor, body, T_world_object, part)
+    caption(picture, status, frame)
     return picture
 
 
@@ -191,12 +193,16 @@ def mark_radius(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: P
     """Radius in px of a feature's ring: visible, and clear of the features beside it."""
     y, _, seen = projected_features(sensor, body, T)
     usual = _MARK_PX * stroke(picture)
-    if seen.sum() < 2:
-        return usual
-    apart = np.linalg.norm(y[seen][:, None] - y[seen], axis=-1)
+    return min(usual, max(_CLEAR_SHARE * part.zoom * median_gap(y[seen]), 3.0))
+
+
+def median_gap(y: Floats) -> float:
+    """Median distance of places (n, 2) from their nearest neighbours; infinite for a lone one."""
+    if len(y) < 2:
+        return float("inf")
+    apart = np.linalg.norm(y[:, None] - y, axis=-1)
     np.fill_diagonal(apart, np.inf)
-    nearest = part.zoom * float(np.median(apart.min(axis=1)))
-    return min(usual, max(_CLEAR_SHARE * nearest, 3.0))
+    return float(np.median(apart.min(axis=1)))
 
 
 def _draw_ellipses(
@@ -220,22 +226,34 @@ def _draw_ellipses(
 
 def _draw_axes(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> None:
     """The object's axes at its origin, or amid the features where that is out of view."""
-    length = _AXIS_SHARE * body.radius
     origin = np.zeros(3)
     if not sensor.project(transform(T, origin[None]))[1].all():
         origin = body.means.mean(axis=0)
+    length = _AXIS_SHARE * body.radius
+    centre, seen = sensor.project(transform(T, origin[None]))
+    if not seen.all():
+        return
+    start = part.places(centre[0])
+    # a feature at the origin stays visible
+    y, _, seen = projected_features(sensor, body, T)
+    radius = mark_radius(picture, sensor, body, T, part)
+    marked = np.linalg.norm(part.places(y[seen]) - start, axis=1).min(initial=np.inf) < radius
     along = np.linspace(0.0, length, _AXIS_PIECES)[:, None]
     for k, (name, colour) in enumerate(AXES):
         y, inside = sensor.project(transform(T, origin + along * np.eye(3)[k]))
-        if inside[0]:
-            whole = len(inside) if inside.all() else int(np.argmin(inside))
-            line = part.places(y[:whole])
-            polyline(picture, line, colour, width=2)
-            shift = 0.3 * line_height(picture)
-            words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
+        line = part.places(y[: len(inside) if inside.all() else int(np.argmin(inside))])
+        line = line[np.linalg.norm(line - start, axis=1) >= (1.3 * radius if marked else 0)]
+        if len(line) < 2:
+            continue
+        polyline(picture, line, colour, width=2)
+        shift = 0.3 * line_height(picture)
+        if np.linalg.norm(line[-1] - start) < 1.5 * line_height(picture):
+            continue  # letters would hide what they are beside
+        words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
 
 
-def _caption(picture: Picture, status: Status | None, frame: int | None) -> None:
+def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
+    """Write number and status of a frame into the upper left corner, in place."""
     u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
     if frame is not None:
         u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
