@@ -36,6 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "checking": GROUND
     | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
     "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
+    "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {
     "sensors",

@@ -224,7 +224,7 @@ def _density(observation: Observation, size: tuple[int, int] | None) -> Any:
     """g_l over the whole sensor, brightest where it is largest; None where nothing was seen."""
     if observation.is_empty:
         return None
-    lower, upper = observation.extent()
+    lower, upper = observation.extent
     margin = 4 * observation.sigma
     lower, upper = lower - margin, upper + margin
     if observation.dimension == 2 and size is not None:

@@ -273,3 +273,15 @@ def schema() -> None:
     from mixpose.poses.schema import schema_text  # noqa: PLC0415
 
     typer.echo(schema_text(), nl=False)
+
+
+@app.command()
+def report(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
+    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
+) -> None:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+    from mixpose.cli.report import write_report  # noqa: PLC0415
+
+    write_report(poses, truth, output)

@@ -101,25 +101,53 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     SessionError
         If it is an input of the run, or holds something else.
     """
+    beginning = _beginning(path, inputs)
+    first = beginning.partition("\n")[0]
+    numbers_only = first and all(_is_number(word) for word in first.split())
+    is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
+    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
+        raise _foreign(path)
+    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
+        raise SessionError(f"-o {path}: holds poses of another origin; name another file")
+
+
+def refuse_to_overwrite_but(path: Path, inputs: Iterable[Path], mark: str) -> None:
+    """Make sure that a file about to be written is new, empty, or begins with a mark in it.
+
+    Parameters
+    ----------
+    path : Path
+    inputs : iterable of Path
+        Files that must stay.
+    mark : str
+        Words by which mixpose knows its own files of this kind.
+
+    Raises
+    ------
+    SessionError
+        If it is one of the inputs, or holds something else.
+    """
+    beginning = _beginning(path, inputs)
+    if beginning and mark not in beginning:
+        raise _foreign(path)
+
+
+def _beginning(path: Path, inputs: Iterable[Path]) -> str:
+    """The first characters of a file that may be in the way; none where no file is."""
     if not path.parent.is_dir():
         raise SessionError(f"-o {path}: there is no folder {path.parent}")
     if path.is_dir():
         raise SessionError(f"-o {path}: is a folder; name a file")
     if not path.is_file():
-        return
+        return ""
     if any(each.exists() and path.samefile(each) for each in inputs):
         raise SessionError(f"-o {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
-        beginning = stream.read(4096).decode("utf-8", errors="replace")
-    first = beginning.partition("\n")[0]
-    numbers_only = first and all(_is_number(word) for word in first.split())
-    is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
-    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
-        raise SessionError(
-            f"-o {path}: holds something that mixpose did not write; name another file"
-        )
-    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
-        raise SessionError(f"-o {path}: holds poses of another origin; name another file")
+        return stream.read(4096).decode("utf-8", errors="replace")
+
+
+def _foreign(path: Path) -> SessionError:
+    return SessionError(f"-o {path}: holds something that mixpose did not write; name another file")
 
 
 def _is_number(word: str) -> bool:

@@ -214,7 +214,7 @@ def _span(finding: Finding) -> tuple[float, float]:
     if finding.expectation is not None:
         shown = finding.expectation.y[finding.expectation.seen, 0]
     if not len(shown):
-        shown = np.concatenate(finding.view.observation.extent())
+        shown = np.concatenate(finding.view.observation.extent)
     margin = max(_AROUND * float(np.ptp(shown)), _LEAST_AROUND * finding.sigma)
     return float(shown.min()) - margin, float(shown.max()) + margin
 

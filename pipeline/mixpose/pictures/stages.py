@@ -186,7 +186,7 @@ def _box(view: View, body: Body, T: Floats | None, margin: float | None) -> tupl
         y, seen = view.sensor.project(transform(T, body.nodes.points))
         y = y[seen]
     if not len(y):
-        y = np.stack(view.observation.extent()) if not view.observation.is_empty else y
+        y = np.stack(view.observation.extent) if not view.observation.is_empty else y
     if not len(y):
         return np.zeros(2), np.array([639.0, 479.0])
     if margin is None:

@@ -147,6 +147,36 @@ def read_poses(path: str | Path) -> PoseFile:
     return _parse(path, _read_bytes(path))
 
 
+def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
+    """Read a poses file that a run may still be writing, or was interrupted in.
+
+    Returns
+    -------
+    poses : PoseFile
+        Without a last line that was cut off.
+    cut : bool
+        Whether there was one.
+
+    Raises
+    ------
+    RecordingError
+        As `read_poses`, for every line but a last one that was cut off.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    whole = data.rfind(b"\n") + 1
+    cut = whole > 0 and not _is_json(data[whole:])
+    return _parse(path, data[:whole] if cut else data), cut
+
+
+def _is_json(line: bytes) -> bool:
+    try:
+        json.loads(line.strip() or b"{}")
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
 def resume_point(path: str | Path, header: Header) -> int | None:
     """Find the frame that an interrupted run wrote last, and drop a half-written line after it.
 
