@@ -101,4 +101,4 @@ def _estimator(table: EstimatorTable, start: Start | None) -> EstimatorOptions:
             f"leaves out {one_of(held)}, which stay as [start] has them; add [start] or free them",
             "free",
         )
-    return EstimatorOptions(table.objective, table.free, table.samples, table.seed)
+    return EstimatorOptions(table.objective, table.free, table.samples, table.seed, table.fuse)

@@ -183,6 +183,7 @@ class EstimatorTable(Table):
     free: Annotated[tuple[str, ...], PlainValidator(_free)] = TWIST_NAMES
     samples: Annotated[int, Field(ge=2, description="an integer of at least 2")] = 1000
     seed: Annotated[int, Field(ge=0, description="an integer of at least 0")] = 0
+    fuse: Annotated[bool, Field(description="true or false")] = True
 
 
 class ExtractTable(Table):
