@@ -196,7 +196,7 @@ class Tracker:
                 self._insert(rated, self._ranged(views, T, track, predictions, prediction))
             else:
                 consider(self._fit(views, T, prediction.uncertainty))
-        if not (rated and self._sure(rated[0]) and rated[0].assessment.coverage > CONVINCING):
+        if not (rated and self._convinces(rated[0])):
             for T in self._elsewhere(views, predictions):
                 consider(T)
         for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
@@ -249,6 +249,11 @@ class Tracker:
 
     def _sure(self, rated: Rated) -> bool:
         return self._possible(rated) and rated.assessment.log_evidence > SURE
+
+    def _convinces(self, rated: Rated) -> bool:
+        """Whether a pose near its prediction needs no other to compare with."""
+        covered = rated.assessment.coverage > CONVINCING
+        return covered and self._sure(rated) and self._is_turned_surely(rated)
 
     def _is_turned_surely(self, rated: Rated) -> bool:
         """Whether ranges leave no wide sector of turns open."""
