@@ -148,9 +148,9 @@ def _meeting(view: View, body: Body, T: Floats) -> Meeting | None:
     if view.observation.is_empty:
         return None
     objective = matched_objective([view], body, [view.observation.sigma], T, fine=True)
-    if not objective.terms:
+    if not objective.stacks:
         return None
-    return meet(objective.terms[0], view.observation, body, T)
+    return meet(objective.stacks[0], [view.observation], T)[0]
 
 
 def _nodes(view: View, body: Body, T: Floats) -> tuple[Floats, Mask]:

@@ -159,6 +159,11 @@ class EstimatorTable(Table):
 
     Example: `seed = 1`
     """
+    fuse: Annotated[bool, Field(description="true or false")] = True
+    """Whether frames of single ranges without labels take the pose before them as a prior.
+
+    Example: `fuse = false`
+    """
 
 
 class SessionTable(Table):
