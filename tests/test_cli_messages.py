@@ -37,7 +37,7 @@ def said(capsys: pytest.CaptureFixture[str], status: int, *arguments: str) -> st
         (["run", "x.toml", "--step=0"],
          "--step: found 0; allowed: greater than or equal to 1; see mixpose run --help"),
         (["run", "x.toml", "--format", "xml"],
-         "--format: found xml; allowed: 'jsonl', 'csv', 'tum', 'bop'; see mixpose run --help"),
+         "--format: found xml; allowed: 'jsonl', 'csv', 'tum', 'bop', 'ros'; see mixpose run --help"),
         (["run", "x.toml", "-o"], "-o: found no value; see mixpose run --help"),
         (["rum"], "rum: no such command; did you mean 'run'? See mixpose --help"),
         (["check", "a.toml", "b.toml"],
@@ -107,4 +107,4 @@ def test_the_shell_completes_commands_and_options() -> None:
 
     assert "check" in completed("mixpose ch")
     assert "--quick" in completed("mixpose check --")
-    assert completed("mixpose run s.toml --format ") == ["jsonl", "csv", "tum", "bop"]
+    assert completed("mixpose run s.toml --format ") == ["jsonl", "csv", "tum", "bop", "ros"]

@@ -80,7 +80,9 @@ def sum_by_hand(odds: Floats, used: frozenset[int] = frozenset()) -> float:
     if odds.shape[1] == 0:
         return 1.0
     rest = odds[:, 1:]
-    met = sum(odds[i, 0] * sum_by_hand(rest, used | {i}) for i in range(len(odds)) if i not in used)
+    met = sum(
+        float(odds[i, 0]) * sum_by_hand(rest, used | {i}) for i in range(len(odds)) if i not in used
+    )
     return sum_by_hand(rest, used) + met
 
 

@@ -60,7 +60,7 @@ def test_every_command_and_option_is_on_the_page() -> None:
         "`-o, --output PATH`",
         "`--source NAME=PATH`",
         "`--quick`",
-        "`--format jsonl|csv|tum|bop`: Format of the poses. Default: jsonl.",
+        "`--format jsonl|csv|tum|bop|ros`: Format of the poses. Default: jsonl.",
         "`--frames N`: Number of frames. Needed, at least 1.",
     ):
         assert words in page

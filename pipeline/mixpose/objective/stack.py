@@ -21,7 +21,6 @@ from mixpose.sensors import Sensor
 Floats: TypeAlias = NDArray[np.float64]
 
 _FEW = 40  # features up to which all pairs at once are faster than those that overlap
-_TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ class Stack:
         overlap = self.overlaps(at)
         L = len(self.terms)
         # a sensor that sees no feature has neither product nor norm
-        norm = np.maximum(overlap.norm, _TINY)
+        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
         flat = (at.J * at.weights[..., None, None]).reshape(L, -1, 6)
         C = sampled[..., 0] * at.weights
         product = np.add.reduce(C, axis=1)
