@@ -45,33 +45,36 @@ class Mixture:
 
     def sample(self, y: Floats) -> Floats:
         """Density and gradient (..., n, 1 + m) at the places (..., n, m) of n features."""
-        away = self.points - y[..., None, :]
-        bells = self._bells(away)
-        sampled = np.empty((*y.shape[:-1], 1 + y.shape[-1]))
-        sampled[..., 0] = bells.sum(axis=-1)
-        sampled[..., 1:] = (bells[..., None, :] @ away)[..., 0, :] / self.variance
-        return sampled
+        C, pull, _ = self.sums(y)
+        return np.concatenate([C[..., None], pull / self.variance], axis=-1)
 
     def sample_all(self, y: Floats) -> tuple[Floats, Floats]:
         """As `sample`, with the second derivatives (..., n, m, m)."""
-        m = y.shape[-1]
-        away = self.points - y[..., None, :]
-        bells = self._bells(away)
-        weighted = away * bells[..., None]
-        sampled = np.empty((*y.shape[:-1], 1 + m))
-        C = np.add.reduce(bells, axis=-1, out=sampled[..., 0])
-        np.divide(np.add.reduce(weighted, axis=-2), self.variance, out=sampled[..., 1:])
-        second = weighted.swapaxes(-1, -2) @ away
-        second /= self.variance[..., None]
-        diagonal = np.einsum("...kk->...k", second)
-        diagonal -= C[..., None]
-        second /= self.variance[..., None]
-        return sampled, second
+        C, pull, spread = self.sums(y)
+        second = spread / self.variance[..., None] - C[..., None, None] * np.eye(y.shape[-1])
+        sampled = np.concatenate([C[..., None], pull / self.variance], axis=-1)
+        return sampled, second / self.variance[..., None]
 
-    def _bells(self, away: Floats) -> Floats:
-        squared = np.add.reduce(away * away, axis=-1)
-        squared *= -0.5 / self.variance
-        return np.asarray(np.exp(squared, out=squared) * self.heights)
+    def sums(self, y: Floats) -> tuple[Floats, Floats, Floats]:
+        """Σ_j b_j, Σ_j b_j (d_j − y) and Σ_j b_j (d_j − y)(d_j − y)ᵀ over the bells b_j at y.
+
+        Parameters
+        ----------
+        y : (..., n, m) array
+
+        Returns
+        -------
+        (..., n), (..., n, m), (..., n, m, m) arrays
+        """
+        away = self.points - y[..., None, :]
+        squares = away * away
+        exponents = squares[..., 0] if y.shape[-1] == 1 else squares[..., 0] + squares[..., 1]
+        exponents *= -0.5 / self.variance
+        bells = np.exp(exponents, out=exponents)
+        bells *= self.heights
+        weighted = away * bells[..., None]
+        ones = np.ones(bells.shape[-1])
+        return bells @ ones, ones @ weighted, weighted.swapaxes(-1, -2) @ away
 
 
 def mixture(pattern: PointPattern, sigma: float, centres: Floats | None, reach: float) -> Mixture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -20,7 +21,7 @@ from mixpose.estimation.evidence import (
     noise_of,
 )
 from mixpose.estimation.meeting import Meeting, meet
-from mixpose.objective import View
+from mixpose.objective import Gaze, View
 from mixpose.objective.matched import matched_objective
 from mixpose.records import SensorReport
 
@@ -70,6 +71,7 @@ def assess(
     *,
     before: Noise | None = None,
     prior: Prior | None = None,
+    gazes: Sequence[Gaze] = (),
 ) -> Assessment:
     """Judge a pose by the matched densities at the finest blur.
 
@@ -84,9 +86,11 @@ def assess(
         Residuals of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
+    gazes : sequence of Gaze
+        Of the views' sensors at the body, where they are at hand.
     """
     sigmas = [view.observation.sigma for view in views]
-    objective = matched_objective(views, body, sigmas, T_world_object, fine=True)
+    objective = matched_objective(views, body, sigmas, T_world_object, fine=True, gazes=gazes)
     observations = {view.name: view.observation for view in views}
     met: dict[str, Meeting] = {}
     for stack in objective.stacks:
@@ -106,7 +110,7 @@ def assess(
     noise = (before or Noise()).joined(noise_of(meetings, free), MEMORY)
     return Assessment(
         sensors=reports,
-        score=float(sum(np.sqrt(one.explained) for one in meetings)) / count,
+        score=sum(math.sqrt(one.explained) for one in meetings) / count,
         coverage=sum(one.coverage for one in meetings) / count,
         measurements=sum(one.measurements for one in meetings),
         covariance=covariance_of(information, noise, free),

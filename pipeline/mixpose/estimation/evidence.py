@@ -26,13 +26,14 @@ The more clutter there is, the more features must agree.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri, fdtri, gammaln
+from scipy.special import chdtri, fdtri
 
 from mixpose.body import Body
 from mixpose.estimation.meeting import Meeting
@@ -97,8 +98,8 @@ def information_of(meetings: Sequence[Meeting]) -> Floats:
     """Σ_l Σ_i J_iᵀ J_i / σ_l² over the met features: (6, 6), for noise of one σ."""
     information = np.zeros((6, 6))
     for one in meetings:
-        weighted = one.J * one.shares[:, None, None]
-        information += weighted.reshape(-1, 6).T @ one.J.reshape(-1, 6) / one.sigma**2
+        weighted = (one.J * (one.shares / one.sigma**2)[:, None, None]).reshape(-1, 6)
+        information += weighted.T @ one.J.reshape(-1, 6)
     return information
 
 
@@ -115,15 +116,23 @@ def covariance_of(information: Floats, noise: Noise, free: NDArray[np.bool_]) ->
     Directions that the data leave open get the variance that their information says: large, and
     at most what float64 can invert.
     """
-    covariance = np.zeros((6, 6))
-    inner = information[np.ix_(free, free)]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), _LEAST_INFORMATION))
+    inner = _free_part(information, free)
+    scale = 1.0 / np.sqrt(np.maximum(inner.diagonal(), _LEAST_INFORMATION))
     values, vectors = np.linalg.eigh(inner * scale * scale[:, None])
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale * scale[:, None]
     variance = noise.squares / noise.degrees if noise.degrees >= 1 else _TYPICAL_NOISE**2
     variance = max(variance, _LEAST_NOISE**2) * enlargement(int(free.sum()), noise.degrees)
-    covariance[np.ix_(free, free)] = variance * (inverse + inverse.T) / 2
+    inverse = variance / 2 * (inverse + inverse.T)
+    if len(inverse) == len(free):
+        return np.asarray(inverse)
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = inverse
     return covariance
+
+
+def _free_part(A: Floats, free: NDArray[np.bool_]) -> Floats:
+    """Rows and columns of the directions that are free."""
+    return A if np.count_nonzero(free) == len(free) else A[np.ix_(free, free)]
 
 
 def enlargement(directions: int, degrees: float) -> float:
@@ -155,17 +164,17 @@ def log_evidence(
     blind : float
         Number of features in sensors that have none of the body in view.
     """
-    if not any(one.shares.any() for one in meetings):
+    if not any(one.met for one in meetings):
         return -np.inf
     typical = Noise(_TYPICAL_DEGREES * _TYPICAL_NOISE**2, _TYPICAL_DEGREES).joined(noise)
     variance = typical.squares / typical.degrees
     gained, missed = 0.0, blind * _LOG_UNSEEN
     for one in meetings:
         gained += float(one.shares @ _gains(one, variance))
-        missed += (one.expected - float(one.shares.sum())) * float(np.log(1 - DETECTION))
+        missed += (one.expected - one.met) * math.log(1 - DETECTION)
         missed += one.unseen * _LOG_UNSEEN
     # a direction that the data leave open is as uncertain as before
-    inner = information[np.ix_(free, free)] / variance + np.diag(1 / prior.spread[free] ** 2)
+    inner = _free_part(information, free) / variance + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * np.log(2 * np.pi) - np.linalg.slogdet(inner)[1])
     by_volume = gained + missed + float(laplace) + prior.log_density
     return max(
@@ -177,9 +186,8 @@ def _gains(one: Meeting, variance: float) -> Floats:
     """What each met feature adds to the odds (n,); at least nothing."""
     m = one.J.shape[1]
     density = one.sigma**m * one.crowd * (2 * np.pi * variance) ** (m / 2)
-    gain = np.log(DETECTION) - np.log(max(density, 1e-300))
-    squared = (one.offsets**2).sum(axis=1) / one.sigma**2
-    return np.asarray(np.maximum(gain - squared / (2 * variance), 0.0))
+    gain = math.log(DETECTION / max(density, 1e-300))
+    return np.asarray(np.maximum(gain - one.squared / (2 * variance), 0.0))
 
 
 def _redundant(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> float:
@@ -194,6 +202,6 @@ def _log_choices(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> float:
     pins = -(-int(free.sum()) // dimension)
     observed = max(sum(one.count for one in meetings), pins)
     features = max(*(one.expected for one in meetings), pins)
-    ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - gammaln(pins + 1)
-    assigned = gammaln(features + 1) - gammaln(features - pins + 1)
-    return float(ways + assigned + np.log(2))
+    ways = math.lgamma(observed + 1) - math.lgamma(observed - pins + 1) - math.lgamma(pins + 1)
+    assigned = math.lgamma(features + 1) - math.lgamma(features - pins + 1)
+    return ways + assigned + math.log(2)

@@ -29,6 +29,9 @@ _NEAR = 0.25  # value per sensor that says so: features have half their peak on 
 # tiles have four times as many
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_VALUE_ERROR / 16)
 
+# between detections the Hessian is exact: after a step that gains 1e-6, 1e-5 σ are left to go
+EXACT = NewtonOptions(iterations=40, tolerance=1e-6, value_error=1e-12)
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -60,6 +63,7 @@ def fit_near(
     uncertainty: Floats,
     options: EstimatorOptions,
     samples: Floats,
+    gazes: Sequence[Gaze] | None = None,
 ) -> Fit:
     """Descend from coarse blurs to σ_ε and climb the objective at each.
 
@@ -74,9 +78,11 @@ def fit_near(
     options : EstimatorOptions
     samples : (N, R, 3) array
         Samples of the body, for the objectives that integrate by sampling.
+    gazes : sequence of Gaze or None
+        Of the views' sensors at the body, where they are at hand.
     """
     free = free_mask(options)
-    gazes = gazes_of([view.sensor for view in views], body)
+    gazes = gazes_of([view.sensor for view in views], body) if gazes is None else gazes
     ascent = None
     if options.objective == "matched" and all_points(views):
         ascent = _straight(views, body, T_start, free, gazes)
@@ -104,7 +110,7 @@ def _straight(
     here = objective.linearise(T_start)
     if here.value < _NEAR * len(views):
         return None
-    return ascend(objective.linearise, perturb, T_start, free, FINE, here)
+    return ascend(objective.linearise, perturb, T_start, free, EXACT, here)
 
 
 def _annealed(
@@ -119,10 +125,11 @@ def _annealed(
     """The ascent at one blur after the other."""
     free = free_mask(options)
     levels = ladder(views, body, T_start, np.where(free, uncertainty, 0.0), gazes)
+    sharp = options.objective == "matched" and all_points(views)
     ascent = Ascent(T_start, 0.0, False, 0)
     for k, sigmas in enumerate(levels):
         last = k == len(levels) - 1
-        newton = FINE if last else COARSE
+        newton = (EXACT if sharp else FINE) if last else COARSE
         objective = build_objective(
             options.objective, views, body, samples, sigmas, ascent.state, last, gazes
         )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -56,28 +58,37 @@ class Meeting:
     crowd: float
     count: float
 
+    @cached_property
+    def met(self) -> float:
+        """Sum of the shares."""
+        return float(self.shares.sum())
+
     @property
     def coverage(self) -> float:
         """Share of the features that face the sensor that were met."""
-        return float(self.shares.sum() / max(self.expected + self.unseen, 1e-12))
+        return self.met / max(self.expected + self.unseen, 1e-12)
 
     @property
     def measurements(self) -> float:
         """Number of coordinates that were met."""
-        return float(self.shares.sum() * self.J.shape[1])
+        return self.met * int(self.J.shape[1])
 
-    @property
+    @cached_property
+    def squared(self) -> Floats:
+        """Squared offset of each feature, in σ² (n,)."""
+        return np.asarray((self.offsets * self.offsets).sum(axis=1) / self.sigma**2)
+
+    @cached_property
     def squares(self) -> float:
         """Sum of the squared offsets, in σ."""
-        scaled = self.offsets / self.sigma
-        return float(self.shares @ (scaled * scaled).sum(axis=1))
+        return float(self.shares @ self.squared)
 
     @property
     def rms(self) -> float | None:
         """Root mean square of the offsets of the met features, sensor units; None without any."""
-        if not self.shares.any():
+        if self.met == 0:
             return None
-        return float(self.sigma * np.sqrt(self.squares / self.shares.sum()))
+        return self.sigma * math.sqrt(self.squares / self.met)
 
 
 def meet(
@@ -112,8 +123,11 @@ def _meeting(
 ) -> Meeting:
     """The meeting with sensor k of a stack."""
     term = stack.terms[k]
-    seen = at.seen[k]
-    y, weights, sampled = at.y[k][seen], at.weights[k][seen], sampled[seen]
+    seen, y, weights, J = at.seen[k], at.y[k], at.weights[k], at.J[k]
+    unseen = 0.0
+    if np.count_nonzero(seen) < seen.size:
+        unseen = float(stack.gaze.weights[at.faced[k] & ~seen].sum())
+        y, weights, J, sampled = y[seen], weights[seen], J[seen], sampled[seen]
     shares, offsets, explained = np.zeros(len(y)), np.zeros(y.shape), 0.0
     product = float(weights @ sampled[:, 0])
     if product > 0:
@@ -122,15 +136,15 @@ def _meeting(
             shares, offsets = _nearest(observation.pattern, y, weights, term.variance)
         else:
             shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
-    sigma = float(np.sqrt(term.variance / 2))
+    sigma = math.sqrt(term.variance / 2)
     count = peak(term.variance, y.shape[1]) / term.energy
     return Meeting(
         explained=explained,
         shares=shares,
         offsets=offsets,
-        J=at.J[k][seen],
+        J=J,
         expected=float(weights.sum()),
-        unseen=float(stack.gaze.weights[at.faced[k] & ~seen].sum()),
+        unseen=unseen,
         sigma=sigma,
         crowd=_crowd(observation, y, sigma, count),
         count=_count(observation, count),
@@ -149,17 +163,18 @@ def _nearest(
     offsets : (n, m) array
     """
     shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
-    away = pattern.points[None] - y[:, None]
+    away = pattern.points - y[:, None]
     squared = (away * away).sum(axis=-1)
-    order = np.argsort(squared, axis=None)
-    reach = -2 * variance * np.log(LEAST_SHARE)
-    i, j = np.unravel_index(order[: int((squared <= reach).sum())], squared.shape)
-    free = np.ones(squared.shape[1], dtype=np.bool_)
-    for feature, detection in zip(i.tolist(), j.tolist(), strict=True):
-        if free[detection] and not shares[feature]:
-            free[detection] = False
-            shares[feature] = weights[feature]
-            offsets[feature] = away[feature, detection]
+    near_i, near_j = np.nonzero(squared <= -2 * variance * np.log(LEAST_SHARE))
+    order = np.argsort(squared[near_i, near_j], kind="stable")
+    met: set[int] = set()
+    taken: set[int] = set()
+    for i, j in zip(near_i[order].tolist(), near_j[order].tolist(), strict=True):
+        if i not in met and j not in taken:
+            met.add(i)
+            taken.add(j)
+            shares[i] = weights[i]
+            offsets[i] = away[i, j]
     return shares, offsets
 
 
@@ -206,14 +221,16 @@ def _crowd(observation: Observation, y: Floats, sigma: float, count: float) -> f
     """Density of observed features: over the whole pattern, or near the body if denser there."""
     smallest = _SMALLEST_REGION * sigma
     lower, upper = observation.extent
-    overall = _count(observation, count) / float(np.prod(np.maximum(upper - lower, smallest)))
-    if not isinstance(observation.pattern, PointPattern):
+    overall = _count(observation, count) / _area(upper - lower, smallest)
+    if not isinstance(observation.pattern, PointPattern) or not len(y):
         return overall
     found = observation.pattern.points
-    if not len(y):
-        return overall
     near, far = y.min(axis=0), y.max(axis=0)
-    grow = np.maximum(smallest - (far - near), 0.0) / 2
-    inside = np.all((found >= near - grow) & (found <= far + grow), axis=1)
-    region = float(np.prod(np.maximum(far - near, smallest)))
-    return max(overall, float(inside.sum()) / region)
+    middle, half = (near + far) / 2, np.maximum(far - near, smallest) / 2
+    inside = (np.abs(found - middle) <= half).all(axis=1)
+    return max(overall, np.count_nonzero(inside) / _area(2 * half, smallest))
+
+
+def _area(sides: NDArray[np.float64], smallest: float) -> float:
+    """Size of a box, no side of which counts as less than the smallest."""
+    return math.prod(max(side, smallest) for side in sides.tolist())

@@ -32,8 +32,7 @@ _NOTICEABLE = 0.35
 
 def bent(meetings: Sequence[Meeting]) -> bool:
     """Whether some feature is met so loosely that it may be another's detection."""
-    squared = [(m.offsets**2).sum(axis=1).max(initial=0.0) / m.sigma**2 for m in meetings]
-    return max(squared, default=0.0) > _NOTICEABLE
+    return any(meeting.squared.max(initial=0.0) > _NOTICEABLE for meeting in meetings)
 
 
 def sharpened(

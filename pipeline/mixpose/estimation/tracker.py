@@ -8,7 +8,7 @@ everywhere else, and invents nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
@@ -33,7 +33,7 @@ from mixpose.estimation.track import (
     predict,
     prior_of,
 )
-from mixpose.objective import View
+from mixpose.objective import Gaze, View, gazes_of
 from mixpose.records import Estimate, Hypothesis, SensorReport
 from mixpose.rigid import rotation_angle_deg, twist_between
 from mixpose.search import search
@@ -86,6 +86,7 @@ class Tracker:
     samples: Floats
     start_uncertainty: Floats
     T_start: Floats | None = None
+    _gazes: dict[tuple[int, ...], list[Gaze]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def create(
@@ -186,7 +187,16 @@ class Tracker:
         def judge(T: Floats) -> Rated:
             T = nearest_alike(T, self.body, T_reference)
             prior = prior_of(T, predictions, self.body, self.free, track.misses)
-            return Rated(T, assess(views, self.body, T, self.free, before=track.noise, prior=prior))
+            judged = assess(
+                views,
+                self.body,
+                T,
+                self.free,
+                before=track.noise,
+                prior=prior,
+                gazes=self._gazes_of(views),
+            )
+            return Rated(T, judged)
 
         def consider(T: Floats) -> None:
             if ranged:
@@ -257,8 +267,18 @@ class Tracker:
         return found
 
     def _fit(self, views: Sequence[View], T: Floats, uncertainty: Floats) -> Floats:
-        fit = fit_near(views, self.body, T, uncertainty, self.options, self.samples)
+        gazes = self._gazes_of(views)
+        fit = fit_near(views, self.body, T, uncertainty, self.options, self.samples, gazes)
         return fit.T_world_object
+
+    def _gazes_of(self, views: Sequence[View]) -> list[Gaze]:
+        """The views' sensors side by side, kept from frame to frame."""
+        sensors = [view.sensor for view in views]
+        # a gaze holds its sensors, so that no other can come to the same place in memory
+        key = tuple(map(id, sensors))
+        if key not in self._gazes:
+            self._gazes[key] = gazes_of(sensors, self.body)
+        return self._gazes[key]
 
     def _sure(self, rated: Rated) -> bool:
         return self._possible(rated) and rated.assessment.log_evidence > SURE

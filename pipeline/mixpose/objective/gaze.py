@@ -53,6 +53,7 @@ class Gaze:
         self.sensors = tuple(sensors)
         self.points = body.nodes.points
         self.weights = body.nodes.weights
+        self.is_even = bool((self.weights == 1.0).all())
         self.normals = body.node_normals
         self._bank = bank(self.sensors)
         self._everything = np.ones((len(self.sensors), len(self.points)), dtype=np.bool_)

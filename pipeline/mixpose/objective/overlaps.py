@@ -14,6 +14,9 @@ Floats: TypeAlias = NDArray[np.float64]
 _NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
 
 
+_NONE = np.zeros(0)
+
+
 class Overlap(NamedTuple):
     """Inner products of a predicted mixture h with itself and its derivatives by the pose.
 
@@ -28,14 +31,35 @@ class Overlap(NamedTuple):
     second : (..., 6, 6) array
         Second derivative of the norm, without those of the projection.
     apart : bool
-        Whether no features overlap, so that derivatives of the norm are zero.
+        Whether no features overlap, so that the norm does not change with the pose; derivatives
+        are left out then.
     """
 
     norm: Any
-    half_gradient: Floats
-    gram: Floats
-    second: Floats
+    half_gradient: Floats = _NONE
+    gram: Floats = _NONE
+    second: Floats = _NONE
     apart: bool = False
+
+
+def apart_at(variances: Floats) -> Floats:
+    """Squared distances (L, 1, 1) from which two features do not overlap."""
+    return np.asarray(-2 * _NEGLIGIBLE * variances[:, None, None])
+
+
+def are_apart(y: Floats, weights: Floats, limits: Floats) -> bool:
+    """Whether no two features (L, n, m) are closer than the root of a limit (L, 1, 1).
+
+    Features of weight 0, which sit together far outside, do not count.
+    """
+    away = y[:, :, None] - y[:, None]
+    away *= away
+    squared = away[..., 0] if y.shape[2] == 1 else away[..., 0] + away[..., 1]
+    close = squared < limits
+    if np.count_nonzero(close) <= weights.size:  # each is close to itself
+        return True
+    close &= (weights[:, :, None] * weights[:, None]) > 0
+    return bool(np.count_nonzero(close) <= np.count_nonzero(weights))
 
 
 def overlap_terms(y: Floats, J: Floats, weights: Floats, variance: float) -> Overlap:
@@ -100,14 +124,6 @@ def overlaps_of_few(y: Floats, J: Floats, weights: Floats, variances: Floats) ->
     flat = weighted.reshape(L, n * m, 6)
     away = y[:, :, None] - y[:, None]
     exponents = (away * away).sum(axis=3) * (-0.5 * scale)[:, None, None]
-    together = exponents > _NEGLIGIBLE
-    if np.count_nonzero(together) > L * n:
-        # those that are not seen sit together far outside
-        together &= (weights[:, :, None] * weights[:, None]) > 0
-    if np.count_nonzero(together) <= L * n:
-        gram = flat.swapaxes(1, 2) @ flat * (tops * scale)[:, None, None]
-        norm = tops * (weights * weights).sum(axis=1)
-        return Overlap(norm, np.zeros((L, 6)), gram, np.zeros((L, 6, 6)), apart=True)
     bells = np.exp(exponents) * tops[:, None, None]
     pull = (bells[..., None] * away * weights[:, None, :, None]).sum(axis=2) * -scale[:, None, None]
     half_gradient = (pull.reshape(L, 1, n * m) @ flat)[:, 0]

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from mixpose.density import Atlas, Density, Mixture
 from mixpose.objective.base import Quadratic
 from mixpose.objective.gaze import Gaze, Projected
-from mixpose.objective.overlaps import Overlap, overlap_terms, overlaps_of_few
+from mixpose.objective.overlaps import (
+    Overlap,
+    apart_at,
+    are_apart,
+    overlap_terms,
+    overlaps_of_few,
+)
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -56,6 +62,8 @@ class Stack:
         self.terms = tuple(terms)
         self.gaze = gaze
         self.variances = np.array([term.variance for term in terms])
+        self._tops = (2 * np.pi * self.variances) ** (-0.5 * terms[0].sensor.dimension)
+        self._apart = apart_at(self.variances)
         self._scales = np.array([term.weight / term.energy for term in terms])
         self._mixtures = _joined([term.matched for term in terms])
 
@@ -77,6 +85,10 @@ class Stack:
 
     def overlaps(self, at: Projected) -> Overlap:
         """Overlaps of the predicted mixture in every sensor, all with a leading axis L."""
+        if self._mixtures is not None and at.y.shape[1] <= _FEW:
+            squares = at.weights * at.weights
+            if are_apart(at.y, at.weights, self._apart):
+                return Overlap(self._tops * (squares @ np.ones(squares.shape[1])), apart=True)
         if at.y.shape[1] <= _FEW:
             return overlaps_of_few(at.y, at.J, at.weights, self.variances)
         each = [
@@ -93,61 +105,72 @@ class Stack:
         )
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Σ_l ω_l S_l at one pose, with its derivatives.
-
-        Between detections the curvature is that of mean-shift, 2 a Σ_i C_i J_iᵀ J_i / 2σ²: every
-        feature is drawn to where the detections around it lie, and the value never falls.  On
-        grids, where features overlap, it is Gauss-Newton's of g − a h.
-        """
+        """Σ_l ω_l S_l at one pose, with its derivatives."""
         at = self.gaze.project(T_world_object)
+        if self._mixtures is None:
+            return self._on_grids(at)
+        return self._between_detections(at, self._mixtures)
+
+    def _between_detections(self, at: Projected, mixtures: Mixture) -> Quadratic:
+        """The curvature is that of mean-shift, 2 a Σ_i C_i J_iᵀ J_i / 2σ².
+
+        Every feature is drawn to where the detections around it lie, and the value never falls.
+        The Hessian has in place of C_i / 2σ² what Σ_j b_j d dᵀ / 4σ⁴ leaves of it.
+        """
+        C, pull, spread = mixtures.sums(at.y)
+        if not (self.gaze.is_even and np.count_nonzero(at.seen) == at.seen.size):
+            C = C * at.weights
+            pull = pull * at.weights[..., None]
+            spread = spread * at.weights[..., None, None]
+        L, v = len(self.terms), self.variances
+        J = at.J.reshape(-1, 6)
+        overlap = self.overlaps(at)
+        product = C @ np.ones(C.shape[1])
+        rest = (pull.reshape(L, 1, -1) @ at.J.reshape(L, -1, 6))[:, 0] / v[:, None]
+        # a sensor that sees no feature has neither product nor norm
+        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
+        amplitude = product / norm
+        strength = 2 * self._scales * amplitude
+        drawn = ((strength / v)[:, None] * C)[..., None, None] * at.J
+        curvature = J.T @ drawn.reshape(-1, 6)
+        bent = ((strength / v**2)[:, None, None, None] * spread) @ at.J
+        hessian = curvature - J.T @ bent.reshape(-1, 6)
+        by_norm = rest
+        if not overlap.apart:
+            half = amplitude[:, None] * overlap.half_gradient
+            rest, by_norm = rest - half, rest - 2 * half
+            level = self._scales * amplitude**2
+            hessian += (level[:, None, None] * overlap.second).sum(axis=0)
+        # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
+        hessian -= ((2 * self._scales / norm)[:, None] * by_norm).T @ by_norm
+        value = float(self._scales @ (product * amplitude))
+        return Quadratic(value, strength @ rest, curvature, hessian)
+
+    def _on_grids(self, at: Projected) -> Quadratic:
+        """The curvature is Gauss-Newton's of g − a h: on grids features overlap."""
         sampled, second = self.look_up(at.y)
         overlap = self.overlaps(at)
         L = len(self.terms)
-        # a sensor that sees no feature has neither product nor norm
-        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
         flat = (at.J * at.weights[..., None, None]).reshape(L, -1, 6)
-        C = sampled[..., 0] * at.weights
-        product = np.add.reduce(C, axis=1)
-        by_pose = (sampled[..., 1:].reshape(L, 1, -1) @ flat)[:, 0]
+        product = (sampled[..., 0] * at.weights).sum(axis=1)
+        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
         amplitude = product / norm
         strength = 2 * self._scales * amplitude
+        half = amplitude[:, None] * overlap.half_gradient
+        rest = (sampled[..., 1:].reshape(L, 1, -1) @ flat)[:, 0] - half
+        level = (self._scales * amplitude**2)[:, None, None]
+        across = overlap.half_gradient[:, :, None] * overlap.half_gradient[:, None]
+        gram = overlap.gram - across / norm[:, None, None]
+        curvature = (2 * level * gram).sum(axis=0)
+        hessian = None
+        if second is not None:
+            bent = (strength[:, None, None, None] * second) @ at.J
+            hessian = (level * overlap.second).sum(axis=0)
+            hessian -= flat.reshape(-1, 6).T @ bent.reshape(-1, 6)
+            by_norm = rest - half
+            hessian -= ((2 * self._scales / norm)[:, None] * by_norm).T @ by_norm
         value = float(self._scales @ (product * amplitude))
-        rest = by_pose
-        if not overlap.apart:
-            rest = by_pose - amplitude[:, None] * overlap.half_gradient
-        hessian = self._hessian(at, flat, second, overlap, rest, amplitude, norm)
-        if self._mixtures is not None:
-            drawn = ((strength / self.variances)[:, None] * C)[..., None, None] * at.J
-            curvature = at.J.reshape(-1, 6).T @ drawn.reshape(-1, 6)
-        else:
-            half = overlap.half_gradient
-            across = half[:, :, None] * half[:, None, :] / norm[:, None, None]
-            level = (strength * amplitude)[:, None, None]
-            curvature = (level * (overlap.gram - across)).sum(axis=0)
         return Quadratic(value, strength @ rest, curvature, hessian)
-
-    def _hessian(
-        self,
-        at: Projected,
-        flat: Floats,
-        second: Floats | None,
-        overlap: Overlap,
-        rest: Floats,
-        amplitude: Floats,
-        norm: Floats,
-    ) -> Floats | None:
-        """Minus the second derivative of Σ ω c²/n: with a = c/n, 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n."""
-        if second is None:
-            return None
-        by_norm = rest if overlap.apart else rest - amplitude[:, None] * overlap.half_gradient
-        strength = 2 * self._scales * amplitude
-        bent = (strength[:, None, None, None] * second) @ at.J
-        hessian = -(flat.reshape(-1, 6).T @ bent.reshape(-1, 6))
-        hessian -= ((2 * self._scales / norm)[:, None] * by_norm).T @ by_norm
-        if not overlap.apart:
-            level = self._scales * amplitude**2
-            hessian += (level[:, None, None] * overlap.second).sum(axis=0)
-        return np.asarray(hessian)
 
 
 def _joined(parts: Sequence[Density | Atlas | Mixture]) -> Mixture | None:
