@@ -1,8 +1,8 @@
 """Where the samples of a body lie in the arrays of densities, as maps for `cv2.remap`.
 
 One evaluation of a sampled objective is to cost hardly more than its look-ups.  So samples are
-kept in single precision, in blocks whose maps fit the cache, and sensors of one kind share one
-matrix product that ends in array indices.  Single precision suffices because samples are relative
+kept in single precision, and sensors of one kind share one matrix product that ends in array
+indices.  Single precision suffices because samples are relative
 to their centre: maps err by less than 1/1000 of an index in arrays of up to 4000 a side.
 
 Samples that a sensor does not see, or that are not finite, come to lie at `FAR`, outside any array.
@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +30,7 @@ Singles: TypeAlias = NDArray[np.float32]
 Maps: TypeAlias = tuple[Singles, Singles]
 Projection: TypeAlias = Callable[[Floats], Sequence[Maps]]
 
-_BLOCK = 1500  # four rows of so many samples stay in the innermost cache
+_BLOCK = 16384  # cv2.remap takes maps of less than 32767 a side
 
 
 @dataclass(frozen=True)
@@ -84,16 +85,26 @@ class Samples:
         blocks = rows.reshape(self.blocks, -1, rows.shape[1]).swapaxes(1, 2)
         return np.ascontiguousarray(blocks, dtype=np.float32)
 
-    def product(self, P: Floats, affine: Floats) -> Singles:
-        """All rows (k·B, r, W) of matrices P (r, 4) that project world points.
+    def by_pose(self, P: Floats) -> Floats:
+        """Coefficients (16, r·c): what rows P (r, 4), for world points, are for `centred`.
 
-        `affine` (k, r, 4) is P with k poses and the shift to the centre.
+        They are linear in the 16 numbers of a pose, the last of which is 1.
         """
+        coefficients = np.einsum("ia,bj->abij", P, self.to_centre)
         if self.offsets is not None:
-            in_world = np.broadcast_to(P[:, :3], (*affine.shape[:2], 3))
-            affine = np.concatenate([affine, in_world], axis=2)
-        maps = np.matmul(affine.astype(np.float32)[:, None], self.centred)
-        return maps.reshape(-1, *maps.shape[2:])
+            in_world = np.zeros((4, 4, len(P), 3))
+            in_world[3, 3] = P[:, :3]
+            coefficients = np.concatenate([coefficients, in_world], axis=3)
+        return np.asarray(coefficients.reshape(16, -1))
+
+    def product(self, rows: Floats) -> Singles:
+        """Products (k·B, r, W) of rows (k, r·c) for k poses with all samples."""
+        k, c = len(rows), self.centred.shape[1]
+        single = rows.astype(np.float32)
+        if k == self.blocks == 1:  # no time for broadcasting
+            return np.asarray(single.reshape(-1, c).dot(self.centred[0])[None])
+        maps = single.reshape(k, 1, -1, c) @ self.centred
+        return np.asarray(maps.reshape(k * self.blocks, -1, maps.shape[3]))
 
 
 def index_maps(terms: Sequence[SampledTerm], samples: Samples) -> Projection:
@@ -129,29 +140,36 @@ class _Parallel:
 
     def __init__(self, terms: Sequence[SampledTerm], samples: Samples) -> None:
         self._samples = samples
-        self._P = np.zeros((2 * len(terms), 4))
+        P = np.zeros((2 * len(terms), 4))
         for k, term in enumerate(terms):
-            sensor = term.sensor
+            sensor, window = term.sensor, term.density.window
             assert isinstance(sensor, ParallelBeam)
-            window = term.density.window
             rows = sensor.T_sensor_world[:2] / sensor.pixel_size
             rows[:, 3] += sensor.principal_point - window.origin
-            self._P[2 * k : 2 * k + 2] = rows / window.step
+            P[2 * k : 2 * k + 2] = rows / window.step
         lower, upper = _index_limits(terms)
         self._limits = lower[:, None], upper[:, None]
-        # where the centre must lie for all samples to be seen
-        self._middle = (lower + upper) / 2
-        reach = samples.radius * np.linalg.norm(self._P[:, :3], axis=1)
-        self._half = (upper - lower) / 2 - reach
+        by_pose = samples.by_pose(P)
+        self._width = by_pose.shape[1]
+        self._by_pose = np.hstack([by_pose, self._centres(by_pose, P, lower, upper)])
+
+    def _centres(self, by_pose: Floats, P: Floats, lower: Floats, upper: Floats) -> Floats:
+        """Coefficients (16, r) of numbers within ±1 if the centre lies so that all are seen."""
+        reach = self._samples.radius * np.linalg.norm(P[:, :3], axis=1)
+        half = (upper - lower) / 2 - reach
+        half = np.where(half > 0, half, np.nan)
+        centres = by_pose.reshape(16, len(P), -1)[:, :, 3].copy()
+        centres[15] -= (lower + upper) / 2
+        return np.asarray(centres / half)
 
     def __call__(self, poses: Floats) -> Sequence[Maps]:
-        affine = self._P @ (poses @ self._samples.to_centre)
-        inside = np.abs(affine[..., 3] - self._middle) <= self._half
-        if np.count_nonzero(inside) == inside.size:
-            maps = self._samples.product(self._P, affine)
+        # poses may be anywhere, even not finite
+        rows = poses.reshape(-1, 16).dot(self._by_pose)
+        if cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+            maps = self._samples.product(rows[:, : self._width])
         else:
-            with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-                maps = self._samples.product(self._P, affine)
+            with np.errstate(all="ignore"):
+                maps = self._samples.product(rows[:, : self._width])
                 _hide(maps, *self._limits)
         return [(maps[:, k], maps[:, k + 1]) for k in range(0, maps.shape[1], 2)]
 
@@ -176,7 +194,7 @@ class _Pinholes:
             pixels.append(from_middle / window.step)
             depths.append(T[2:])
             middles.append(middle)
-        self._P = np.concatenate(pixels + depths)
+        self._by_pose = samples.by_pose(np.concatenate(pixels + depths))
         self._middle = np.concatenate(middles).astype(np.float32)[:, None]
         lower, upper = _index_limits(terms)
         self._limits = lower[:, None], upper[:, None]
@@ -184,8 +202,7 @@ class _Pinholes:
     def __call__(self, poses: Floats) -> Sequence[Maps]:
         count = 2 * self._count
         with np.errstate(all="ignore"):
-            affine = self._P @ (poses @ self._samples.to_centre)
-            rows = self._samples.product(self._P, affine)
+            rows = self._samples.product(poses.reshape(-1, 16) @ self._by_pose)
             maps, depth = rows[:, :count], rows[:, count:]
             depth[~(depth > NEAREST)] = np.nan
             by_camera = maps.reshape(len(maps), self._count, 2, -1)

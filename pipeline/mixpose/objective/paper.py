@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -70,20 +70,19 @@ class _SampledObjective:
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
+        self._poses_at_once = max(1, _SAMPLES_AT_ONCE // len(self.points))
         self.offsets: Floats | None = None
         if world_offsets is not None and world_offsets.any():
             self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
+        if T_world_object.ndim == 2:
+            return self._values(T_world_object[None])[0]
         poses = T_world_object.reshape(-1, 4, 4)
-        at_once = max(1, _SAMPLES_AT_ONCE // len(self.points))
-        if len(poses) <= at_once:
-            values = self._values(poses)
-        else:
-            starts = range(0, len(poses), at_once)
-            values = np.concatenate([self._values(poses[k : k + at_once]) for k in starts])
-        return values.reshape(T_world_object.shape[:-2])
+        starts = range(0, len(poses), self._poses_at_once)
+        values = [self._values(poses[k : k + self._poses_at_once]) for k in starts]
+        return np.concatenate([np.zeros(0), *values]).reshape(T_world_object.shape[:-2])
 
     def _values(self, poses: Floats) -> Floats:
         raise AssertionError("an objective says how sensors combine")
@@ -97,16 +96,20 @@ class _SampledObjective:
     def _densities(self, poses: Floats) -> list[Singles]:
         """g_l in blocks of samples, per sensor, for poses (k, 4, 4)."""
         project, arrays = self._looked_up_in
-        return [
-            cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-            for g, (u, v) in zip(arrays, project(poses), strict=True)
-        ]
+        looked_up = []
+        for g, (u, v) in zip(arrays, project(poses), strict=True):
+            values: Any = cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            looked_up.append(values)
+        return looked_up
 
     def _means(self, blocks: Singles, count: int) -> Floats:
         """Means (k,) over the samples of k poses, summed in double precision."""
-        by_pose = blocks.reshape(count, -1)[:, : len(self.points)]
+        size = len(self.points)
+        if count * size == blocks.size == blocks.shape[1]:
+            return np.array([cv2.sumElems(blocks)[0] / size])
+        by_pose = blocks.reshape(count, -1)[:, :size]
         sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
-        return sums[:, 0] / len(self.points)
+        return np.asarray(sums[:, 0] / size)
 
     def _linearised(self, T_world_object: Floats) -> list[_Sampled]:
         points = transform(T_world_object, self.points)
@@ -128,7 +131,7 @@ class PaperObjective(_SampledObjective):
     def _values(self, poses: Floats) -> Floats:
         product, *others = self._densities(poses)
         for g in others:
-            product = cv2.multiply(product, g, dst=product)
+            product *= g
         return self._means(product, len(poses))
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
