@@ -31,6 +31,8 @@ from mixpose.objective.index_maps import (
 )
 from mixpose.rigid import transform
 
+__all__ = ["REACH", "IndependentObjective", "PaperObjective", "SampledTerm", "sampled_terms"]
+
 Floats: TypeAlias = NDArray[np.float64]
 
 REACH = 4.0
@@ -78,7 +80,7 @@ class _SampledObjective:
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
         if T_world_object.ndim == 2:
-            return self._values(T_world_object[None])[0]
+            return self._values(T_world_object[None]).reshape(())
         poses = T_world_object.reshape(-1, 4, 4)
         starts = range(0, len(poses), self._poses_at_once)
         values = [self._values(poses[k : k + self._poses_at_once]) for k in starts]
