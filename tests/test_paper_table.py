@@ -123,6 +123,19 @@ def test_fast_objectives_are_those_of_mixpose(name: str) -> None:
         )
 
 
+@pytest.mark.parametrize("name", ["1", "2", "3"])
+def test_single_precision_agrees_with_double(name: str) -> None:
+    system, scenario = SYSTEMS[name], BY_NAME["I"]
+    truth, start = draw(np.random.default_rng(1))
+    measurements = measure(system, scenario, truth, np.random.default_rng(0))
+    samples = system.body(scenario).sample(200, antithetic=False)
+    single = sampled_objectives(system, measurements, samples)
+    double = sampled_objectives(system, measurements, samples, double=True)
+    for beta in (truth, start):
+        for one, other in zip(single, double, strict=True):
+            assert one(beta) == pytest.approx(other(beta), rel=2e-5)
+
+
 def test_the_simplex_starts_like_fminsearch() -> None:
     def bowl(x: Floats) -> float:
         return float((x[0] - 3) ** 2 + 2 * (x[1] + 1) ** 2)

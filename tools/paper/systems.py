@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.rigid import from_parts
 from mixpose.sensors import ParallelBeam, RangeSensor, Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -118,8 +117,10 @@ def deformed(points: Floats) -> Floats:
 
 def pose(beta: Floats) -> Floats:
     """T_world_object (4, 4) of the paper's (φ1, φ2, φ3, w1, w2, w3), radians: R3 R2 R1 (z + w)."""
-    R = rotation(beta)
-    return from_parts(R, R @ beta[3:])
+    T = np.eye(4)
+    T[:3, :3] = rotation(beta)
+    T[:3, 3] = T[:3, :3] @ beta[3:]
+    return T
 
 
 def rotation(beta: Floats) -> Floats:

@@ -86,6 +86,15 @@ class Density:
         first = self.values if self.values.ndim == 2 else self.values[..., 0]
         return float(first.sum(dtype=np.float64) * self.window.step**self.dimension)
 
+    def indices(self, y: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Array indices (n,) along columns and rows of sensor coordinates (..., m), all finite."""
+        index = (y.reshape(-1, self.dimension) - self.window.origin) / self.window.step
+        np.nan_to_num(index, copy=False, nan=FAR)
+        np.clip(index, FAR, -FAR, out=index)
+        map_u = index[:, 0].astype(np.float32)
+        map_v = index[:, 1].astype(np.float32) if self.dimension == 2 else np.zeros_like(map_u)
+        return map_u, map_v
+
     def sample(self, y: Floats) -> NDArray[np.float32]:
         """Look the channels up, bilinearly.
 
@@ -99,11 +108,7 @@ class Density:
         (..., 1 + m) or (...,) float32
             The channels at y, `FLOOR` outside; without the last axis for a single channel.
         """
-        index = (y.reshape(-1, self.dimension) - self.window.origin) / self.window.step
-        np.nan_to_num(index, copy=False, nan=FAR)
-        np.clip(index, FAR, -FAR, out=index)
-        map_u = index[:, 0].astype(np.float32)
-        map_v = index[:, 1].astype(np.float32) if self.dimension == 2 else np.zeros_like(map_u)
+        map_u, map_v = self.indices(y)
         looked_up = remap(self.values, map_u, map_v)
         if self.values.ndim == 2:
             return looked_up.reshape(y.shape[:-1])

@@ -13,30 +13,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import Density
 from mixpose.objective.base import Quadratic, View, pose_jacobian, region_of_interest
+from mixpose.objective.index_maps import (
+    Projection,
+    SampledTerm,
+    Samples,
+    Singles,
+    index_maps,
+    look_up_array,
+)
 from mixpose.rigid import transform
-from mixpose.sensors import Sensor
+
+__all__ = ["REACH", "IndependentObjective", "PaperObjective", "SampledTerm", "sampled_terms"]
 
 Floats: TypeAlias = NDArray[np.float64]
 
 REACH = 4.0
 """Margin of a window around the predicted samples, in standard deviations of a feature."""
 
-_POSES_AT_ONCE = 64  # bounds the memory of a batch: 64 poses of 6000 samples are 10 MB
-
-
-@dataclass(frozen=True)
-class SampledTerm:
-    """A sensor with its density g_l (with gradient) at one level of blur."""
-
-    sensor: Sensor
-    density: Density
+_SAMPLES_AT_ONCE = 2**18  # of all poses of a batch: bounds its memory to a few MB per sensor
 
 
 @dataclass(frozen=True)
@@ -70,33 +72,51 @@ class _SampledObjective:
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
-        offsets = np.zeros((1, 3)) if world_offsets is None else world_offsets
-        self.offsets = np.broadcast_to(offsets, samples.shape).reshape(-1, 3)
-
-    def densities(self, T_world_object: Floats) -> list[Floats]:
-        """g_l at all samples (..., S), per sensor."""
-        points = transform(T_world_object, self.points) + self.offsets
-        looked_up = []
-        for term in self.terms:
-            y, _ = term.sensor.project(points)
-            g = term.density.sample(y)
-            looked_up.append((g[..., 0] if g.ndim == y.ndim else g).astype(np.float64))
-        return looked_up
+        self._poses_at_once = max(1, _SAMPLES_AT_ONCE // len(self.points))
+        self.offsets: Floats | None = None
+        if world_offsets is not None and world_offsets.any():
+            self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
+        if T_world_object.ndim == 2:
+            return self._values(T_world_object[None]).reshape(())
         poses = T_world_object.reshape(-1, 4, 4)
-        parts = [
-            self._combine(self.densities(poses[k : k + _POSES_AT_ONCE]))
-            for k in range(0, len(poses), _POSES_AT_ONCE)
-        ]
-        return np.concatenate(parts).reshape(T_world_object.shape[:-2])
+        starts = range(0, len(poses), self._poses_at_once)
+        values = [self._values(poses[k : k + self._poses_at_once]) for k in starts]
+        return np.concatenate([np.zeros(0), *values]).reshape(T_world_object.shape[:-2])
 
-    def _combine(self, densities: list[Floats]) -> Floats:
+    def _values(self, poses: Floats) -> Floats:
         raise AssertionError("an objective says how sensors combine")
 
+    @cached_property
+    def _looked_up_in(self) -> tuple[Projection, list[Singles]]:
+        """What only values need, so that objectives to be linearised are not slowed down."""
+        project = index_maps(self.terms, Samples(self.points, self.offsets))
+        return project, [look_up_array(term.density) for term in self.terms]
+
+    def _densities(self, poses: Floats) -> list[Singles]:
+        """g_l in blocks of samples, per sensor, for poses (k, 4, 4)."""
+        project, arrays = self._looked_up_in
+        looked_up = []
+        for g, (u, v) in zip(arrays, project(poses), strict=True):
+            values: Any = cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            looked_up.append(values)
+        return looked_up
+
+    def _means(self, blocks: Singles, count: int) -> Floats:
+        """Means (k,) over the samples of k poses, summed in double precision."""
+        size = len(self.points)
+        if count * size == blocks.size == blocks.shape[1]:
+            return np.array([cv2.sumElems(blocks)[0] / size])
+        by_pose = blocks.reshape(count, -1)[:, :size]
+        sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
+        return np.asarray(sums[:, 0] / size)
+
     def _linearised(self, T_world_object: Floats) -> list[_Sampled]:
-        points = transform(T_world_object, self.points) + self.offsets
+        points = transform(T_world_object, self.points)
+        if self.offsets is not None:
+            points += self.offsets
         result = []
         for term in self.terms:
             y, by_world, _ = term.sensor.linearise(points)
@@ -110,8 +130,11 @@ class _SampledObjective:
 class PaperObjective(_SampledObjective):
     """Formula (4): sensors multiplied inside the integral over the object."""
 
-    def _combine(self, densities: list[Floats]) -> Floats:
-        return np.asarray(np.prod(densities, axis=0).mean(axis=-1))
+    def _values(self, poses: Floats) -> Floats:
+        product, *others = self._densities(poses)
+        for g in others:
+            product *= g
+        return self._means(product, len(poses))
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
@@ -130,8 +153,9 @@ class PaperObjective(_SampledObjective):
 class IndependentObjective(_SampledObjective):
     """The product of separate objectives: sensors as if they saw different objects."""
 
-    def _combine(self, densities: list[Floats]) -> Floats:
-        return np.asarray(np.prod([g.mean(axis=-1) for g in densities], axis=0))
+    def _values(self, poses: Floats) -> Floats:
+        means = [self._means(g, len(poses)) for g in self._densities(poses)]
+        return np.asarray(np.prod(means, axis=0))
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
