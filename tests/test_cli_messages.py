@@ -37,7 +37,8 @@ def said(capsys: pytest.CaptureFixture[str], status: int, *arguments: str) -> st
         (["run", "x.toml", "--step=0"],
          "--step: found 0; allowed: greater than or equal to 1; see mixpose run --help"),
         (["run", "x.toml", "--format", "xml"],
-         "--format: found xml; allowed: 'jsonl', 'csv', 'tum', 'bop', 'ros'; see mixpose run --help"),
+         "--format: found xml; allowed: 'jsonl', 'csv', 'tum', 'bop', 'ros'; "
+         "see mixpose run --help"),
         (["run", "x.toml", "-o"], "-o: found no value; see mixpose run --help"),
         (["rum"], "rum: no such command; did you mean 'run'? See mixpose --help"),
         (["check", "a.toml", "b.toml"],
