@@ -35,6 +35,10 @@ Floats: TypeAlias = NDArray[np.float64]
 Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 
 
+LEAST_DELAY_S = 1e-6
+"""Sensors that differ by less count as in step."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """Which frames of a recording are estimated, as by `range`: numbers, `stop` excluded."""
@@ -165,11 +169,21 @@ def _estimates(
 
 def observe(session: Session, frame_set: FrameSet) -> list[View]:
     """Extract the features of every sensor that has a frame."""
-    return [
-        View(setup.name, setup.sensor, observation_of(session, setup, frame_set.frames[setup.name]))
-        for setup in session.sensors
-        if setup.name in frame_set.frames
-    ]
+    views = []
+    for setup in session.sensors:
+        frame = frame_set.frames.get(setup.name)
+        if frame is not None:
+            observation = observation_of(session, setup, frame)
+            views.append(View(setup.name, setup.sensor, observation, _delay(frame_set, frame)))
+    return views
+
+
+def _delay(frame_set: FrameSet, frame: RawFrame) -> float:
+    """Seconds by which a sensor's frame is later than the set's time; 0 where not known."""
+    if frame.time_s is None or frame_set.time_s is None:
+        return 0.0
+    delay = frame.time_s - frame_set.time_s
+    return delay if abs(delay) > LEAST_DELAY_S else 0.0
 
 
 def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:

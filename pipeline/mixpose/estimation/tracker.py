@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.estimation.assessment import Assessment, assess
 from mixpose.estimation.flips import flipped
+from mixpose.estimation.instep import in_step
 from mixpose.estimation.labelling import are_labelled
 from mixpose.estimation.local import FINE, fit_near, free_mask
 from mixpose.estimation.multistart import NARROWING, starts_around
@@ -144,6 +145,7 @@ class Tracker:
             The track for the next frame, and the frame's estimate without its latency.
         """
         usable = [view for view in views if not view.observation.is_empty]
+        usable = in_step(usable, track, frame, time_s)
         rated = self._rated(track, frame, time_s, usable) if usable else []
         reports = {view.name: SensorReport(False) for view in views}
         if rated:
@@ -274,6 +276,8 @@ class Tracker:
     def _gazes_of(self, views: Sequence[View]) -> list[Gaze]:
         """The views' sensors side by side, kept from frame to frame."""
         sensors = [view.sensor for view in views]
+        if any(view.delay for view in views):  # they are others in every frame
+            return gazes_of(sensors, self.body)
         # a gaze holds its sensors, so that no other can come to the same place in memory
         key = tuple(map(id, sensors))
         if key not in self._gazes:

@@ -29,11 +29,14 @@ class View:
     name : str
     sensor : Sensor
     observation : Observation
+    delay : float
+        Seconds by which the sensor's frame was taken later than the common time.
     """
 
     name: str
     sensor: Sensor
     observation: Observation
+    delay: float = 0.0
 
 
 class Quadratic(NamedTuple):

@@ -9,6 +9,7 @@ from mixpose.sensors.bank import Bank, bank
 from mixpose.sensors.base import OUTSIDE, Sensor
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
+from mixpose.sensors.motion import moved_against
 from mixpose.sensors.parallel import ParallelBeam
 from mixpose.sensors.pinhole import PinholeCamera
 
@@ -29,4 +30,5 @@ __all__ = [
     "RangeSensor",
     "Sensor",
     "bank",
+    "moved_against",
 ]
