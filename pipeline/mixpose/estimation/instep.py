@@ -30,7 +30,7 @@ def in_step(views: list[View], track: Track, frame: int, time_s: float | None) -
         return views
     if not track.branches or track.misses > COASTING:
         return views
-    velocity = track.branches[0].velocity
+    velocity = track.branches[0].steady
     if velocity is None:
         return views
     elapsed = elapsed_since(track, frame, time_s)

@@ -45,6 +45,8 @@ class Branch:
     spread : (6,) float64 or None
         Standard deviations of the pose itself, where they are as large as its motion: then the
         next frame takes it as a prior, and no velocity is believed.
+    steady : (6,) float64 or None
+        Mean of the last two velocities: less of a pose's own error is in it.
     """
 
     T_world_object: Floats
@@ -52,6 +54,7 @@ class Branch:
     velocity: Floats | None
     uncertainty: Floats
     spread: Floats | None = None
+    steady: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -226,7 +229,7 @@ def follow(
     branches: list[Branch] = []
     stride = track.stride
     for T, weight, spread in found:
-        velocity, uncertainty = None, _unsteady(body)
+        velocity, steady, uncertainty = None, None, _unsteady(body)
         parent = _parent(track, T, body)
         if spread is not None and parent is not None and elapsed > 0:
             if not branches and track.frame is not None:
@@ -236,10 +239,11 @@ def follow(
             moved = twist_between(parent.T_world_object, T)
             if track.misses <= COASTING:
                 velocity = moved / elapsed
+                steady = velocity if parent.velocity is None else (velocity + parent.velocity) / 2
                 change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), _steady(body))
-        branches.append(Branch(T, weight, velocity, uncertainty, spread))
+        branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
     return Track(tuple(branches), frame, time_s, 0, noise, stride)
 
 
