@@ -28,6 +28,7 @@ from mixpose.records import SensorReport
 Floats: TypeAlias = NDArray[np.float64]
 
 MEMORY = 0.95  # per frame, of the residuals before
+FORGETTING = 0.8  # the same where they no longer seem to hold
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Assessment:
     log_evidence : float
         Logarithm of the odds for this pose against mere clutter.
     noise : Noise
-        Residuals of this frame and, fading, of those before it.
+        Residuals of this frame and, fading, of those before it, for the next frame.
     meetings : tuple of Meeting
         The pose against each sensor that has some of the body in view.
     """
@@ -107,7 +108,7 @@ def assess(
     count = max(len(views), 1)
     blind = float(len(body) * (len(views) - len(meetings)))
     information = information_of(meetings)
-    noise = (before or Noise()).joined(noise_of(meetings, free), MEMORY)
+    noise, remembered = _noises(before or Noise(), noise_of(meetings, free))
     return Assessment(
         sensors=reports,
         score=sum(math.sqrt(one.explained) for one in meetings) / count,
@@ -117,6 +118,18 @@ def assess(
         log_evidence=log_evidence(
             meetings, information, noise, free, prior or flat_prior(body, free), blind
         ),
-        noise=noise,
+        noise=remembered,
         meetings=tuple(meetings),
     )
+
+
+def _noises(before: Noise, own: Noise) -> tuple[Noise, Noise]:
+    """The noise that a frame's covariance goes by, and the one that is remembered.
+
+    As a rule both are that of the frames so far.  A frame with residuals of another kind, as where
+    two features run into each other, goes by its own, and the frames after it forget it.
+    """
+    if before.is_outdone_by(own):
+        return own, Noise(FORGETTING * before.squares, FORGETTING * before.degrees)
+    joined = before.joined(own, MEMORY)
+    return joined, joined

@@ -52,6 +52,8 @@ _TYPICAL_DEGREES = 4.0
 _LEAST_NOISE = 1e-3  # of σ_ε: float32 densities do not resolve residuals below
 _LEAST_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 _CONFIDENCE = 0.95
+_BY_CHANCE = 0.999  # frames whose residuals are larger stand on their own
+_KNOWN = 20.0  # degrees of freedom from which a noise is known well enough to say so
 ROOM = 10.0
 """Radii of the body: how far a position may be, where nothing is known before."""
 
@@ -63,9 +65,21 @@ class Noise:
     squares: float = 0.0
     degrees: float = 0.0
 
+    @property
+    def variance(self) -> float:
+        """Mean of the squares."""
+        return self.squares / max(self.degrees, 1e-12)
+
     def joined(self, other: Noise, memory: float = 1.0) -> Noise:
         """Add another noise to what is remembered of the present one."""
         return Noise(memory * self.squares + other.squares, memory * self.degrees + other.degrees)
+
+    def is_outdone_by(self, frame: Noise) -> bool:
+        """Whether a frame's residuals are larger than chance makes them."""
+        if self.degrees < _KNOWN or frame.degrees < 1:
+            return False
+        limit = float(fdtri(frame.degrees, self.degrees, _BY_CHANCE))
+        return frame.variance > limit * self.variance
 
 
 @dataclass(frozen=True)
