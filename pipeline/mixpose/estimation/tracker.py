@@ -334,5 +334,7 @@ def beliefs(rated: Sequence[Rated]) -> list[float]:
     if not rated:
         return []
     logs = np.array([one.assessment.log_evidence for one in rated])
+    if not np.isfinite(logs.max()):  # none meets anything
+        return [1.0 / len(rated)] * len(rated)
     weights = np.exp(logs - logs.max())
     return [float(w) for w in weights / weights.sum()]
