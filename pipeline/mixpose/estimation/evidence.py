@@ -43,7 +43,7 @@ Floats: TypeAlias = NDArray[np.float64]
 DETECTION = 0.75
 """P_D, probability that a feature in view is detected."""
 
-_LOG_UNSEEN = -0.7  # bodies are in view as a rule: half, for each feature that is not
+_LOG_UNSEEN = -1.2  # bodies are in view as a rule: a third, for each feature that is not
 
 _TYPICAL_NOISE = (
     0.2  # of σ_ε, what centres of blobs err by; believed only where evidence is weighed
@@ -189,11 +189,18 @@ def log_evidence(
         missed += one.unseen * _LOG_UNSEEN
     # a direction that the data leave open is as uncertain as before
     inner = _free_part(information, free) / variance + np.diag(1 / prior.spread[free] ** 2)
-    laplace = 0.5 * (len(inner) * np.log(2 * np.pi) - np.linalg.slogdet(inner)[1])
-    by_volume = gained + missed + float(laplace) + prior.log_density
+    laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
+    by_volume = gained + missed + laplace + prior.log_density
     return max(
         by_volume, gained * _redundant(meetings, free) + missed - _log_choices(meetings, free)
     )
+
+
+def _log_det(A: Floats) -> float:
+    """Logarithm of the determinant of a positive definite matrix, however ill conditioned."""
+    scale = np.sqrt(A.diagonal())
+    values = np.linalg.eigvalsh(A / scale / scale[:, None])
+    return float(np.log(np.maximum(values, 1e-12)).sum() + 2 * np.log(scale).sum())
 
 
 def _gains(one: Meeting, variance: float) -> Floats:

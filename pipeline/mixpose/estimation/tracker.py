@@ -148,20 +148,22 @@ class Tracker:
         usable = in_step(usable, track, frame, time_s)
         rated = self._rated(track, frame, time_s, usable) if usable else []
         reports = {view.name: SensorReport(False) for view in views}
+        best = next((one for one in rated if self._possible(one)), None)
         if rated:
-            reports |= rated[0].assessment.sensors
-        weights = beliefs(rated)
-        if not rated or not self._possible(rated[0]):
+            reports |= (best or rated[0]).assessment.sensors
+        if best is None:
             score = rated[0].assessment.score if rated else 0.0
             lost = Estimate(frame, time_s, self.body.name, "lost", None, None, score, reports)
             return track.missed(), lost
-        best = rated[0]
-        clear = self._sure(best) and (len(rated) == 1 or weights[1] < RIVAL)
+        weights = beliefs(rated)
+        # what is not possible by itself still casts doubt on the others
+        rivals = [weight for one, weight in zip(rated, weights, strict=True) if one is not best]
+        clear = self._sure(best) and max(rivals, default=0.0) < RIVAL
         clear = clear and self._is_turned_surely(best)
         kept = [
             Found(one.T_world_object, w, one.spread if self.options.fuse else None)
             for one, w in zip(rated, weights, strict=True)
-            if w >= _LISTED
+            if w >= _LISTED and (one is best or self._possible(one))
         ]
         estimate = Estimate(
             frame=frame,
@@ -262,10 +264,11 @@ class Tracker:
             seed=self.options.seed,
         )
         for candidate in candidates:
-            # far worse ones are rivals in name only, and are rated as the search leaves them
-            rival = candidate.evidence > candidates[0].evidence - _OUTDONE
             T = candidate.T_world_object
-            found.append(self._fit(views, T, close) if rival else T)
+            found.append(T)
+            # far worse ones are rivals in name only
+            if candidate.evidence > candidates[0].evidence - _OUTDONE:
+                found.append(self._fit(views, T, close))
         return found
 
     def _fit(self, views: Sequence[View], T: Floats, uncertainty: Floats) -> Floats:
