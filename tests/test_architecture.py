@@ -31,7 +31,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
-    "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
+    "runner": GROUND
+    | {"sensors", "density", "extraction", "objective", "estimation", "frames", "session"},
 }
 EDGE = {"cli", "__init__", "__main__"}
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mixpose.density import Observation
 from mixpose.errors import SessionError
-from mixpose.estimation import Track, Tracker
-from mixpose.extraction import extract
+from mixpose.estimation import Encounter, Expectation, Track, Tracker, predict
+from mixpose.extraction import Window, extract
 from mixpose.frames import Source, SourceSpec, open_source, pair
 from mixpose.objective import View
 from mixpose.records import (
@@ -29,6 +29,7 @@ from mixpose.records import (
 )
 
 if TYPE_CHECKING:
+    from mixpose.sensors import Sensor
     from mixpose.session import SensorSetup, Session
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -142,25 +143,97 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 def _estimates(
     session: Session, tracker: Tracker, track: Track, frames: Generator[FrameSet, None, None]
 ) -> Generator[Estimate, None, None]:
+    expectation = Expectation(tracker.body, _windowed(session), tracker.free)
+    met: Encounter | None = None
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            views = observe(session, frame_set)
-            track, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
+            track, estimate, met = _advance(session, tracker, expectation, track, frame_set, met)
             estimate = _with_silent_sensors(estimate, session.sensors)
             yield replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
 
 
-def observe(session: Session, frame_set: FrameSet) -> list[View]:
-    """Extract the features of every sensor that has a frame."""
+def _windowed(session: Session) -> dict[str, Sensor]:
+    """Cameras whose features in a part of the frame are those of the whole frame."""
+    return {
+        setup.name: setup.sensor
+        for setup in session.sensors
+        if setup.model != "lateration"
+        and setup.extract.method == "blobs"
+        and setup.extract.threshold not in ("otsu", "local")
+    }
+
+
+def _advance(
+    session: Session,
+    tracker: Tracker,
+    expectation: Expectation,
+    track: Track,
+    frame_set: FrameSet,
+    before: Encounter | None,
+) -> tuple[Track, Estimate, Encounter | None]:
+    """Estimate a frame: around the prediction if that convinces, else from all that is there.
+
+    `before` tells how the body was met in the frame before, None if it was not or poorly; and
+    likewise what is returned.
+    """
+    number, time_s = frame_set.number, frame_set.time_s
+    if before is not None:
+        windows = {
+            name: window
+            for name, window in expectation.windows(predict(track, number, time_s)).items()
+            if name in frame_set.frames and isinstance(frame_set.frames[name].data, np.ndarray)
+        }
+        if windows:
+            views = observe(session, frame_set, windows)
+            if not _fewer(views, before):
+                after, estimate = tracker.advance(track, number, time_s, views)
+                met = _encounter(expectation, views, estimate)
+                if met is not None and met.as_good_as(before):
+                    return after, estimate, met
+    views = observe(session, frame_set)
+    after, estimate = tracker.advance(track, number, time_s, views)
+    met = _encounter(expectation, views, estimate)
+    return after, estimate, met if met is not None and met.convincing else None
+
+
+def _fewer(views: Sequence[View], before: Encounter) -> bool:
+    """Whether a camera has fewer detections than it met features in the frame before."""
+    patterns = {view.name: view.observation.pattern for view in views}
+    return any(
+        isinstance(pattern, PointPattern) and len(pattern.points) < before.met.get(name, 0)
+        for name, pattern in patterns.items()
+    )
+
+
+def _encounter(
+    expectation: Expectation, views: Sequence[View], estimate: Estimate
+) -> Encounter | None:
+    if estimate.status != "ok" or estimate.T_world_object is None:
+        return None
+    return expectation.encounter(views, estimate.T_world_object)
+
+
+def observe(
+    session: Session, frame_set: FrameSet, windows: Mapping[str, Window] | None = None
+) -> list[View]:
+    """Extract the features of every sensor that has a frame, of some in a window only."""
     return [
-        View(setup.name, setup.sensor, observation_of(session, setup, frame_set.frames[setup.name]))
+        View(
+            setup.name,
+            setup.sensor,
+            observation_of(
+                session, setup, frame_set.frames[setup.name], (windows or {}).get(setup.name)
+            ),
+        )
         for setup in session.sensors
         if setup.name in frame_set.frames
     ]
 
 
-def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
+def observation_of(
+    session: Session, setup: SensorSetup, frame: RawFrame, window: Window | None = None
+) -> Observation:
     """The feature pattern of one sensor's frame, with the width of its features."""
     options = setup.extract
     pattern: Pattern
@@ -170,7 +243,7 @@ def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Obs
         # noise may take a profile below zero; cutting that off would leave a floor of noise
         pattern = frame.data
     else:
-        pattern = extract(frame.data, options, base=session.folder)
+        pattern = extract(frame.data, options, window=window, base=session.folder)
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))

@@ -92,7 +92,7 @@ def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
     options : ExtractOptions
         `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
     """
-    contours = outlines(scene.grey, scene.zero + scene.level)
+    contours = outlines(scene)
     blobs = _search(scene, contours, scene.level, options.min_area, islands=True)
     largest = math.inf if options.max_area is None else options.max_area
     return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
@@ -117,7 +117,7 @@ def _search(
         if len(contour) ** 2 < min_area or (area := filled_area(contour)) < min_area:
             continue
         if area <= SMALL_AREA_PX:
-            spots = find_spots(scene, contour, level)
+            spots = find_spots(scene, contour, area, level)
             blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
         elif (disk := _disk(scene, contour, level)) is not None:
             blobs.append(disk)
