@@ -28,11 +28,25 @@ MAY_IMPORT: dict[str, set[str]] = {
     "search": GROUND | {"sensors", "body", "density", "objective", "optimise"},
     "estimation": GROUND | {"sensors", "body", "density", "objective", "optimise", "search"},
     "frames": GROUND,
+    "pictures": GROUND
+    | {"sensors", "body", "density", "extraction", "objective", "estimation", "session"},
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
+    "checking": GROUND
+    | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "estimation", "frames", "session"},
+    "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
+}
+MAY_IMPORT["rerun_file"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "frames",
+    "poses",
+    "session",
+    "runner",
 }
 EDGE = {"cli", "__init__", "__main__"}
 

@@ -42,7 +42,10 @@ def folder(tmp_path: Path) -> Path:
         ("ranges.csv", "lateration", "detections"),
         ("profile.csv", "lateration", "profiles"),
         ("profile.npy", "lateration", "profiles"),
-        ("rtsp://camera/1", "camera", "video"),
+        ("rtsp://camera/1", "camera", "live"),
+        ("http://camera/video.mp4", "camera", "video"),
+        ("http://camera/video.mjpg", "camera", "live"),
+        ("camera:0", "camera", "live"),
     ],
 )
 def test_kind_of_source_is_recognised(
@@ -55,7 +58,7 @@ def test_kind_of_source_is_recognised(
     ("source", "sensor", "found"),
     [
         ("f1.png", "lateration", "images"),
-        ("http://camera/1", "lateration", "video"),
+        ("http://camera/1", "lateration", "live"),
         ("profile.npy", "camera", "profiles"),
     ],
 )

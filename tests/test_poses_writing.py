@@ -102,8 +102,12 @@ def test_each_frame_is_flushed_as_soon_as_it_is_written(name: str, tmp_path: Pat
         writer = FORMATS[name](stream, HEADER)
         for count, frame in enumerate((20, 21, 22), start=1):
             writer.write(replace(GOOD, frame=frame, time_s=float(frame)))
+            text = path.read_text()
+            if name == "ros":
+                assert text.count("---\n") == count
+                continue
             has_column_names = name != "tum"
-            assert len(path.read_text().splitlines()) == count + has_column_names
+            assert len(text.splitlines()) == count + has_column_names
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -131,16 +131,25 @@ def test_a_trolley_is_followed_through_unlabelled_ranges(recordings: Path) -> No
     folder = recordings / "uwb_trolley"
     session = mixpose.load_session(folder / "session.toml")
     truth = truth_of(folder / "truth.jsonl")
-    estimates = list(mixpose.run(session, selection=Selection(0, 300, 10)))
-    assert len(estimates) == 30
-    distances = [
-        float(np.linalg.norm((e.T_world_object - truth[e.frame])[:2, 3]))
-        for e in estimates
-        if e.T_world_object is not None
-    ]
-    # with identities known, least squares reaches a median of 3.2 cm over the whole recording
-    assert np.median(distances) < 0.05
+    estimates = list(mixpose.run(session, selection=Selection(0, 60)))
+    assert len(estimates) == 60
+    found = []
     for estimate in estimates:
-        if estimate.covariance is not None:
-            assert not estimate.covariance[2].any()
-            assert not estimate.covariance[:, 4].any()
+        assert estimate.T_world_object is not None
+        assert estimate.covariance is not None
+        # what is not free stays where the start has it
+        assert not estimate.covariance[2].any()
+        assert not estimate.covariance[:, 4].any()
+        angle, shift = nearest_error(estimate.T_world_object, truth[estimate.frame][None])
+        found.append((angle, shift))
+        # a pose that is wrong is not called ok
+        assert estimate.status != "ok" or (angle < 15 and shift < 0.15)
+    assert sum(estimate.status == "ok" for estimate in estimates) > 40
+    # labels known, least squares reaches medians of 2.9 degrees and 3.2 cm over the recording;
+    # here 3.1 and 3.4 over all of it, 90 % within 6.9 degrees and 5.9 cm; these first frames
+    # are worse, 90 % within 6.8 cm
+    angles, shifts = np.array(found).T
+    assert np.median(angles) < 4.5
+    assert np.median(shifts) < 0.04
+    assert np.quantile(angles, 0.9) < 9.0
+    assert np.quantile(shifts, 0.9) < 0.08

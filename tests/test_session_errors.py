@@ -61,6 +61,18 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"unit": 'unit = "mm"\nsensors = 3'}, ["sensors: unknown key", 'did you mean "sensor"?']),
     ({"object": ""}, ["points: unknown key", "a key of [object]"]),
     ({"unit": 'unit = "mm"\nstart = 3', "start": ""}, ["start: found 3", "[start]"]),
+    # keys in the wrong table
+    (
+        {"unit": 'unit = "mm"\nsigma = 3'},
+        ["sigma: unknown key; it is a key of [object] or [object.gravity] or [extract]"],
+    ),
+    ({"unit": 'unit = "mm"\nfree = ["x"]'}, ["free: unknown key; it is a key of [estimator];"]),
+    ({"unit": 'unit = "mm"\nfps = 5'}, ["fps: unknown key; it is a key of [[sensor]];"]),
+    ({"extract": "[extract]\nseed = 3"}, ["extract.seed: unknown key", "[estimator]"]),
+    (
+        {"unit": "", "extract": '[extract]\nunit = "mm"'},
+        ["extract.unit: unknown key", "the top of the file, before its first [table]"],
+    ),
     # the object
     ({"object": "[object]"}, ["object.name: missing"]),
     ({"object": '[object]\nname = ""'}, ['object.name: found ""']),
@@ -155,7 +167,7 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"estimator": '[estimator]\nfree = [["x"]]'}, ['estimator.free[0]: found ["x"]']),
     (
         {"start": "", "estimator": '[estimator]\nfree = ["x", "y", "z", "rx"]'},
-        ['estimator.free: leaves out "ry", "rz"', "[start]"],
+        ['estimator.free: leaves out "ry", "rz"', "held", "there is no [start]"],
     ),
     ({"estimator": "[estimator]\nsamples = 0"}, ["estimator.samples: found 0", "at least 2"]),
     ({"estimator": "[estimator]\nsamples = 1.5"}, ["estimator.samples: found 1.5", "an integer"]),
@@ -214,7 +226,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"left_more": 'fps = 5\ntimes = "t.csv"'}, [LEFT + "fps: stands beside times"]),
     (
         {"left_more": "sigma = 5"},
-        [LEFT + "sigma: unknown key", "[object] and [gravity] and [extract]"],
+        [
+            LEFT + "sigma: unknown key",
+            "[object] or [object.gravity] or [extract] or [sensor.extract]",
+        ],
     ),
     ({"left_more": "euler_xyz_deg = [0, 0, 0]"}, [LEFT + "euler_xyz_deg: unknown key", "[start]"]),
     ({"left_more": "range_bias = 1"}, [LEFT + "range_bias: unknown key", "model lateration"]),

@@ -180,6 +180,8 @@ def test_more_frames_than_digits_get_more_digits(tmp_path: Path) -> None:
         ('"left*.exr"', 3, "simulate writes .png"),
         ('"left.mkv"', 3, "simulate writes images, .avi, .mp4 and .csv"),
         ('"rtsp://camera/1"', 3, "simulate writes images, .avi, .mp4 and .csv"),
+        ("0", 3, "found 'camera:0'; simulate writes images, .avi, .mp4 and .csv"),
+        ('"camera:0"', 3, "simulate writes images, .avi, .mp4 and .csv"),
         ('"left.npy"', 3, "simulate writes images, .avi, .mp4 and .csv"),
     ],
 )

@@ -114,6 +114,11 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
 def twist_between(T_from: Floats, T_to: Floats) -> Floats:
     """The twist (..., 6) with ``perturb(T_from, twist) == T_to``."""
     R_difference = T_to[..., :3, :3] @ np.swapaxes(T_from[..., :3, :3], -1, -2)
+    if R_difference.ndim == 2:
+        twist = np.empty(6)
+        twist[:3] = T_to[:3, 3] - T_from[:3, 3]
+        twist[3:] = cv2.Rodrigues(R_difference)[0][:, 0]
+        return twist
     vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mixpose.session import SensorSetup, Session
 
 Floats: TypeAlias = NDArray[np.float64]
+Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ def run(
     opened: Mapping[str, Source] | None = None,
     selection: Selection = Selection(),
     T_start: Floats | None = None,
+    watch: Watch | None = None,
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
@@ -65,6 +67,10 @@ def run(
     selection : Selection
     T_start : (4, 4) array or None
         Pose to begin at in place of the session's ``[start]``.
+    watch : callable or None
+        Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
+        raw frames and the features found in them, while tracking around the body only; its time
+        is not in the latency.
 
     Yields
     ------
@@ -82,7 +88,7 @@ def run(
     if opened is None:
         opened = open_sources(session, sources or {})
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    return _estimates(session, tracker, track, frames)
+    return _estimates(session, tracker, track, frames, watch)
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
@@ -141,16 +147,24 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 
 
 def _estimates(
-    session: Session, tracker: Tracker, track: Track, frames: Generator[FrameSet, None, None]
+    session: Session,
+    tracker: Tracker,
+    track: Track,
+    frames: Generator[FrameSet, None, None],
+    watch: Watch | None,
 ) -> Generator[Estimate, None, None]:
     expectation = Expectation(tracker.body, _windowed(session), tracker.free)
     met: Encounter | None = None
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            track, estimate, met = _advance(session, tracker, expectation, track, frame_set, met)
-            estimate = _with_silent_sensors(estimate, session.sensors)
-            yield replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+            step = _advance(session, tracker, expectation, track, frame_set, met)
+            track, met = step.track, step.met
+            estimate = _with_silent_sensors(step.estimate, session.sensors)
+            estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+            if watch is not None:
+                watch(frame_set, step.views, estimate)
+            yield estimate
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
@@ -164,6 +178,15 @@ def _windowed(session: Session) -> dict[str, Sensor]:
     }
 
 
+class _Step(NamedTuple):
+    """A frame's estimate, what it was made from, and how the body was met if that convinces."""
+
+    track: Track
+    estimate: Estimate
+    views: list[View]
+    met: Encounter | None
+
+
 def _advance(
     session: Session,
     tracker: Tracker,
@@ -171,30 +194,33 @@ def _advance(
     track: Track,
     frame_set: FrameSet,
     before: Encounter | None,
-) -> tuple[Track, Estimate, Encounter | None]:
+) -> _Step:
     """Estimate a frame: around the prediction if that convinces, else from all that is there.
 
-    `before` tells how the body was met in the frame before, None if it was not or poorly; and
-    likewise what is returned.
+    `before` tells how the body was met in the frame before, None if that did not convince.
     """
-    number, time_s = frame_set.number, frame_set.time_s
+
+    def estimated(views: list[View]) -> _Step:
+        after, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
+        met = None
+        if estimate.status == "ok" and estimate.T_world_object is not None:
+            met = expectation.encounter(views, estimate.T_world_object)
+        return _Step(after, estimate, views, met if met is not None and met.convincing else None)
+
     if before is not None:
-        windows = {
-            name: window
-            for name, window in expectation.windows(predict(track, number, time_s)).items()
-            if name in frame_set.frames and isinstance(frame_set.frames[name].data, np.ndarray)
+        predictions = predict(track, tracker.body, frame_set.number, frame_set.time_s)
+        images = {
+            name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)
         }
+        windows = expectation.windows(predictions)
+        windows = {name: window for name, window in windows.items() if name in images}
         if windows:
             views = observe(session, frame_set, windows)
             if not _fewer(views, before):
-                after, estimate = tracker.advance(track, number, time_s, views)
-                met = _encounter(expectation, views, estimate)
-                if met is not None and met.as_good_as(before):
-                    return after, estimate, met
-    views = observe(session, frame_set)
-    after, estimate = tracker.advance(track, number, time_s, views)
-    met = _encounter(expectation, views, estimate)
-    return after, estimate, met if met is not None and met.convincing else None
+                step = estimated(views)
+                if step.met is not None and step.met.as_good_as(before):
+                    return step
+    return estimated(observe(session, frame_set))
 
 
 def _fewer(views: Sequence[View], before: Encounter) -> bool:
@@ -204,14 +230,6 @@ def _fewer(views: Sequence[View], before: Encounter) -> bool:
         isinstance(pattern, PointPattern) and len(pattern.points) < before.met.get(name, 0)
         for name, pattern in patterns.items()
     )
-
-
-def _encounter(
-    expectation: Expectation, views: Sequence[View], estimate: Estimate
-) -> Encounter | None:
-    if estimate.status != "ok" or estimate.T_world_object is None:
-        return None
-    return expectation.encounter(views, estimate.T_world_object)
 
 
 def observe(

@@ -40,8 +40,9 @@ def _status(arguments: list[str]) -> int:
     except typer.TyperException as error:
         if debug:
             raise
-        command = getattr(getattr(error, "ctx", None), "command_path", "mixpose")
-        return _fail(f"{error.format_message()} See {command} --help", WRONG_USAGE)
+        from mixpose.cli.usage import usage_message  # noqa: PLC0415
+
+        return _fail(usage_message(error, arguments), WRONG_USAGE)
     except (KeyboardInterrupt, typer.Abort):
         outcome = INTERRUPTED
     except OSError as error:

@@ -27,6 +27,18 @@ class Format(StrEnum):
     csv = "csv"
     tum = "tum"
     bop = "bop"
+    ros = "ros"
+
+
+class ConvertFormat(StrEnum):
+    """Formats that poses are converted to."""
+
+    jsonl = "jsonl"
+    csv = "csv"
+    tum = "tum"
+    bop = "bop"
+    ros = "ros"
+    rerun = "rerun"
 
 
 def _version(wanted: bool) -> None:
@@ -63,7 +75,10 @@ def run(
     format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
     source: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+        typer.Option(
+            metavar="NAME=PATH",
+            help="Another recording of a sensor, relative to the working folder; repeatable.",
+        ),
     ] = None,
     start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
     stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
@@ -72,13 +87,17 @@ def run(
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
     workers: Annotated[int, typer.Option(min=1, help="How many sessions are run at a time.")] = 1,
+    overlay: Annotated[
+        Path | None,
+        typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
+    ] = None,
 ) -> None:
     """Print a pose per frame."""
     from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
     from mixpose.runner import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
-    request = RunRequest(output, format.value, tuple(source or ()), selection, resume)
+    request = RunRequest(output, format.value, tuple(source or ()), selection, resume, overlay)
     if len(sessions) == 1:
         if workers > 1:
             from mixpose.cli.notices import warn  # noqa: PLC0415
@@ -92,11 +111,38 @@ def run(
 
 
 @app.command()
-def check(session: SessionFile) -> None:
-    """Read everything, estimate nothing: sensors, recordings, symmetries, expected accuracy."""
+def check(
+    session: SessionFile,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
+    ] = False,
+) -> None:
+    """Read every frame, estimate nothing: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session)
+    check_session(session, quick=quick)
+
+
+@app.command()
+def inspect(
+    session: SessionFile,
+    frame: Annotated[int, typer.Option(help="Number of the frame.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="POSES.jsonl", help="Take the pose from a run, not from this frame alone."
+        ),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """Pictures of one frame: features found, densities, pose, objective; and what to change."""
+    from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
+
+    inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
 
 
 @app.command()
@@ -170,3 +216,72 @@ def evaluate(
     from mixpose.cli.evaluate import evaluate_poses  # noqa: PLC0415
 
     evaluate_poses(poses, truth, as_json=json)
+
+
+@app.command()
+def convert(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout.")
+    ] = None,
+    format: Annotated[
+        ConvertFormat | None,
+        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun)."),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
+    ] = None,
+    object: Annotated[str | None, typer.Option(help="Only the poses of this object.")] = None,
+    only_ok: Annotated[
+        bool, typer.Option("--only-ok", help="Leave out ambiguous frames too.")
+    ] = False,
+    scene_id: Annotated[int | None, typer.Option(min=0, help="bop: the scene; 0.")] = None,
+    obj_id: Annotated[int | None, typer.Option(min=0, help="bop: the object; 1.")] = None,
+    relative_to: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR", help="bop, ros, tum: relative to a camera, not the world."),
+    ] = None,
+    session: Annotated[
+        Path | None, typer.Option(help="The session of the poses, where they do not lead to it.")
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
+    ] = None,
+) -> None:
+    """Write poses in the format of another program."""
+    from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
+
+    request = ConvertRequest(
+        output=output,
+        format=None if format is None else format.value,
+        unit=unit,
+        object=object,
+        only_ok=only_ok,
+        scene_id=scene_id,
+        obj_id=obj_id,
+        relative_to=relative_to,
+        session=session,
+        sources=tuple(source or ()),
+    )
+    convert_poses(poses, request)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON Schema of pose lines."""
+    from mixpose.poses.schema import schema_text  # noqa: PLC0415
+
+    typer.echo(schema_text(), nl=False)
+
+
+@app.command()
+def report(
+    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
+    truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
+) -> None:
+    """One page about a run: motion, accuracy, residuals, latency, frames with their poses."""
+    from mixpose.cli.report import write_report  # noqa: PLC0415
+
+    write_report(poses, truth, output)

@@ -1,83 +1,194 @@
-"""``mixpose check``: what a session says, without estimating anything."""
+"""``mixpose check``: what a session says and its recording holds, without estimating anything."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mixpose.body import symmetries
+from mixpose.checking import (
+    LookAlike,
+    Survey,
+    advice,
+    depends_on_distance,
+    expected_count,
+    image_of,
+    judge,
+    look_alikes,
+    noise_of,
+    placement_lines,
+    placement_warnings,
+    survey,
+    typical_poses,
+    with_image_sizes,
+)
+from mixpose.errors import RecordingError
 from mixpose.estimation import expected_covariance, free_mask
-from mixpose.rigid import TWIST_NAMES, transform
+from mixpose.frames import Source
+from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.runner import open_sources
 from mixpose.session import SensorSetup, Session, load_session
 
-_NOISE_OF_SIGMA = 0.2  # what centres of blobs err by, of σ_ε
+_TYPICAL_POSES = 3
+_AWAY = (1.0, 2.0, 4.0)  # times the distance at which the body fills half of one camera's image
+_LISTED = 5  # frame numbers that are named
 
 
-def check_session(path: Path) -> None:
+@dataclass
+class _Report:
+    """Lines for people, warnings last, so that they are on the screen in the end."""
+
+    lines: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def say(self, title: str, text: str) -> None:
+        self.lines.append(f"{title:<10}{text}")
+
+    def write(self) -> None:
+        for warning in self.warnings:
+            self.say("warning", warning)
+        if not self.warnings:
+            self.say("warnings", "none")
+        sys.stdout.write("\n".join(self.lines) + "\n")
+        self.lines, self.warnings = [], []
+
+
+def check_session(path: Path, *, quick: bool = False) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
+
+    Parameters
+    ----------
+    path : Path
+    quick : bool
+        Look at a few frames only instead of all.
 
     Raises
     ------
-    SessionError, RecordingError
+    SessionError
         As ``mixpose run`` would before its first frame.
+    RecordingError
+        If a recording cannot be opened, or, after all has been printed, if a frame is damaged.
     """
     session = load_session(path)
-    lines = [f"session   {session.path}, lengths in {session.unit}"]
-    lines += _object_lines(session)
     sources = open_sources(session, {})
+    report = _Report()
+    report.say("session", f"{session.path}, lengths in {session.unit}")
+    _say_object(report, session)
+    surveys: dict[str, Survey] = {}
+    with _progress(sources, quick=quick) as done:
+        for setup in session.sensors:
+            surveys[setup.name] = survey(
+                session, setup, sources[setup.name], quick=quick, done=done
+            )
     for setup in session.sensors:
-        lines.append(f"sensor    {setup.name}: {_geometry(setup)}, {_extraction(setup)}")
-        lines.append(f"          {sources[setup.name].describe()}")
-    lines += _accuracy_lines(session)
-    sys.stdout.write("\n".join(lines) + "\n")
+        _say_sensor(report, session, setup, sources[setup.name], surveys)
+    sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
+    report.warnings += placement_warnings(sized)
+    _say_accuracy(report, sized)
+    report.write()
+    damage = [text for each in surveys.values() for text in each.damage]
+    if damage:
+        more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
+        raise RecordingError(f"{damage[0]}{more}")
 
 
-def _object_lines(session: Session) -> list[str]:
+def _say_object(report: _Report, session: Session) -> None:
     body = session.body
     spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
     extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
-    lines = [f"object    {body.name}: {extent}{spread}"]
+    report.say("object", f"{body.name}: {extent}{spread}")
     alike = len(body.symmetries)
+    text = "none"
     if alike > 1:
-        lines.append(
-            f"symmetry  {alike} orientations look the same; the pose nearest to the previous one "
-            "is written"
+        text = (
+            f"{alike} orientations look the same; the pose nearest to the previous one is written"
         )
-    else:
-        lines.append("symmetry  none")
-    return lines + _near_symmetry_lines(session)
+    report.say("symmetry", text)
 
 
-def _near_symmetry_lines(session: Session) -> list[str]:
-    """A warning where the body almost maps onto itself, as far as the sensors can tell."""
-    blur = _blur_at_start(session)
-    body = session.body
-    if blur is None or blur <= 0:
-        return []
-    alike = len(symmetries(body.nodes.points, blur))
-    if alike <= len(body.symmetries):
-        return []
-    return [
-        f"warning   {alike} orientations look the same within {blur:.3g} {session.unit}, three "
-        "times the error of a feature: expect frames that are ambiguous, or move a marker"
-    ]
+def _say_sensor(
+    report: _Report,
+    session: Session,
+    setup: SensorSetup,
+    source: Source,
+    surveys: Mapping[str, Survey],
+) -> None:
+    found = surveys[setup.name]
+    report.say("sensor", f"{setup.name}: {_geometry(setup)}, {_extraction(setup)}")
+    for line in placement_lines(setup, session.unit):
+        report.say("", line)
+    total = len(found.numbers) + len(found.damage)
+    read = "all read" if found.is_whole else f"looked at {total}"
+    if found.damage:
+        read = f"{len(found.damage)} of the {total} looked at cannot be read"
+    report.say("", f"{source.describe()}; {read}" if not found.damage or found.numbers else read)
+    for text in found.damage[:_LISTED]:
+        report.say("", f"damaged: {text}")
+    where = f"sensor {setup.name!r}"
+    caution = source.caution()
+    if caution:
+        report.warnings.append(f"{where}: {caution}")
+    if all(each.is_whole for each in surveys.values()):
+        _say_missing(report, setup.name, surveys)
+    _say_features(report, session, setup, source, found)
 
 
-def _blur_at_start(session: Session) -> float | None:
-    """Three times the error of a feature at the start, in length units, in the best sensor."""
-    if session.start is None:
-        return None
-    points = transform(session.start.T_world_object, session.body.means)
-    blurs = []
-    for setup in session.sensors:
-        _, J, seen = setup.sensor.linearise(points)
-        if seen.any():
-            largest = np.linalg.norm(J[seen], axis=2).mean()
-            blurs.append(3 * setup.extract.sigma * _NOISE_OF_SIGMA / float(largest))
-    return min(blurs, default=None)
+def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> None:
+    """Frames that other sensors have."""
+    own = {*surveys[name].numbers, *surveys[name].damaged}
+    others = [each for other, each in surveys.items() if other != name]
+    known = set().union(*(each.numbers for each in others))
+    missing = sorted(known - own)
+    if missing:
+        everyone = len(known | own)
+        report.say("", f"missing: {_numbers(missing)} of the {everyone} frames of all sensors")
+    pairs = len(own & known)
+    if known and pairs < 0.5 * min(len(own), len(known)):
+        report.warnings.append(
+            f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other sensors: "
+            "frames are paired by the number that their names end in; rename the files"
+        )
+
+
+def _say_features(
+    report: _Report, session: Session, setup: SensorSetup, source: Source, found: Survey
+) -> None:
+    where, expected = f"sensor {setup.name!r}", expected_count(setup, session)
+    if found.counts is None:
+        if found.numbers and found.empty:
+            report.warnings.append(
+                f"{where}: nothing but one value in frame {_numbers(list(found.empty))}"
+            )
+        return
+    low, high = min(found.counts), max(found.counts)
+    middle = float(np.median(found.counts))
+    report.say(
+        "",
+        f"features per frame: {low} / {middle:g} / {high} (least / median / most), expected: "
+        f"{expected}",
+    )
+    judgement = judge(middle, expected)
+    if judgement is not None:
+        number = found.typical_frame
+        assert number is not None, "there are counts"
+        image = image_of(source, number)
+        count = found.counts[found.numbers.index(number)]
+        report.warnings.append(
+            f"{where}: {judgement} features, {count} in frame {number} where "
+            f"{expected} are expected: {advice(image, setup.extract, expected, session.folder)}"
+        )
+    elif found.empty:
+        report.warnings.append(f"{where}: no feature in frame {_numbers(list(found.empty))}")
+
+
+def _numbers(numbers: list[int]) -> str:
+    text = ", ".join(map(str, numbers[:_LISTED]))
+    return text if len(numbers) <= _LISTED else f"{text}, ... ({len(numbers)} frames)"
 
 
 def _geometry(setup: SensorSetup) -> str:
@@ -95,37 +206,104 @@ def _extraction(setup: SensorSetup) -> str:
     )
 
 
-def _accuracy_lines(session: Session) -> list[str]:
-    if session.start is None:
-        return ["start     none: the first pose is searched for; with one, accuracy is predicted"]
+def _say_accuracy(report: _Report, session: Session) -> None:
+    """What is in view, how accurate poses will be, and which poses look alike."""
+    if session.start is not None:
+        _say_accuracy_at(report, session, [session.start.T_world_object], "at [start]")
+        return
+    several = depends_on_distance(session)
+    for away in _AWAY if several else _AWAY[:1]:
+        poses = typical_poses(session, _TYPICAL_POSES, away=away)
+        if not poses:
+            report.say("start", "none, and no place is in view of the sensors: add [start]")
+            return
+        where = "in the middle of the sensors' common view"
+        if several:
+            middle = np.array(
+                [T[:3, :3] @ session.body.means.mean(axis=0) + T[:3, 3] for T in poses]
+            )
+            away_by = np.linalg.norm(session.sensors[0].sensor.towards(middle), axis=1).mean()
+            where = f"{float(f'{away_by:.3g}'):g} {session.unit} away"
+        if away == _AWAY[0]:
+            report.say(
+                "start",
+                f"none: the first pose is searched for; below, the body is assumed {where}, in "
+                f"{len(poses)} orientations",
+            )
+        if _say_accuracy_at(report, session, poses, where, brief=away != _AWAY[0]):
+            return
+
+
+def _say_accuracy_at(
+    report: _Report, session: Session, poses: list[Floats], where: str, *, brief: bool = False
+) -> bool:
+    """Say it for some poses; returns whether other poses look like one of them."""
     free = free_mask(session.estimator)
-    covariance, counts = expected_covariance(
-        [setup.sensor for setup in session.sensors],
-        [setup.extract.sigma for setup in session.sensors],
-        session.body,
-        session.start.T_world_object,
-        free,
+    sensors = [setup.sensor for setup in session.sensors]
+    sigmas = [setup.extract.sigma for setup in session.sensors]
+    expected = [expected_covariance(sensors, sigmas, session.body, T, free) for T in poses]
+    if not brief:
+        counts = np.median([counts for _, counts in expected], axis=0)
+        seen = ", ".join(
+            f"{setup.name} {count:g}/{len(session.body)}"
+            for setup, count in zip(session.sensors, counts, strict=True)
+        )
+        report.say("in view", f"{where}: {seen}")
+        deviations = np.median([np.sqrt(np.diag(c)) for c, _ in expected], axis=0)
+        report.say(
+            "accuracy",
+            f"one standard deviation {where}, if each feature errs by sigma: "
+            f"{_deviations(deviations, session.unit, free)}",
+        )
+    others = [
+        look_alikes(session.sensors, session.body, T, free)
+        for T, (covariance, _) in zip(poses, expected, strict=True)
+        if np.isfinite(np.diag(covariance)).all()
+    ]
+    found = [alike for alike in others if alike]
+    if found:
+        report.warnings.append(_look_alike_text(session, found, len(poses), where))
+    return bool(found)
+
+
+def _look_alike_text(session: Session, found: list[list[LookAlike]], tried: int, where: str) -> str:
+    best = min((alike[0] for alike in found), key=lambda other: other.difference)
+    orientations = f" in {len(found)} of {tried} orientations" if tried > 1 else ""
+    count = max(map(len, found))
+    poses = "another pose looks" if count == 1 else f"{count} other poses look"
+    largest = max(session.sensors, key=noise_of)
+    unit = "px" if largest.sensor.unit == "px" else session.unit
+    return (
+        f"{where}{orientations}, {poses} the same where features err by "
+        f"{noise_of(largest):.2g} {unit} (turned by {best.turn_deg:.0f} deg, "
+        f"{best.difference:.1f} standard deviations apart): expect ambiguous frames, or move a "
+        "marker out of line and plane, come closer, or add a sensor"
     )
-    seen = ", ".join(
-        f"{setup.name} {count}/{len(session.body)}"
-        for setup, count in zip(session.sensors, counts, strict=True)
-    )
-    deviations = np.sqrt(np.diag(covariance))
-    deviations[3:] = np.degrees(deviations[3:])
-    units = [session.unit] * 3 + ["deg"] * 3
-    terms = [
-        _deviation(name, value, unit)
-        for name, value, unit, is_free in zip(TWIST_NAMES, deviations, units, free, strict=True)
+
+
+def _deviations(deviations: Floats, unit: str, free: NDArray[np.bool_]) -> str:
+    scale = np.array([1.0] * 3 + [180 / np.pi] * 3)
+    units = [unit] * 3 + ["deg"] * 3
+    return ", ".join(
+        f"{name} {value:.3g} {each}" if np.isfinite(value) else f"{name} not determined"
+        for name, value, each, is_free in zip(
+            TWIST_NAMES, deviations * scale, units, free, strict=True
+        )
         if is_free
-    ]
-    return [
-        f"in view   at the start: {seen}",
-        f"accuracy  one standard deviation at the start, if each feature errs by sigma: "
-        f"{', '.join(terms)}",
-    ]
+    )
 
 
-def _deviation(name: str, value: float, unit: str) -> str:
-    if not np.isfinite(value):
-        return f"{name} not determined"
-    return f"{name} {value:.3g} {unit}"
+@contextmanager
+def _progress(sources: Mapping[str, Source], *, quick: bool) -> Iterator[Callable[[], None]]:
+    """A bar on standard error while a person is watching; yields what moves it on."""
+    if quick or not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console  # noqa: PLC0415 - only where it is shown
+    from rich.progress import Progress  # noqa: PLC0415
+
+    lengths = [source.length for source in sources.values()]
+    total = None if None in lengths else sum(length or 0 for length in lengths)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reading frames", total=total)
+        yield lambda: progress.advance(task)

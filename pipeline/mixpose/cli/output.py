@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -14,7 +14,10 @@ from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
 from mixpose.records import Estimate
 
-_FIRST_WORDS = ('{"type": "header"', "frame,time_s,object", "scene_id,im_id", "#")
+_FIRST_WORDS = (
+    *('{"type": "header"', "frame,time_s,object", "scene_id,im_id"),
+    *("# time is the frame number", "# frame "),
+)
 
 
 class Output:
@@ -29,13 +32,21 @@ class Output:
     header : Header
     append : bool
         Go on in a file of JSON lines that has its header already.
+    options : mapping
+        What the writer of the format takes besides.
     """
 
     def __init__(
-        self, path: Path | None, format_name: str, header: Header, *, append: bool
+        self,
+        path: Path | None,
+        format_name: str,
+        header: Header,
+        *,
+        append: bool = False,
+        options: Mapping[str, int | str] | None = None,
     ) -> None:
         self._path, self._format, self._header = path, format_name, header
-        self._append = append
+        self._append, self._options = append, options or {}
         self._stream: TextIO | None = None
         self._writer: PoseWriter | None = None
 
@@ -72,7 +83,7 @@ class Output:
         if self._format == "jsonl":
             self._writer = JsonlWriter(stream, self._header, resume=self._append)
         else:
-            self._writer = FORMATS[self._format](stream, self._header)
+            self._writer = FORMATS[self._format](stream, self._header, **self._options)
         self._stream = stream
         return self._writer
 
@@ -90,24 +101,53 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
     SessionError
         If it is an input of the run, or holds something else.
     """
+    beginning = _beginning(path, inputs)
+    first = beginning.partition("\n")[0]
+    numbers_only = first and all(_is_number(word) for word in first.split())
+    is_rerun = beginning.startswith("RRF") and "mixpose" in beginning
+    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only or is_rerun):
+        raise _foreign(path)
+    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
+        raise SessionError(f"-o {path}: holds poses of another origin; name another file")
+
+
+def refuse_to_overwrite_but(path: Path, inputs: Iterable[Path], mark: str) -> None:
+    """Make sure that a file about to be written is new, empty, or begins with a mark in it.
+
+    Parameters
+    ----------
+    path : Path
+    inputs : iterable of Path
+        Files that must stay.
+    mark : str
+        Words by which mixpose knows its own files of this kind.
+
+    Raises
+    ------
+    SessionError
+        If it is one of the inputs, or holds something else.
+    """
+    beginning = _beginning(path, inputs)
+    if beginning and mark not in beginning:
+        raise _foreign(path)
+
+
+def _beginning(path: Path, inputs: Iterable[Path]) -> str:
+    """The first characters of a file that may be in the way; none where no file is."""
     if not path.parent.is_dir():
         raise SessionError(f"-o {path}: there is no folder {path.parent}")
     if path.is_dir():
         raise SessionError(f"-o {path}: is a folder; name a file")
     if not path.is_file():
-        return
+        return ""
     if any(each.exists() and path.samefile(each) for each in inputs):
         raise SessionError(f"-o {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
-        beginning = stream.read(4096).decode("utf-8", errors="replace")
-    first = beginning.partition("\n")[0]
-    numbers_only = first and all(_is_number(word) for word in first.split())
-    if beginning and not (first.startswith(_FIRST_WORDS) or numbers_only):
-        raise SessionError(
-            f"-o {path}: holds something that mixpose did not write; name another file"
-        )
-    if first.startswith(_FIRST_WORDS[0]) and '"mixpose": ' not in first:
-        raise SessionError(f"-o {path}: holds poses of another origin; name another file")
+        return stream.read(4096).decode("utf-8", errors="replace")
+
+
+def _foreign(path: Path) -> SessionError:
+    return SessionError(f"-o {path}: holds something that mixpose did not write; name another file")
 
 
 def _is_number(word: str) -> bool:

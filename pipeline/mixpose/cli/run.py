@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +12,11 @@ from mixpose import __version__
 from mixpose.cli.notices import Summary, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import SessionError
+from mixpose.frames import Source
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
-from mixpose.runner import Selection, open_sources, run
+from mixpose.runner import Selection, Watch, open_sources, run
 from mixpose.session import Session, load_session
 
 
@@ -28,6 +29,7 @@ class RunRequest:
     sources: tuple[str, ...]
     selection: Selection
     resume: bool
+    overlay: Path | None = None
 
 
 def run_session(path: Path, request: RunRequest) -> None:
@@ -41,24 +43,36 @@ def run_session(path: Path, request: RunRequest) -> None:
         If the recording cannot be read; frames already estimated stay written.
     """
     session = load_session(path)
-    header = header_of(session)
+    replaced = named_sources(request.sources)
+    header = header_of(session, replaced)
     selection, T_start, resumed = request.selection, None, False
-    opened = open_sources(session, _sources(request.sources))
+    opened = open_sources(session, replaced)
     if request.output is not None and not _is_device(request.output):
         refuse_to_overwrite(request.output, _inputs(session))
     if request.resume:
+        _refuse_live(opened)
         selection, T_start, resumed = _resumed(request, header)
     warn_of_sources(opened)
     summary = Summary()
-    estimates = run(session, opened=opened, selection=selection, T_start=T_start)
-    with (
-        closing(estimates),
-        Output(request.output, request.format, header, append=resumed) as output,
-    ):
+    with ExitStack() as stack:
+        watch = _overlay(stack, session, request)
+        estimates = run(session, opened=opened, selection=selection, T_start=T_start, watch=watch)
+        stack.enter_context(closing(estimates))
+        output = Output(request.output, request.format, header, append=resumed)
+        stack.enter_context(output)
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
             summary.add(estimate)
     summary.say("" if request.output is None else f" -> {request.output}")
+
+
+def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
+    """What draws each frame, finished with the stack; None where nothing is to be drawn."""
+    if request.overlay is None:
+        return None
+    from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
+
+    return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
 
 
 def _is_device(path: Path) -> bool:
@@ -79,8 +93,8 @@ def _inputs(session: Session) -> Iterator[Path]:
             yield setup.times
 
 
-def header_of(session: Session) -> Header:
-    """The first line of the poses of a session."""
+def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Header:
+    """The first line of the poses of a session, with the recordings given in place of its own."""
     return Header(
         unit=session.unit,
         session=str(session.path),
@@ -88,11 +102,19 @@ def header_of(session: Session) -> Header:
         mixpose=__version__,
         seed=session.estimator.seed,
         symmetries={session.body.name: session.body.symmetries},
+        sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
     )
 
 
-def _sources(named: Iterable[str]) -> dict[str, str]:
+def named_sources(named: Iterable[str]) -> dict[str, str]:
+    """Recordings by sensor name, from texts like ``left=frames/``.
+
+    Raises
+    ------
+    SessionError
+        If a text is not of this form.
+    """
     sources = {}
     for text in named:
         name, separator, path = text.partition("=")
@@ -100,6 +122,15 @@ def _sources(named: Iterable[str]) -> dict[str, str]:
             raise SessionError(f"--source {text}: found no NAME=PATH, as in --source left=frames/")
         sources[name] = path
     return sources
+
+
+def _refuse_live(opened: Mapping[str, Source]) -> None:
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
+                "and name another file with -o"
+            )
 
 
 def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | None, bool]:

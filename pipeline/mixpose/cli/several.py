@@ -52,6 +52,10 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
         raise SessionError(
             f"--source {request.sources[0]}: found {len(sessions)} sessions, allowed with one only"
         )
+    if request.overlay is not None:
+        raise SessionError(
+            f"--overlay {request.overlay}: found {len(sessions)} sessions, allowed with one only"
+        )
     outputs = output_paths(sessions, request)
     commands = [
         _command(session, output, request)

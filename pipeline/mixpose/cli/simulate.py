@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mixpose.session import load_session
 from mixpose.simulation import SimulationOptions, simulate
+from mixpose.simulation.session_copy import SESSION_NAME
 
 
 def simulate_session(
@@ -36,6 +37,6 @@ def simulate_session(
                 progress=lambda done: progress.update(task, completed=done),
             )
     print(
-        f"{options.frames} frames in {folder}; play them with: mixpose run {folder / path.name}",
+        f"{options.frames} frames in {folder}; play them with: mixpose run {folder / SESSION_NAME}",
         file=sys.stderr,
     )

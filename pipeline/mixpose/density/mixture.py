@@ -59,16 +59,19 @@ class Mixture:
         bells = self._bells(away)
         weighted = away * bells[..., None]
         sampled = np.empty((*y.shape[:-1], 1 + m))
-        C = bells.sum(axis=-1)
-        sampled[..., 0] = C
-        sampled[..., 1:] = weighted.sum(axis=-2) / self.variance
-        second = weighted.swapaxes(-1, -2) @ away / self.variance[..., None]
-        second -= C[..., None, None] * np.eye(m)
-        return sampled, second / self.variance[..., None]
+        C = np.add.reduce(bells, axis=-1, out=sampled[..., 0])
+        np.divide(np.add.reduce(weighted, axis=-2), self.variance, out=sampled[..., 1:])
+        second = weighted.swapaxes(-1, -2) @ away
+        second /= self.variance[..., None]
+        diagonal = np.einsum("...kk->...k", second)
+        diagonal -= C[..., None]
+        second /= self.variance[..., None]
+        return sampled, second
 
     def _bells(self, away: Floats) -> Floats:
-        squared = (away * away).sum(axis=-1)
-        return np.asarray(np.exp(squared * (-0.5 / self.variance)) * self.heights)
+        squared = np.add.reduce(away * away, axis=-1)
+        squared *= -0.5 / self.variance
+        return np.asarray(np.exp(squared, out=squared) * self.heights)
 
 
 def mixture(pattern: PointPattern, sigma: float, centres: Floats | None, reach: float) -> Mixture:

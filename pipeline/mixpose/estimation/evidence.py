@@ -51,7 +51,8 @@ _TYPICAL_DEGREES = 4.0
 _LEAST_NOISE = 1e-3  # of σ_ε: float32 densities do not resolve residuals below
 _LEAST_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 _CONFIDENCE = 0.95
-_ROOM = 10.0  # radii of the body: how far a position may be, where nothing is known before
+ROOM = 10.0
+"""Radii of the body: how far a position may be, where nothing is known before."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ class Prior:
 
 def flat_prior(body: Body, free: NDArray[np.bool_]) -> Prior:
     """Nothing is known: anywhere within ten radii of the body, turned in any way."""
-    room = _ROOM * body.radius
+    room = ROOM * body.radius
     turns = int(free[3:].sum())
     rotations = 8 * np.pi**2 if turns == 3 else (2 * np.pi) ** turns
     volume = room ** int(free[:3].sum()) * rotations / len(body.symmetries)
@@ -120,12 +121,12 @@ def covariance_of(information: Floats, noise: Noise, free: NDArray[np.bool_]) ->
     values, vectors = np.linalg.eigh(inner * scale * scale[:, None])
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale * scale[:, None]
     variance = noise.squares / noise.degrees if noise.degrees >= 1 else _TYPICAL_NOISE**2
-    variance = max(variance, _LEAST_NOISE**2) * _enlargement(int(free.sum()), noise.degrees)
+    variance = max(variance, _LEAST_NOISE**2) * enlargement(int(free.sum()), noise.degrees)
     covariance[np.ix_(free, free)] = variance * (inverse + inverse.T) / 2
     return covariance
 
 
-def _enlargement(directions: int, degrees: float) -> float:
+def enlargement(directions: int, degrees: float) -> float:
     """Factor that makes the Gaussian 95 % ellipsoid as large as that of the F distribution."""
     if directions == 0:
         return 1.0

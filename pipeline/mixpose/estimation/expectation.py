@@ -2,7 +2,7 @@
 
 While a body is tracked, features are looked for around the prediction only.  That must never
 change what is found: a frame whose pose is not as convincing as the one before it is looked at
-again as a whole (`Encounter.as_good_as`).
+again as a whole (`mixpose.runner`).
 """
 
 from __future__ import annotations
@@ -52,9 +52,7 @@ class Encounter:
 
     def as_good_as(self, before: Encounter) -> bool:
         """Whether no sensor misses more of the body than in the frame before."""
-        return self.convincing and all(
-            count <= before.missed.get(name, 0) for name, count in self.missed.items()
-        )
+        return all(count <= before.missed.get(name, 0) for name, count in self.missed.items())
 
 
 class Expectation:

@@ -15,8 +15,9 @@ from mixpose.estimation.annealing import ladder
 from mixpose.estimation.guidance import all_grids, ascend_guided
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.settling import settle
-from mixpose.objective import View, build_objective, gazes_of
+from mixpose.objective import Gaze, View, build_objective, gazes_of, matched_objective
 from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.records import PointPattern
 from mixpose.rigid import TWIST_NAMES, perturb
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -24,6 +25,7 @@ Floats: TypeAlias = NDArray[np.float64]
 # bilinear values at n grid points per σ are up to 1/(8 n²) low along each of two axes, and squared
 _VALUE_ERROR = 4.0 / (8 * STEPS_PER_SIGMA**2)
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_VALUE_ERROR)
+_NEAR = 0.25  # value per sensor that says so: features have half their peak on average
 # tiles have four times as many
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_VALUE_ERROR / 16)
 
@@ -75,6 +77,47 @@ def fit_near(
     """
     free = free_mask(options)
     gazes = gazes_of([view.sensor for view in views], body)
+    ascent = None
+    if options.objective == "matched" and all_points(views):
+        ascent = _straight(views, body, T_start, free, gazes)
+    if ascent is None:
+        ascent = _annealed(views, body, T_start, uncertainty, options, samples, gazes)
+    T, settled = ascent.state, False
+    if options.objective == "matched" and all_grids(views):
+        T = ascend_guided(views, body, T, T_start, uncertainty, free)
+        T_settled = settle(views, body, T, free)
+        T, settled = T_settled, T_settled is not T
+    sigmas = tuple(view.observation.sigma for view in views)
+    return Fit(T, ascent.value, ascent.converged, sigmas, settled)
+
+
+def _straight(
+    views: Sequence[View],
+    body: Body,
+    T_start: Floats,
+    free: NDArray[np.bool_],
+    gazes: Sequence[Gaze],
+) -> Ascent[Floats] | None:
+    """The ascent at σ_ε alone, where most features are near a detection at the start already."""
+    sigmas = [view.observation.sigma for view in views]
+    objective = matched_objective(views, body, sigmas, T_start, gazes=gazes)
+    here = objective.linearise(T_start)
+    if here.value < _NEAR * len(views):
+        return None
+    return ascend(objective.linearise, perturb, T_start, free, FINE, here)
+
+
+def _annealed(
+    views: Sequence[View],
+    body: Body,
+    T_start: Floats,
+    uncertainty: Floats,
+    options: EstimatorOptions,
+    samples: Floats,
+    gazes: Sequence[Gaze],
+) -> Ascent[Floats]:
+    """The ascent at one blur after the other."""
+    free = free_mask(options)
     levels = ladder(views, body, T_start, np.where(free, uncertainty, 0.0), gazes)
     ascent = Ascent(T_start, 0.0, False, 0)
     for k, sigmas in enumerate(levels):
@@ -84,12 +127,12 @@ def fit_near(
             options.objective, views, body, samples, sigmas, ascent.state, last, gazes
         )
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
-    T, settled = ascent.state, False
-    if options.objective == "matched" and all_grids(views):
-        T = ascend_guided(views, body, T, T_start, uncertainty, free)
-        T_settled = settle(views, body, T, free)
-        T, settled = T_settled, T_settled is not T
-    return Fit(T, ascent.value, ascent.converged, tuple(levels[-1]), settled)
+    return ascent
+
+
+def all_points(views: Sequence[View]) -> bool:
+    """Whether all sensors gave detections."""
+    return all(isinstance(view.observation.pattern, PointPattern) for view in views)
 
 
 def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:

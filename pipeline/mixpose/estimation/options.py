@@ -21,9 +21,12 @@ class EstimatorOptions:
     samples : int
         R, samples per feature where q is integrated by sampling.
     seed : int
+    fuse : bool
+        Whether frames of single ranges take the pose before them as a prior.
     """
 
     objective: ObjectiveName = "matched"
     free: tuple[str, ...] = TWIST_NAMES
     samples: int = 1000
     seed: int = 0
+    fuse: bool = True

@@ -26,7 +26,7 @@ Floats: TypeAlias = NDArray[np.float64]
 NARROW = 0.5
 """Blur of the closer look in σ_ε: twice what centres of blobs err by."""
 
-_NOTICEABLE = 0.5
+_NOTICEABLE = 0.35
 """Squared offset in σ_ε that makes a closer look worth while."""
 
 
@@ -40,10 +40,11 @@ def sharpened(
     views: Sequence[View],
     body: Body,
     T_world_object: Floats,
+    meetings: Sequence[Meeting],
     free: NDArray[np.bool_],
     newton: NewtonOptions,
 ) -> Floats | None:
-    """The pose climbed to at a narrower blur.
+    """The pose climbed to at a narrower blur, from where the features agree without the loosest.
 
     Parameters
     ----------
@@ -51,6 +52,8 @@ def sharpened(
     body : Body
     T_world_object : (4, 4) array
         Climbed to at σ_ε.
+    meetings : sequence of Meeting
+        Of the sensors with that pose.
     free : (6,) bool
     newton : NewtonOptions
 
@@ -62,5 +65,43 @@ def sharpened(
     if not all(isinstance(view.observation.pattern, PointPattern) for view in views):
         return None
     sigmas = [NARROW * view.observation.sigma for view in views]
-    objective = matched_objective(views, body, sigmas, T_world_object, fine=True)
-    return ascend(objective.linearise, perturb, T_world_object, free, newton).state
+    T_begin = perturb(T_world_object, _agreed(meetings, free))
+    objective = matched_objective(views, body, sigmas, T_begin, fine=True)
+    return ascend(objective.linearise, perturb, T_begin, free, newton).state
+
+
+def _agreed(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> Floats:
+    """The step (6,) to where the met features agree, leaving out those that agree least.
+
+    One feature after the other is left out, each time the one without which the rest agree best,
+    until all are met tightly or too few are left.
+    """
+    met = [meeting.shares > 0 for meeting in meetings]
+    blocks = [m.J[seen] / m.sigma for m, seen in zip(meetings, met, strict=True)]
+    offsets = [m.offsets[seen] / m.sigma for m, seen in zip(meetings, met, strict=True)]
+    parts = [
+        (J[:, free], r)
+        for block, rows in zip(blocks, offsets, strict=True)
+        for J, r in zip(block, rows, strict=True)
+    ]
+    step = np.zeros(len(free))
+    fewest = -(-(int(free.sum()) + 2) // min(len(r) for _, r in parts))
+    while len(parts) >= fewest:
+        solved, squared = _solve(parts)
+        step[free] = solved
+        if squared.max() < _NOTICEABLE or len(parts) == fewest:
+            break
+        remaining = [_solve(parts[:k] + parts[k + 1 :])[1].sum() for k in range(len(parts))]
+        del parts[int(np.argmin(remaining))]
+    return step
+
+
+def _solve(parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Least-squares step, and what is left of each feature's squared offset."""
+    J, r = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    A = J.T @ J
+    A.flat[:: len(A) + 1] *= 1 + 1e-9
+    A.flat[:: len(A) + 1] += 1e-18
+    step = np.linalg.solve(A, J.T @ r)
+    left = (r - J @ step) ** 2
+    return step, np.add.reduceat(left, np.cumsum([0] + [len(part[1]) for part in parts[:-1]]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,12 @@ _STEADY_ROTATION_DEG = 1.0
 _STEADY_DISTANCE_SHARE = 0.03  # of the body's radius
 _WIDENING = 1.5  # per frame without a pose
 _WIDEST = 4.0
+_UNKNOWN_ROTATION_DEG = 30.0  # from one frame to the next, before any motion was seen
+_UNKNOWN_DISTANCE_SHARE = 1.0  # of the body's radius
+_GUESSED = 0.2  # of a displacement that was seen: what the guess before counts
+_RECALL = 0.95  # per frame, of displacements before
+_LEAST_SHARE = 0.25  # of squared displacements of features by shifts: those by turns, and reverse
+_PERSISTENCE = 1.5
 _SURPRISE = 0.02  # chance per frame that the body is somewhere else than predicted
 
 
@@ -36,12 +42,52 @@ class Branch:
         Twist per second where frames have times, else per frame.
     uncertainty : (6,) float64
         Standard deviations of the next pose about the prediction.
+    spread : (6,) float64 or None
+        Standard deviations of the pose itself, where they are as large as its motion: then the
+        next frame takes it as a prior, and no velocity is believed.
     """
 
     T_world_object: Floats
     weight: float
     velocity: Floats | None
     uncertainty: Floats
+    spread: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Stride:
+    """How far the body moves from frame to frame, learnt from uncertain poses.
+
+    Attributes
+    ----------
+    rates : (6,) float64
+        Sum of squared displacements over the time that they took.
+    count : float
+        Of displacements; fades.
+    """
+
+    rates: Floats
+    count: float
+
+    def joined(self, moved: Floats, radius: float, elapsed: float) -> Stride:
+        """Add a displacement (6,) of a body of some radius to what is remembered.
+
+        A body whose features shift by some length may also turn them by half of it, and
+        the other way round: a turn is not unlikely for not having been seen so far.
+        """
+        lever = np.repeat([1.0, radius], 3)
+        shares = _per_kind_mean((moved * lever) ** 2)
+        other = np.roll(shares, 3)
+        rate = np.maximum(shares, _LEAST_SHARE * other) / lever**2 / elapsed
+        return Stride(_RECALL * self.rates + rate, _RECALL * self.count + 1)
+
+    def variance(self, elapsed: float) -> Floats:
+        """Variance (6,) of the displacement in a time.
+
+        Steps that follow each other are alike, so that errors of prediction add up: it is wider
+        than the mean square.
+        """
+        return np.asarray(_PERSISTENCE * self.rates / self.count * elapsed)
 
 
 @dataclass(frozen=True)
@@ -60,6 +106,8 @@ class Track:
         Frames since then.
     noise : Noise
         Residuals so far.
+    stride : Stride or None
+        None before two uncertain poses.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -67,6 +115,7 @@ class Track:
     time_s: float | None = None
     misses: int = 0
     noise: Noise = field(default_factory=Noise)
+    stride: Stride | None = None
 
     def missed(self) -> Track:
         """The track after a frame without a pose."""
@@ -80,9 +129,10 @@ class Prediction:
     T_world_object: Floats
     uncertainty: Floats
     weight: float
+    is_prior: bool = False
 
 
-def predict(track: Track, frame: int, time_s: float | None) -> list[Prediction]:
+def predict(track: Track, body: Body, frame: int, time_s: float | None) -> list[Prediction]:
     """Where the branches of a track expect the body.
 
     The longer nothing was seen, the wider; velocities are believed for a few frames only.
@@ -92,6 +142,11 @@ def predict(track: Track, frame: int, time_s: float | None) -> list[Prediction]:
     predictions = []
     for branch in track.branches:
         T = branch.T_world_object
+        if branch.spread is not None:
+            moved = _stride_of(track, body, elapsed).variance(elapsed)
+            u = np.sqrt(branch.spread**2 + moved)
+            predictions.append(Prediction(T, u, branch.weight, is_prior=True))
+            continue
         if branch.velocity is not None and track.misses <= COASTING:
             T = perturb(T, branch.velocity * elapsed)
         predictions.append(Prediction(T, branch.uncertainty * widening, branch.weight))
@@ -137,10 +192,18 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     return np.asarray(alike[int(np.argmin(angles))])
 
 
+class Found(NamedTuple):
+    """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior."""
+
+    T_world_object: Floats
+    weight: float
+    spread: Floats | None = None
+
+
 def follow(
     track: Track,
     body: Body,
-    found: Sequence[tuple[Floats, float]],
+    found: Sequence[Found],
     frame: int,
     time_s: float | None,
     noise: Noise,
@@ -152,27 +215,41 @@ def follow(
     track : Track
         Before the frame.
     body : Body
-    found : sequence of ((4, 4) array, float)
-        Poses with their belief, best first.
+    found : sequence of Found
+        Best first.
     frame, time_s
         Of the frame.
     noise : Noise
         Residuals so far.
     """
     elapsed = elapsed_since(track, frame, time_s)
-    branches = []
-    for T, weight in found:
+    branches: list[Branch] = []
+    stride = track.stride
+    for T, weight, spread in found:
         velocity, uncertainty = None, _unsteady(body)
         parent = _parent(track, T, body)
-        if parent is not None and track.frame is not None and elapsed > 0:
+        if spread is not None and parent is not None and elapsed > 0:
+            if not branches and track.frame is not None:
+                moved = twist_between(parent.T_world_object, T)
+                stride = _stride_of(track, body, elapsed).joined(moved, body.radius, elapsed)
+        elif parent is not None and track.frame is not None and elapsed > 0:
             moved = twist_between(parent.T_world_object, T)
             if track.misses <= COASTING:
                 velocity = moved / elapsed
                 change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), _steady(body))
-        branches.append(Branch(T, weight, velocity, uncertainty))
-    return Track(tuple(branches), frame, time_s, 0, noise)
+        branches.append(Branch(T, weight, velocity, uncertainty, spread))
+    return Track(tuple(branches), frame, time_s, 0, noise, stride)
+
+
+def _stride_of(track: Track, body: Body, elapsed: float) -> Stride:
+    """What was learnt of the motion, or a guess that is wide enough for most."""
+    if track.stride is not None:
+        return track.stride
+    turn = np.radians(_UNKNOWN_ROTATION_DEG)
+    unknown = np.repeat([_UNKNOWN_DISTANCE_SHARE * body.radius, turn], 3)
+    return Stride(_GUESSED * unknown**2 / max(elapsed, 1e-9), _GUESSED)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
@@ -191,6 +268,12 @@ def _parent(track: Track, T: Floats, body: Body) -> Branch | None:
         for branch in track.branches
     ]
     return track.branches[int(np.argmin(away))]
+
+
+def _per_kind_mean(squares: Floats) -> Floats:
+    """The mean of the lengths and of the angles that are not zero, for all directions alike."""
+    parts = [part.sum() / max(np.count_nonzero(part), 1) for part in (squares[:3], squares[3:])]
+    return np.repeat(parts, 3)
 
 
 def _per_kind(twist: Floats) -> Floats:

@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.estimation.assessment import Assessment, assess
 from mixpose.estimation.flips import flipped
+from mixpose.estimation.labelling import are_labelled
 from mixpose.estimation.local import FINE, fit_near, free_mask
 from mixpose.estimation.multistart import NARROWING, starts_around
 from mixpose.estimation.options import EstimatorOptions
+from mixpose.estimation.ranging import fit_ranges, judge_ranges, noise_ratio
 from mixpose.estimation.sharpening import bent, sharpened
 from mixpose.estimation.track import (
     Branch,
+    Found,
     Prediction,
     Track,
     follow,
@@ -32,7 +35,7 @@ from mixpose.estimation.track import (
 )
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, SensorReport
-from mixpose.rigid import rotation_angle_deg
+from mixpose.rigid import rotation_angle_deg, twist_between
 from mixpose.search import search
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -52,12 +55,16 @@ _MOST = 0.6
 RIVAL = 0.01
 """Belief from which another pose makes a frame ambiguous."""
 
+WIDEST_TURN_DEG = 15.0
+"""95 % bound on the turn about any axis, above which ranges leave a frame ambiguous."""
+
 CONVINCING = 0.75
 """Share of the body that must be met for the prediction to be taken without looking elsewhere."""
 
 _LISTED = 0.001
 _OUTDONE = 10.0  # log odds by which a candidate of the search may be behind to be refined
 _SAME_ROTATION_DEG = 1.0
+_SAME_PEAK = 9.0  # squared distance in standard deviations of uncertain poses
 _SAME_DISTANCE_SHARE = 0.02  # of the body's radius
 
 
@@ -67,6 +74,7 @@ class Rated:
 
     T_world_object: Floats
     assessment: Assessment
+    spread: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -146,7 +154,12 @@ class Tracker:
             return track.missed(), lost
         best = rated[0]
         clear = self._sure(best) and (len(rated) == 1 or weights[1] < RIVAL)
-        kept = [(one.T_world_object, w) for one, w in zip(rated, weights) if w >= _LISTED]
+        clear = clear and self._is_turned_surely(best)
+        kept = [
+            Found(one.T_world_object, w, one.spread if self.options.fuse else None)
+            for one, w in zip(rated, weights, strict=True)
+            if w >= _LISTED
+        ]
         estimate = Estimate(
             frame=frame,
             time_s=time_s,
@@ -156,7 +169,7 @@ class Tracker:
             covariance=best.assessment.covariance,
             score=best.assessment.score,
             sensors=reports,
-            hypotheses=() if clear else tuple(Hypothesis(T, w) for T, w in kept),
+            hypotheses=() if clear else tuple(Hypothesis(T, w) for T, w, _ in kept),
         )
         noise = best.assessment.noise if clear else track.noise
         return follow(track, self.body, kept, frame, time_s, noise), estimate
@@ -165,9 +178,10 @@ class Tracker:
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> list[Rated]:
         """Distinct poses that may explain the frame, most evident first."""
-        predictions = predict(track, frame, time_s)
+        predictions = predict(track, self.body, frame, time_s)
         T_reference = predictions[0].T_world_object if predictions else self.T_start
         rated: list[Rated] = []
+        ranged = self.options.objective == "matched" and are_labelled(views, self.body)
 
         def judge(T: Floats) -> Rated:
             T = nearest_alike(T, self.body, T_reference)
@@ -175,21 +189,46 @@ class Tracker:
             return Rated(T, assess(views, self.body, T, self.free, before=track.noise, prior=prior))
 
         def consider(T: Floats) -> None:
+            if ranged:
+                T = nearest_alike(T, self.body, T_reference)
+                self._insert(rated, self._ranged(views, T, track, predictions))
+                return
             new = judge(T)
-            if self.options.objective == "matched" and bent(new.assessment.meetings):
-                T_sharp = sharpened(views, self.body, T, self.free, FINE)
-                sharp = new if T_sharp is None else judge(T_sharp)
-                new = max(new, sharp, key=lambda one: one.assessment.log_evidence)
             self._insert(rated, new)
+            if self.options.objective == "matched" and bent(new.assessment.meetings):
+                meetings = new.assessment.meetings
+                T_sharp = sharpened(views, self.body, T, meetings, self.free, FINE)
+                if T_sharp is not None:
+                    self._insert(rated, judge(T_sharp))
 
         for prediction in predictions:
-            consider(self._fit(views, prediction.T_world_object, prediction.uncertainty))
-        if not (rated and self._sure(rated[0]) and rated[0].assessment.coverage > CONVINCING):
+            T = prediction.T_world_object
+            if ranged and prediction.is_prior:
+                self._insert(rated, self._ranged(views, T, track, predictions, prediction))
+            else:
+                consider(self._fit(views, T, prediction.uncertainty))
+        if not (rated and self._convinces(rated[0])):
             for T in self._elsewhere(views, predictions):
                 consider(T)
         for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
             consider(self._fit(views, mirrored, self.start_uncertainty / NARROWING))
         return rated
+
+    def _ranged(
+        self,
+        views: Sequence[View],
+        T_start: Floats,
+        track: Track,
+        predictions: Sequence[Prediction],
+        known: Prediction | None = None,
+    ) -> Rated:
+        """The most probable pose near a start, over all labellings of ranges."""
+        found = fit_ranges(views, self.body, T_start, self.free, noise_ratio(track.noise), known)
+        T = found.T_world_object
+        prior = prior_of(T, predictions, self.body, self.free, track.misses)
+        judged = assess(views, self.body, T, self.free, before=track.noise, prior=prior)
+        judged = judge_ranges(judged, found, self.free, track.noise, prior)
+        return Rated(T, judged, np.sqrt(np.diag(judged.covariance)))
 
     def _elsewhere(self, views: Sequence[View], predictions: Sequence[Prediction]) -> list[Floats]:
         """Poses found without a prediction: around it by many starts, and everywhere."""
@@ -224,6 +263,17 @@ class Tracker:
     def _sure(self, rated: Rated) -> bool:
         return self._possible(rated) and rated.assessment.log_evidence > SURE
 
+    def _convinces(self, rated: Rated) -> bool:
+        """Whether a pose near its prediction needs no other to compare with."""
+        covered = rated.assessment.coverage > CONVINCING
+        return covered and self._sure(rated) and self._is_turned_surely(rated)
+
+    def _is_turned_surely(self, rated: Rated) -> bool:
+        """Whether ranges leave no wide sector of turns open."""
+        if rated.spread is None:
+            return True
+        return bool(1.96 * rated.spread[3:].max() < np.radians(WIDEST_TURN_DEG))
+
     def _possible(self, rated: Rated) -> bool:
         enough = rated.assessment.measurements >= int(self.free.sum())
         least = _DOUBTFUL if rated.assessment.coverage >= _MOST else POSSIBLE
@@ -232,7 +282,7 @@ class Tracker:
     def _insert(self, rated: list[Rated], new: Rated) -> None:
         """Keep a list of distinct poses, the most evident first."""
         for k, old in enumerate(rated):
-            if self._alike(old.T_world_object, new.T_world_object):
+            if self._alike(old, new):
                 if new.assessment.log_evidence > old.assessment.log_evidence:
                     rated[k] = new
                 break
@@ -240,8 +290,15 @@ class Tracker:
             rated.append(new)
         rated.sort(key=lambda one: -one.assessment.log_evidence)
 
-    def _alike(self, T_a: Floats, T_b: Floats) -> bool:
-        T_b = nearest_alike(T_b, self.body, T_a)
+    def _alike(self, a: Rated, b: Rated) -> bool:
+        T_a = a.T_world_object
+        T_b = nearest_alike(b.T_world_object, self.body, T_a)
+        if a.spread is not None:
+            # one peak of the likelihood, drawn to different priors
+            away = twist_between(T_a, T_b)[self.free]
+            inner = np.ix_(self.free, self.free)
+            widest = a.assessment.covariance[inner] + b.assessment.covariance[inner]
+            return bool(away @ np.linalg.solve(widest, away) < _SAME_PEAK)
         centre = np.append(self.body.means.mean(axis=0), 1.0)
         apart = float(np.linalg.norm((T_a - T_b) @ centre))
         near = apart < _SAME_DISTANCE_SHARE * self.body.radius

@@ -1,7 +1,7 @@
 """From what the session says to the source that reads it.
 
 A new kind of source is one file with its class, one line in `_OPENERS` and one rule in
-`_recognise`.  A camera by its index would be recognised there, beside the streams.
+`_recognise`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from mixpose.errors import RecordingError, SessionError
+from mixpose.frames.capture import is_pipe
 from mixpose.frames.csv_rows import csv_rows
 from mixpose.frames.images import IMAGE_SUFFIXES, natural_order, open_images
+from mixpose.frames.live import LiveSource, live_address
 from mixpose.frames.profiles import open_profiles
 from mixpose.frames.source import SensorKind, Source, SourceKind, SourceSpec
 from mixpose.frames.tables import open_table
@@ -23,17 +25,20 @@ from mixpose.frames.video import open_video
 # A scheme has two letters or more; one letter is a drive.
 _STREAM = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
+_SHOWN = 4  # names of files that a message lists
+
 _OPENERS: dict[SourceKind, Callable[[SourceSpec, list[str], Clock | None], Source]] = {
     "images": lambda spec, places, clock: open_images(spec, [Path(p) for p in places], clock),
     "video": lambda spec, places, clock: open_video(spec, places[0], clock),
+    "live": lambda spec, places, clock: _open_live(spec, places[0], clock),
     "detections": lambda spec, places, clock: open_table(spec, Path(places[0]), clock),
     "profiles": lambda spec, places, clock: open_profiles(spec, Path(places[0]), clock),
 }
 
 _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
     "camera": (
-        {"images", "video", "detections"},
-        "images, a video or a .csv table of detections with columns u,v",
+        {"images", "video", "live", "detections"},
+        "images, a video, a camera or a .csv table of detections with columns u,v",
     ),
     "lateration": (
         {"detections", "profiles"},
@@ -71,8 +76,17 @@ def open_source(spec: SourceSpec) -> Source:
     return _OPENERS[kind](spec, places, clock)
 
 
+def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
+    """A camera or a stream, opened when its frames are asked for."""
+    address = live_address(source)
+    assert address is not None, "recognised as live"
+    return LiveSource(address, spec.resolution, clock)
+
+
 def _recognise(spec: SourceSpec, source: str | tuple[str, ...]) -> tuple[SourceKind, list[str]]:
     """Kind of a source, and the files or the address it is read from."""
+    if isinstance(source, str) and live_address(source) is not None:
+        return "live", [source]
     if isinstance(source, str) and _STREAM.match(source):
         return "video", [source]
     kind, paths = _recognise_files(spec, source)
@@ -87,6 +101,8 @@ def _recognise_files(
     path = spec.base / source
     if source and path.is_dir():
         return "images", _images_in(path)
+    if is_pipe(str(path)):
+        return "video", [path]
     if path.is_file():
         return _kind_of_file(spec, path), [path]
     return _matches(spec, source)
@@ -99,7 +115,9 @@ def _listed(spec: SourceSpec, source: Sequence[str]) -> list[Path]:
     paths = [spec.base / name for name in source]
     for path in paths:
         if not path.is_file():
-            raise RecordingError(f"{path}: no such file, named in the source of {spec.sensor!r}")
+            raise RecordingError(
+                f"{path}: no such file, named in the source of {spec.sensor!r}; {_looked_in(path)}"
+            )
     return paths
 
 
@@ -120,13 +138,35 @@ def _matches(spec: SourceSpec, pattern: str) -> tuple[SourceKind, list[Path]]:
             f"{path}: matches {len(files)} files and none is an image (the first is "
             f"{min(files).name}); allowed are images or one other file"
         )
-    raise RecordingError(f"{path}: no such file, and nothing matches; source of {spec.sensor!r}")
+    raise RecordingError(
+        f"{path}: no such file, and nothing matches; source of {spec.sensor!r}; {_looked_in(path)}"
+    )
+
+
+def _looked_in(path: Path) -> str:
+    """The folder where a file was looked for, and what lies there instead."""
+    folder = path.parent
+    while not folder.is_dir() and folder != folder.parent:
+        folder = folder.parent
+    # dots and the working directory are spelled out: they may be the mistake
+    text = f"looked in {folder.resolve()}"
+    if folder != path.parent and not glob.has_magic(str(path.parent)):
+        return f"there is no folder {path.parent.resolve()}"
+    try:
+        names = natural_order([each for each in folder.iterdir() if each.name[:1] != "."])
+    except OSError as error:
+        return f"{text}, which cannot be read: {error.strerror}"
+    # files numbered alike are shown by their first
+    kinds = {re.sub(r"[0-9]+", "0", each.name): each.name for each in reversed(names)}
+    shown = ", ".join(list(kinds.values())[::-1][:_SHOWN])
+    more = f", ... ({len(names)} in all)" if len(names) > min(len(kinds), _SHOWN) else ""
+    return f"{text}, where there is {shown}{more}" if names else f"{text}, which is empty"
 
 
 def _images_in(folder: Path) -> list[Path]:
     images = [path for path in folder.iterdir() if _is_image(path) and path.is_file()]
     if not images:
-        raise RecordingError(f"{folder}: no images in this folder")
+        raise RecordingError(f"{folder}: no images in this folder; {_looked_in(folder / '*')}")
     return natural_order(images)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 
+from mixpose.errors import SessionError
+from mixpose.frames.live import LiveSource, join_live
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Source, selection
 from mixpose.records import FrameSet, RawFrame
@@ -16,7 +18,7 @@ def pair(
     stop: int | None = None,
     step: int = 1,
 ) -> Generator[FrameSet, None, None]:
-    """Join the frames of all sources by number, ascending.
+    """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
     A number that some sources lack yields a set without them.  Of each source only a few frames
     are in memory, decoded ahead in a thread of its own where that pays; the threads end with
@@ -37,10 +39,19 @@ def pair(
     Raises
     ------
     SessionError
-        At once, if `step` is less than 1.
+        At once, if `step` is less than 1, or live sources and recordings are mixed.
     RecordingError
         In place of the first set that a source cannot be read for.
     """
+    live = {sensor: source for sensor, source in sources.items() if isinstance(source, LiveSource)}
+    if live and len(live) < len(sources):
+        recorded = next(sensor for sensor in sources if sensor not in live)
+        raise SessionError(
+            f"source: {next(iter(live))!r} is live and {recorded!r} is a recording; allowed: all "
+            "sensors live, or none"
+        )
+    if live:
+        return join_live(live, selection(start, stop, step, 0))
     firsts = [source.first for source in sources.values()]
     first = min((number for number in firsts if number is not None), default=0)
     return _join(sources, selection(start, stop, step, first))

@@ -11,7 +11,7 @@ from mixpose.errors import SessionError
 from mixpose.records import RawFrame
 
 SensorKind: TypeAlias = Literal["camera", "lateration"]
-SourceKind: TypeAlias = Literal["images", "video", "detections", "profiles"]
+SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profiles"]
 
 # Frame numbers come from file names, which hold at most 255 digits.
 _BEYOND_ALL_NUMBERS = 10**256
@@ -26,7 +26,8 @@ class SourceSpec:
     sensor : str
         Name of the sensor; only for messages.
     source : str or tuple of str
-        A glob, a folder, a file or a stream's address (with ``://``); or a list of images.
+        A glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a
+        list of images.
     base : Path
         Folder that relative paths start from.
     kind : {"camera", "lateration"}

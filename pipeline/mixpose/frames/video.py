@@ -7,20 +7,16 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, cast
+from typing import ClassVar
 
 import cv2
-import numpy as np
 
 from mixpose.errors import RecordingError
+from mixpose.frames.capture import NotOpenedError, grab, is_stream, opened, retrieve
 from mixpose.frames.containers import container_of, missing_bytes
-from mixpose.frames.quiet import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock
-from mixpose.records import Image, RawFrame
-
-# Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
-_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
+from mixpose.records import RawFrame
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Video:
     Attributes
     ----------
     address : str
-        Path of the file, or address of a stream (with ``://``).
+        Path of the file or pipe, or address of a stream (with ``://``).
     resolution : (width, height) or None
         Size that every frame must have, in px.
     clock : callable or None
@@ -89,7 +85,7 @@ class Video:
             time_s = None
             held: RawFrame | None = None
             while number < wanted.stop or held is not None:
-                if not capture.grab():
+                if not grab(capture, self.address):
                     self._check_end(capture, number, time_s)
                     return
                 if held is not None:
@@ -106,22 +102,10 @@ class Video:
 
     def _frame(self, capture: cv2.VideoCapture, number: int, time_s: float | None) -> RawFrame:
         """Convert the grabbed frame."""
-        found, image = capture.retrieve()
-        if not found or image is None:
-            raise RecordingError(f"{self.address}: frame {number} cannot be decoded")
-        if image.ndim == 3:
-            code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
-            image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image, code)
-        expected = self.resolution or self.size
-        height, width = image.shape
-        if expected is not None and (width, height) != expected:
-            raise RecordingError(
-                f"{self.address}: frame {number} has {width}x{height} pixels, "
-                f"allowed is {expected[0]}x{expected[1]}"
-            )
+        image = retrieve(capture, self.address, number, self.resolution or self.size)
         if self.clock is not None:
             time_s = self.clock(number)
-        return RawFrame(number, time_s, cast(Image, image))
+        return RawFrame(number, time_s, image)
 
     def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
         """Complain where the video ends after `count` frames but should not."""
@@ -160,14 +144,14 @@ class Video:
 
 
 def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
-    """Open a video to learn its size and length; an address with ``://`` is left for later.
+    """Open a video to learn its size and length; a stream or a pipe is left for later.
 
     Raises
     ------
     RecordingError
         If it does not open.
     """
-    if "://" in address:
+    if is_stream(address):
         return Video(address, spec.resolution, clock, size=None, promised=None, missing=0)
     with _opened(address) as capture:
         width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
@@ -188,24 +172,18 @@ def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
 
 @contextmanager
 def _opened(address: str) -> Iterator[cv2.VideoCapture]:
-    """A capture that is released at the end; grey videos keep their depth."""
-    quieten_opencv()
-    capture = cv2.VideoCapture(address)
+    """A capture of a file, a pipe or a stream; why a file does not open is told from its bytes."""
     try:
-        if not capture.isOpened():
-            raise RecordingError(_unopened(address))
-        tag = np.int32(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).tobytes()
-        if tag in _GREY_FORMATS:
-            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
-        yield capture
-    finally:
-        capture.release()
+        with opened(address) as capture:
+            yield capture
+    except NotOpenedError as error:
+        if is_stream(address):
+            raise
+        raise RecordingError(_unopened(address)) from error
 
 
 def _unopened(address: str) -> str:
     """Why a video does not open, as far as that can be told."""
-    if "://" in address:
-        return f"{address}: the stream does not open"
     try:
         container, cut = container_of(Path(address)), missing_bytes(Path(address))
     except OSError as error:

@@ -9,7 +9,7 @@ without the terms that can make it indefinite).  Order and axes of the six numbe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +36,7 @@ class View:
     observation: Observation
 
 
-@dataclass(frozen=True)
-class Quadratic:
+class Quadratic(NamedTuple):
     """Second-order model of an objective at a pose: value + gᵀδ − ½ δᵀCδ.
 
     Attributes
@@ -88,12 +87,12 @@ def facing(
 
 
 def pose_jacobian(by_world: Floats, T_world_object: Floats, points: Floats) -> Floats:
-    """Chain the Jacobian (n, m, 3) by world points into (n, m, 6) by the twist of the pose.
+    """Chain the Jacobian (..., n, m, 3) by world points into (..., n, m, 6) by the pose's twist.
 
     A turn ω about the object's origin moves R z by ω × R z, and a · (ω × x) = ω · (x × a).
     """
-    arms = points @ T_world_object[:3, :3].T
-    x, y, z = arms[:, 0, None], arms[:, 1, None], arms[:, 2, None]
+    arms = points @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
+    x, y, z = arms[..., 0, None], arms[..., 1, None], arms[..., 2, None]
     a, b, c = by_world[..., 0], by_world[..., 1], by_world[..., 2]
     J = np.empty((*by_world.shape[:-1], 6))
     J[..., :3] = by_world

@@ -7,8 +7,7 @@ one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +23,7 @@ _LIFT[[1, 5, 6], [2, 0, 1]] = 1.0  # x ↦ −[x]× as a matrix of nine rows
 _LIFT[[2, 3, 7], [1, 2, 0]] = -1.0
 
 
-@dataclass(frozen=True)
-class Projected:
+class Projected(NamedTuple):
     """A body in L sensors at one pose.
 
     Attributes

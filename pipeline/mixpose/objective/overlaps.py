@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +14,7 @@ Floats: TypeAlias = NDArray[np.float64]
 _NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
 
 
-@dataclass(frozen=True)
-class Overlap:
+class Overlap(NamedTuple):
     """Inner products of a predicted mixture h with itself and its derivatives by the pose.
 
     Attributes
@@ -29,12 +27,15 @@ class Overlap:
         ⟨∂h, ∂h⟩.
     second : (..., 6, 6) array
         Second derivative of the norm, without those of the projection.
+    apart : bool
+        Whether no features overlap, so that derivatives of the norm are zero.
     """
 
     norm: Any
     half_gradient: Floats
     gram: Floats
     second: Floats
+    apart: bool = False
 
 
 def overlap_terms(y: Floats, J: Floats, weights: Floats, variance: float) -> Overlap:
@@ -106,7 +107,7 @@ def overlaps_of_few(y: Floats, J: Floats, weights: Floats, variances: Floats) ->
     if np.count_nonzero(together) <= L * n:
         gram = flat.swapaxes(1, 2) @ flat * (tops * scale)[:, None, None]
         norm = tops * (weights * weights).sum(axis=1)
-        return Overlap(norm, np.zeros((L, 6)), gram, np.zeros((L, 6, 6)))
+        return Overlap(norm, np.zeros((L, 6)), gram, np.zeros((L, 6, 6)), apart=True)
     bells = np.exp(exponents) * tops[:, None, None]
     pull = (bells[..., None] * away * weights[:, None, :, None]).sum(axis=2) * -scale[:, None, None]
     half_gradient = (pull.reshape(L, 1, n * m) @ flat)[:, 0]

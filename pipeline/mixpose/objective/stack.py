@@ -21,7 +21,6 @@ from mixpose.sensors import Sensor
 Floats: TypeAlias = NDArray[np.float64]
 
 _FEW = 40  # features up to which all pairs at once are faster than those that overlap
-_TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -103,35 +102,52 @@ class Stack:
         at = self.gaze.project(T_world_object)
         sampled, second = self.look_up(at.y)
         overlap = self.overlaps(at)
+        L = len(self.terms)
         # a sensor that sees no feature has neither product nor norm
-        norm = np.maximum(overlap.norm, _TINY)
-        L = len(norm)
+        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
         flat = (at.J * at.weights[..., None, None]).reshape(L, -1, 6)
-        C = sampled[..., 0]
-        product = (at.weights * C).sum(axis=1)
+        C = sampled[..., 0] * at.weights
+        product = np.add.reduce(C, axis=1)
         by_pose = (sampled[..., 1:].reshape(L, 1, -1) @ flat)[:, 0]
         amplitude = product / norm
-        half = overlap.half_gradient
-        rest = by_pose - amplitude[:, None] * half
         strength = 2 * self._scales * amplitude
-        level = strength * amplitude
-        hessian = None
-        if second is not None:
-            # of c²/n, with a = c/n: 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n
-            by_amplitude = (rest - amplitude[:, None] * half) / norm[:, None]
-            bend = (strength[:, None, None] * flat).swapaxes(1, 2) @ (second @ at.J).reshape(
-                L, -1, 6
-            )
-            hessian = (0.5 * level[:, None, None] * overlap.second - bend).sum(axis=0)
-            hessian -= ((2 * self._scales * norm)[:, None] * by_amplitude).T @ by_amplitude
+        value = float(self._scales @ (product * amplitude))
+        rest = by_pose
+        if not overlap.apart:
+            rest = by_pose - amplitude[:, None] * overlap.half_gradient
+        hessian = self._hessian(at, flat, second, overlap, rest, amplitude, norm)
         if self._mixtures is not None:
             drawn = ((strength / self.variances)[:, None] * C)[..., None, None] * at.J
-            curvature = flat.reshape(-1, 6).T @ drawn.reshape(-1, 6)
+            curvature = at.J.reshape(-1, 6).T @ drawn.reshape(-1, 6)
         else:
+            half = overlap.half_gradient
             across = half[:, :, None] * half[:, None, :] / norm[:, None, None]
-            curvature = (level[:, None, None] * (overlap.gram - across)).sum(axis=0)
-        value = float(self._scales @ (product * amplitude))
+            level = (strength * amplitude)[:, None, None]
+            curvature = (level * (overlap.gram - across)).sum(axis=0)
         return Quadratic(value, strength @ rest, curvature, hessian)
+
+    def _hessian(
+        self,
+        at: Projected,
+        flat: Floats,
+        second: Floats | None,
+        overlap: Overlap,
+        rest: Floats,
+        amplitude: Floats,
+        norm: Floats,
+    ) -> Floats | None:
+        """Minus the second derivative of Σ ω c²/n: with a = c/n, 2 n ∇a∇aᵀ + 2 a ∇²c − a² ∇²n."""
+        if second is None:
+            return None
+        by_norm = rest if overlap.apart else rest - amplitude[:, None] * overlap.half_gradient
+        strength = 2 * self._scales * amplitude
+        bent = (strength[:, None, None, None] * second) @ at.J
+        hessian = -(flat.reshape(-1, 6).T @ bent.reshape(-1, 6))
+        hessian -= ((2 * self._scales / norm)[:, None] * by_norm).T @ by_norm
+        if not overlap.apart:
+            level = self._scales * amplitude**2
+            hessian += (level[:, None, None] * overlap.second).sum(axis=0)
+        return np.asarray(hessian)
 
 
 def _joined(parts: Sequence[Density | Atlas | Mixture]) -> Mixture | None:

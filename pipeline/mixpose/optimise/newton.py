@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,12 +80,20 @@ class Ascent(Generic[State]):
     iterations: int
 
 
+class _Inner(NamedTuple):
+    """Directions that may change, as a mask and as rows and columns."""
+
+    free: NDArray[np.bool_]
+    square: tuple[NDArray[Any], ...]
+
+
 def ascend(
     model: Callable[[State], Model],
     move: Callable[[State, Floats], State],
     start: State,
     free: NDArray[np.bool_],
     options: NewtonOptions = NewtonOptions(),
+    at_start: Model | None = None,
 ) -> Ascent[State]:
     """Climb to a maximum near the start.
 
@@ -99,14 +107,17 @@ def ascend(
     free : (n,) bool
         Directions that may change.
     options : NewtonOptions
+    at_start : Model or None
+        The model at the start, where it is at hand.
 
     Returns
     -------
     Ascent
         The best state seen; `converged` is false when the iterations ran out.
     """
-    state, here, damping = start, model(start), options.damping
-    step, gain = _step(here, free, damping)
+    inner = None if free.all() else _Inner(free, np.ix_(free, free))
+    state, here, damping = start, at_start or model(start), options.damping
+    step, gain = _step(here, inner, damping)
     for iteration in range(1, options.iterations):
         if gain <= options.tolerance * abs(here.value):
             # so near, the model is right: its last step is taken unseen
@@ -114,7 +125,7 @@ def ascend(
         candidate = move(state, step)
         there = model(candidate)
         next_damping = max(damping / 10, 1e-9)
-        next_step, next_gain = _step(there, free, next_damping)
+        next_step, next_gain = _step(there, inner, next_damping)
         close = gain <= options.value_error * abs(here.value)
         if there.value > here.value or (close and next_gain < gain):
             state, here, damping, step, gain = candidate, there, next_damping, next_step, next_gain
@@ -122,33 +133,29 @@ def ascend(
         damping = max(10 * damping, _HELD_BACK)
         if damping > _STUCK:
             return Ascent(state, here.value, close, iteration)
-        step, gain = _step(here, free, damping)
+        step, gain = _step(here, inner, damping)
     return Ascent(state, here.value, False, options.iterations)
 
 
-def _step(here: Model, free: NDArray[np.bool_], damping: float) -> tuple[Floats, float]:
+def _step(here: Model, inner: _Inner | None, damping: float) -> tuple[Floats, float]:
     """Damped Newton step and the gain that the model expects of it."""
     C, g, hessian = here.curvature, here.gradient, here.hessian
-    everything = bool(free.all())
-    if not everything:
-        inner = np.ix_(free, free)
-        C, g = C[inner], g[free]
-        hessian = None if hessian is None else hessian[inner]
+    if inner is not None:
+        C, g = C[inner.square], g[inner.free]
+        hessian = None if hessian is None else hessian[inner.square]
+    if hessian is not None and _is_definite(hessian - _LEAST_CURVATURE * C):
+        C = hessian
     diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
     floor = max(float(diagonal.max(initial=0.0)) * 1e-12, _TINY)
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, floor))
-    scales = scale[:, None] * scale
-    if hessian is not None and _is_definite((hessian - _LEAST_CURVATURE * C) * scales):
-        C = hessian
-    A = C * scales
-    A.flat[:: len(g) + 1] += damping + 1e-12
-    partial = scale * _solved(A, scale * g)
-    gain = float(g @ partial - 0.5 * partial @ C @ partial)
-    if everything:
+    A = C.copy()
+    A.flat[:: len(g) + 1] += (damping + 1e-12) * np.maximum(diagonal, floor)
+    partial = _solved(A, g)
+    gain = float(partial @ (g - 0.5 * (C @ partial)))
+    if inner is None:
         return partial, gain
-    step = np.zeros(len(free))
-    step[free] = partial
+    step = np.zeros(len(inner.free))
+    step[inner.free] = partial
     return step, gain
 
 
@@ -160,6 +167,6 @@ def _solved(A: Floats, b: Floats) -> Floats:
     return np.asarray(np.linalg.solve(A, b) if failure else x)
 
 
-def _is_definite(scaled: Floats) -> bool:
-    """Whether a matrix, scaled to a diagonal near 1, is positive definite."""
-    return len(scaled) > 0 and bool(dpotrf(scaled)[1] == 0)
+def _is_definite(A: Floats) -> bool:
+    """Whether a symmetric matrix is positive definite."""
+    return len(A) > 0 and bool(dpotrf(A)[1] == 0)

@@ -17,10 +17,10 @@ COLUMNS = "scene_id,im_id,obj_id,score,R,t,time"
 class BopWriter:
     """Writes one row per frame that has a pose; lost frames are left out.
 
-    R (row by row) and t (mm) map object to *world* coordinates.  The toolkit takes them for
-    object to camera, so let the camera be the world where its scores are wanted.  `time` is how
+    R (row by row) and t (mm) are those of `T_world_object`.  The toolkit takes them for object to
+    camera: give it estimates that are relative to one (`estimates.relative_to`).  `time` is how
     long the estimate took in seconds, as BOP has it, or -1 where that was not measured.  BOP
-    numbers its objects: the first name that occurs is 1, the next 2.
+    numbers its objects: the first name that occurs is `obj_id`, the next one more.
 
     Parameters
     ----------
@@ -29,12 +29,17 @@ class BopWriter:
     header : Header
     scene_id : int
         Written into every row.
+    obj_id : int
+        Number of the first object.
     """
 
-    def __init__(self, stream: TextIO, header: Header, *, scene_id: int = 0) -> None:
+    def __init__(
+        self, stream: TextIO, header: Header, *, scene_id: int = 0, obj_id: int = 1
+    ) -> None:
         self._stream = stream
         self._mm_per_unit = 1000.0 / UNITS_PER_METRE[header.unit]
         self._scene_id = scene_id
+        self._first_obj_id = obj_id
         self._obj_ids: dict[str, int] = {}
         self._stream.write(COLUMNS + "\n")
         self._stream.flush()
@@ -42,7 +47,7 @@ class BopWriter:
     def write(self, estimate: Estimate) -> None:
         """Write the row of one frame and flush it."""
         require_finite(estimate)
-        obj_id = self._obj_ids.setdefault(estimate.object, len(self._obj_ids) + 1)
+        obj_id = self._obj_ids.setdefault(estimate.object, self._first_obj_id + len(self._obj_ids))
         T = pose_of(estimate)
         if T is None:
             return

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Protocol, TextIO
+from typing import Protocol
 
 from mixpose.poses.bop import BopWriter
 from mixpose.poses.csvtable import CsvWriter
-from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
+from mixpose.poses.ros import RosWriter
 from mixpose.poses.tum import TumWriter
 from mixpose.records import Estimate
 
@@ -23,9 +23,11 @@ class PoseWriter(Protocol):
         """Write what is still due and flush; the stream stays open."""
 
 
-FORMATS: Mapping[str, Callable[[TextIO, Header], PoseWriter]] = {
+# each is called with a text stream and a `Header`; BOP and ROS have options of their own
+FORMATS: Mapping[str, Callable[..., PoseWriter]] = {
     "jsonl": JsonlWriter,
     "csv": CsvWriter,
     "tum": TumWriter,
     "bop": BopWriter,
+    "ros": RosWriter,
 }

@@ -32,6 +32,9 @@ class Header:
     seed : int
     symmetries : mapping of object name to (n, 4, 4) array
         Motions T_object_object that map the object's features onto themselves, identity included.
+    sources : mapping of str to str
+        Recordings given in place of the session's, by sensor name; the line has them only where
+        there are any.
     sensors : tuple of str
         Names of all sensors of the session, in its order.  Only the CSV table needs them, for
         its columns; they are not written into JSON lines.
@@ -43,6 +46,7 @@ class Header:
     mixpose: str
     seed: int
     symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
+    sources: Mapping[str, str] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
 
 

@@ -57,7 +57,7 @@ class JsonlWriter:
 
 
 def _header_line(header: Header) -> dict[str, Any]:
-    return {
+    line: dict[str, Any] = {
         "type": "header",
         "format": FORMAT,
         "version": VERSION,
@@ -69,6 +69,9 @@ def _header_line(header: Header) -> dict[str, Any]:
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
     }
+    if header.sources:
+        line["sources"] = dict(header.sources)
+    return line
 
 
 def _pose_line(estimate: Estimate) -> dict[str, Any]:
@@ -144,6 +147,36 @@ def read_poses(path: str | Path) -> PoseFile:
     return _parse(path, _read_bytes(path))
 
 
+def read_unfinished_poses(path: str | Path) -> tuple[PoseFile, bool]:
+    """Read a poses file that a run may still be writing, or was interrupted in.
+
+    Returns
+    -------
+    poses : PoseFile
+        Without a last line that was cut off.
+    cut : bool
+        Whether there was one.
+
+    Raises
+    ------
+    RecordingError
+        As `read_poses`, for every line but a last one that was cut off.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    whole = data.rfind(b"\n") + 1
+    cut = whole > 0 and not _is_json(data[whole:])
+    return _parse(path, data[:whole] if cut else data), cut
+
+
+def _is_json(line: bytes) -> bool:
+    try:
+        json.loads(line.strip() or b"{}")
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
 def resume_point(path: str | Path, header: Header) -> int | None:
     """Find the frame that an interrupted run wrote last, and drop a half-written line after it.
 
@@ -163,7 +196,7 @@ def resume_point(path: str | Path, header: Header) -> int | None:
     Raises
     ------
     SessionError
-        If the file is of another session, seed, unit or version of mixpose.
+        If the file is of another session, seed, unit, recording or version of mixpose.
     RecordingError
         If the file is not a poses file; it is left as it is.
     """
@@ -197,6 +230,18 @@ def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> Non
                 f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
                 f"{line[key]!r}; leave out --resume to start afresh, or name another file with -o"
             )
+    before, now = (_sources_text(each.get("sources")) for each in (found, line))
+    if before != now:
+        raise SessionError(
+            f"--resume: {path} was written with {before}, this run has {now}; give the same, or "
+            "leave out --resume to start afresh, or name another file with -o"
+        )
+
+
+def _sources_text(sources: object) -> str:
+    if not isinstance(sources, dict) or not sources:
+        return "no --source"
+    return " ".join(f"--source {name}={sources[name]}" for name in sorted(sources))
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -84,30 +84,35 @@ class PinholeBank:
         self._K = K[:, None, :2, :2]
         self._K_transposed = K[:, :2, :2].swapaxes(1, 2).copy()
         self._centre = K[:, None, :2, 2]
-        self._lower = np.array([camera.lower for camera in cameras])[:, None]
-        self._upper = np.array([camera.upper for camera in cameras])[:, None]
+        self._middle, self._half = _images(cameras)
         self._lens = _lenses(cameras)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `Bank.linearise`."""
-        points = (self._rows @ points_world.T + self._t).reshape(self._count, 3, -1)
+        points = self._rows @ points_world.T
+        points += self._t
+        points = points.reshape(self._count, 3, -1)
         depth = points[:, 2]
-        visible = depth > NEAREST
-        inverse_depth = 1.0 / (depth if visible.all() else np.where(visible, depth, 1.0))
-        xy = np.swapaxes(points[:, :2] * inverse_depth[:, None], 1, 2)
+        in_front = depth > NEAREST
+        everything = np.count_nonzero(in_front) == in_front.size
+        inverse_depth = 1.0 / (depth if everything else np.where(in_front, depth, 1.0))
+        xy = (points[:, :2] * inverse_depth[:, None]).swapaxes(1, 2)
         M = self._K * inverse_depth[..., None, None]
         lens = self._lens
         ideal = xy
         if lens is not None:
-            visible &= (xy * xy).sum(axis=2) < lens.radius_limit**2
+            in_front &= (xy * xy).sum(axis=2) < lens.radius_limit**2
             # polynomials of huge radii overflow; hidden points are overwritten anyway
-            ideal = np.where(visible[..., None], xy, 0.0)
+            ideal = np.where(in_front[..., None], xy, 0.0)
             xy = lens.apply(ideal)
             M = M @ lens.derivative(ideal)
-        y = xy @ self._K_transposed + self._centre
+        y = xy @ self._K_transposed
+        y += self._centre
         J = M @ (self._upper_rows - ideal[..., None] * self._last_row)
-        visible &= ((y >= self._lower) & (y <= self._upper)).all(axis=2)
-        return _hidden(y, J, visible)
+        inside = np.abs(y - self._middle) <= self._half
+        if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
+            return y, J, in_front
+        return _hidden(y, J, in_front & inside.all(axis=2))
 
 
 def _hidden(y: Floats, J: Floats, visible: Mask) -> tuple[Floats, Floats, Mask]:
@@ -116,6 +121,16 @@ def _hidden(y: Floats, J: Floats, visible: Mask) -> tuple[Floats, Floats, Mask]:
         y[~visible] = OUTSIDE
         J[~visible] = 0.0
     return y, J, visible
+
+
+def _images(cameras: Sequence[PinholeCamera]) -> tuple[Floats, Floats]:
+    """Middle and half size (L, 1, 2) of the images; infinite where a resolution is unknown."""
+    lower = np.array([camera.lower for camera in cameras])[:, None]
+    upper = np.array([camera.upper for camera in cameras])[:, None]
+    bounded = np.isfinite(upper)
+    middle = np.zeros_like(upper)
+    middle[bounded] = (lower[bounded] + upper[bounded]) / 2
+    return middle, np.where(bounded, upper - middle, np.inf)
 
 
 def _is_tilted(camera: PinholeCamera) -> bool:

@@ -14,7 +14,7 @@ from mixpose.session.calibration_yaml import (
 )
 from mixpose.session.intrinsics import CameraModel, Intrinsics
 from mixpose.session.messages import BadKeyError, in_file
-from mixpose.session.schema import CalibrationTable
+from mixpose.session.schema_sensors import CalibrationTable
 from mixpose.session.text_files import as_text, read_bytes
 
 

@@ -10,7 +10,7 @@ import cv2
 from mixpose.session.calibration_yaml import model_of_distortion
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, nearest, under
-from mixpose.session.schema import CalibrationTable
+from mixpose.session.schema_sensors import CalibrationTable
 
 # What OpenCV's samples and common calibration programs call their nodes, tried in order.
 MATRIX_NODES = ("camera_matrix", "Camera_Matrix", "K", "M", "cameraMatrix")

@@ -8,7 +8,7 @@ from mixpose.rigid import Floats
 from mixpose.session.arrays import resolution
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, found, one_of, under
-from mixpose.session.schema import CalibrationTable
+from mixpose.session.schema_sensors import CalibrationTable
 
 # Kalibr calls them radtan and equidistant, ROS the others; all are OpenCV's coefficients.
 _MODELS: dict[str, CameraModel] = {

@@ -13,10 +13,10 @@ from mixpose.session.arrays import is_number, numbers
 from mixpose.session.markers import Markers, read_markers
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
+from mixpose.session.values import SIGMA_ALLOWED
 
 FEWEST_FEATURES = 3
 
-_SIGMA = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
 _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 
 
@@ -124,10 +124,10 @@ def covariances(sigma: Any, count: int) -> Floats:
         _check_ambiguous(sigma, count)
         return np.repeat(_covariance(sigma)[None], count, axis=0)
     if not isinstance(sigma, list) or not sigma:
-        raise BadKeyError(found(sigma, _SIGMA))
+        raise BadKeyError(found(sigma, SIGMA_ALLOWED))
     if len(sigma) != count:
         text = f"found {len(sigma)} items for {count} features"
-        raise BadKeyError(f"{text}; allowed: {_SIGMA}")
+        raise BadKeyError(f"{text}; allowed: {SIGMA_ALLOWED}")
     return _one_each(sigma)
 
 
@@ -166,7 +166,7 @@ def _covariance(sigma: Any) -> Floats:
     if is_number(sigma):
         sigma = [sigma] * 3
     elif not isinstance(sigma, list):
-        raise BadKeyError(found(sigma, _SIGMA))
+        raise BadKeyError(found(sigma, SIGMA_ALLOWED))
     if any(isinstance(item, list) for item in sigma):
         return _positive(numbers(sigma, (3, 3), "a 3x3 covariance, [sx, sy, sz] or a number"))
     deviations = numbers(sigma, (3,), "three numbers [sx, sy, sz], a 3x3 covariance or a number")

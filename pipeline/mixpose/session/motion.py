@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.rigid import Floats, from_parts, is_rigid, nearest_rigid
 from mixpose.session.messages import BadKeyError, one_of
-from mixpose.session.schema import Placement
+from mixpose.session.schema_common import Placement
 
 # A rotation written with four decimals misses R Rᵀ = 1 by up to 2·√3·0.5e-4.
 ROUNDING = 2e-4

@@ -98,7 +98,8 @@ def _estimator(table: EstimatorTable, start: Start | None) -> EstimatorOptions:
     held = [name for name in TWIST_NAMES if name not in table.free]
     if held and start is None:
         raise BadKeyError(
-            f"leaves out {one_of(held)}, which stay as [start] has them; add [start] or free them",
+            f"leaves out {one_of(held)}, which are held where [start] has them, and there is no "
+            "[start]; add one with the pose they are held at, or leave free out to estimate all",
             "free",
         )
-    return EstimatorOptions(table.objective, table.free, table.samples, table.seed)
+    return EstimatorOptions(table.objective, table.free, table.samples, table.seed, table.fuse)

@@ -1,305 +1,192 @@
-"""The tables and keys of a session file.
+"""The tables and keys of a session file: what `docs/session.md` is made from.
 
-Each key's description is what an error message says is allowed, so it is written for the user.
+The description of a key is what is allowed, and what an error message says; the docstring below
+it is what the key means, in which unit, with an example.  Both are written for the user.
 What depends on several keys at once is checked where they are put together.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, get_args
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    GetCoreSchemaHandler,
-    PlainValidator,
-)
-from pydantic_core import core_schema
+from pydantic import Field, PlainValidator
 
 from mixpose.body import Spread
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
-from mixpose.session.arrays import LARGEST, RESOLUTION_FORM, is_number, numbers
-from mixpose.session.arrays import resolution as resolution_of
-from mixpose.session.intrinsics import MATRIX_FORM
-from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
+from mixpose.session.messages import one_of
+from mixpose.session.schema_common import ExtractTable, Number, Placement, Table, Text
+from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
-
-EXTRACT_METHODS = ("blobs", "corners", "intensity")
-THRESHOLDS = ("auto", "otsu", "local")
-
-_FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
-_METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
-_THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
-
-
-@dataclass(frozen=True)
-class ArrayOf:
-    """Annotation of a key that holds nested lists of numbers, see `arrays.numbers`."""
-
-    shape: tuple[int | None, ...]
-    description: str
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
-        return core_schema.no_info_plain_validator_function(self.read)
-
-    def read(self, value: Any) -> Floats:
-        """Read what the file holds."""
-        return numbers(value, self.shape, self.description)
-
-
-def _sensor_name(name: str) -> str:
-    if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
-        raise BadKeyError(
-            found(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
-        )
-    return name
-
-
-def _method(value: Any) -> str:
-    if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
-        return value
-    raise BadKeyError(found(value, _METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
-
-
-def _threshold(value: Any) -> str | float:
-    if isinstance(value, str) and value in THRESHOLDS:
-        return value
-    if is_number(value):
-        return float(value)
-    raise BadKeyError(found(value, _THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
-
-
-def _source(value: Any) -> str | tuple[str, ...]:
-    allowed = "a glob, a folder or a file as text, or a list of files"
-    texts = value if isinstance(value, list) else [value]
-    if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
-        raise BadKeyError(found(value, allowed))
-    return tuple(texts) if isinstance(value, list) else str(value)
-
-
-def _free(value: Any) -> tuple[str, ...]:
-    allowed = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
-    if not isinstance(value, list) or not value:
-        raise BadKeyError(found(value, allowed))
-    for i, name in enumerate(value):
-        if name not in TWIST_NAMES:
-            raise BadKeyError(found(name, one_of(TWIST_NAMES)), i)
-        if name in value[:i]:
-            raise BadKeyError(found(value, allowed) + f'; "{name}" stands there twice')
-    return tuple(name for name in TWIST_NAMES if name in value)
-
-
-def _calibration(value: Any) -> Any:
-    return {"file": value} if isinstance(value, str) else value
-
-
-Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
-Number: TypeAlias = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
-
-
-class Table(BaseModel):
-    """A TOML table: no keys but these, no text for numbers, no NaN and no infinity."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        strict=True,
-        frozen=True,
-        allow_inf_nan=False,
-        arbitrary_types_allowed=True,
-        str_strip_whitespace=False,
-    )
-
-
-class Placement(Table):
-    """The forms of a rigid motion beside the 4x4 matrix."""
-
-    rotation_vector: Annotated[
-        Floats | None, ArrayOf((3,), "three numbers: axis times angle in radians")
-    ] = None
-    quaternion_xyzw: Annotated[Floats | None, ArrayOf((4,), "four numbers: x, y, z, w")] = None
-    translation: Annotated[Floats | None, ArrayOf((3,), "three numbers: x, y, z")] = None
+from mixpose.session.values import FREE_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
 
 
 class GravityTable(Table):
-    """``[object.gravity]``: displacement along a direction of the world."""
+    """Displacement of all features along one direction of the world, however the body is turned."""
 
     direction: Annotated[Floats, ArrayOf((3,), "a direction [x, y, z] in the world")]
+    """Where gravity points in the world; its length does not matter.
+
+    Example: `direction = [0, 0, -1]`
+    """
     sigma: Annotated[Number, Field(gt=0, description="a length greater than 0")]
+    """Standard deviation of the displacement along it, in `unit`.
+
+    Example: `sigma = 2.0`
+    """
 
 
 class ObjectTable(Table):
-    """``[object]``."""
+    """The rigid body: where its features are. It needs `points`, `file` or `segments`, of points
+    and segments together at least three.
+    """
 
     name: Text
+    """Name of the body, written into every pose.
+
+    Example: `name = "tracker"`
+    """
     points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
+    """Features in the body's own coordinates, in `unit`, in any order.
+
+    Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`
+    """
     file: Annotated[
         str | None, Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]")
     ] = None
-    sigma: Any = None
+    """A table of points in place of `points`: a row per point under the header `name,x,y,z`, with
+    one, three or nine more columns for the spread of each.
+
+    Example: `file = "markers.csv"`
+    """
+    sigma: Annotated[Any, Field(description=SIGMA_ALLOWED)] = None
+    """How far features may be off their places: standard deviation in `unit`, or covariance in
+    `unit`². Left out, or 0: exact.
+
+    Example: `sigma = 0.5`
+    """
     segments: Annotated[
         Floats | None, ArrayOf((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
     ] = None
+    """Straight lines as features, from end to end in `unit`; they may stand beside points.
+
+    Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`
+    """
     normals: Annotated[
         Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
     ] = None
+    """Outward directions, one per feature (points first, then segments): a feature is seen only
+    by sensors that it faces.
+
+    Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`
+    """
     spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
+    """Density of the displacements that `sigma` states.
+
+    Example: `spread = "uniform"`
+    """
     gravity: Annotated[
         GravityTable | None, Field(description="a table with direction and sigma")
     ] = None
+    """See `[object.gravity]`.
+
+    Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`
+    """
 
 
 class StartTable(Placement):
-    """``[start]``."""
+    """About where the body is in the first frame that is estimated. Without it the first pose is
+    searched for in all orientations. It needs `T_world_object`, or a rotation and `translation`.
+    """
 
     T_world_object: Annotated[
         Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
     ] = None
+    """The pose: maps coordinates of the body to coordinates of the world.
+
+    Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`
+    """
     euler_xyz_deg: Annotated[
         Floats | None, ArrayOf((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
     ] = None
+    """The rotation as turns about the fixed axes, x first.
+
+    Example: `euler_xyz_deg = [0, 0, 45]`
+    """
     rotation_deg: Annotated[
         Number | None,
         Field(gt=0, le=180, description="half-width in degrees, greater than 0, at most 180"),
     ] = None
+    """How far the orientation may be off; where it is left out, 5 degrees.
+
+    Example: `rotation_deg = 10`
+    """
     distance: Annotated[
         Number | None, Field(gt=0, description="half-width, a length greater than 0")
     ] = None
+    """How far the position may be off, in `unit`; where it is left out, a tenth of the body's
+    radius.
+
+    Example: `distance = 10`
+    """
 
 
 class EstimatorTable(Table):
-    """``[estimator]``."""
+    """How poses are estimated."""
 
     objective: Annotated[ObjectiveName, Field(description=one_of(get_args(ObjectiveName)))] = (
         "matched"
     )
-    free: Annotated[tuple[str, ...], PlainValidator(_free)] = TWIST_NAMES
+    """What is maximised: the normalised objective, the paper's product of the sensors inside the
+    integral, or the product of one objective per sensor.
+
+    Example: `objective = "paper"`
+    """
+    free: Annotated[tuple[str, ...], PlainValidator(read_free), Field(description=FREE_ALLOWED)] = (
+        TWIST_NAMES
+    )
+    """Directions of the world that are estimated; the others stay where `[start]` has them.
+
+    Example: `free = ["x", "y", "rz"]`
+    """
     samples: Annotated[int, Field(ge=2, description="an integer of at least 2")] = 1000
+    """Samples per feature where its density is integrated by sampling; an exact body needs none.
+
+    Example: `samples = 4000`
+    """
     seed: Annotated[int, Field(ge=0, description="an integer of at least 0")] = 0
+    """Same seed, same poses.
 
+    Example: `seed = 1`
+    """
+    fuse: Annotated[bool, Field(description="true or false")] = True
+    """Whether frames of single ranges without labels take the pose before them as a prior.
 
-class ExtractTable(Table):
-    """``[extract]`` and ``[sensor.extract]``; what is left out has the defaults of extraction."""
-
-    method: Annotated[str | None, PlainValidator(_method)] = None
-    polarity: Annotated[Literal["bright", "dark"] | None, Field(description='"bright", "dark"')] = (
-        None
-    )
-    threshold: Annotated[str | Number | None, PlainValidator(_threshold)] = None
-    min_area: Annotated[Number | None, Field(ge=0, description="an area in px, at least 0")] = None
-    max_area: Annotated[
-        Number | None, Field(gt=0, description="an area in px, greater than min_area")
-    ] = None
-    sigma: Annotated[
-        Number | None,
-        Field(gt=0, description="greater than 0: px for cameras, a length for lateration"),
-    ] = None
-    spot_sigma: Annotated[
-        Number | None,
-        Field(ge=0, description="at least 0: px for cameras, a length for lateration"),
-    ] = None
-
-
-class CalibrationTable(Table):
-    """``calibration``: a file, and what to read in it."""
-
-    file: Text
-    camera_matrix: Annotated[
-        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
-    ] = None
-    distortion: Annotated[
-        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
-    ] = None
-    camera: Annotated[
-        str | None, Field(min_length=1, description='a camera of a Kalibr file, like "cam0"')
-    ] = None
-
-
-class SensorTable(Table):
-    """What every ``[[sensor]]`` has."""
-
-    name: Annotated[
-        str, AfterValidator(_sensor_name), Field(description="a name for the sensor, as text")
-    ]
-    source: Annotated[str | tuple[str, ...], PlainValidator(_source)] = ()
-    times: Annotated[str | None, Field(min_length=1, description="a CSV file: frame,time_s")] = None
-    fps: Annotated[Number | None, Field(gt=0, description="frames per second, greater than 0")] = (
-        None
-    )
-    extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
-
-
-class PlacedTable(SensorTable, Placement):
-    """A sensor that stands somewhere and looks somewhere."""
-
-    T_sensor_world: Annotated[
-        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
-    ] = None
-    resolution: Annotated[
-        tuple[int, int] | None, PlainValidator(resolution_of), Field(description=RESOLUTION_FORM)
-    ] = None
-
-
-class CameraTable(PlacedTable):
-    """``model = "pinhole"`` and ``model = "fisheye"``."""
-
-    model: Literal["pinhole", "fisheye"]
-    camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
-    distortion: Annotated[Any, Field(description="a list of 4, 5, 8, 12 or 14 numbers")] = None
-    calibration: Annotated[
-        CalibrationTable | None,
-        BeforeValidator(_calibration),
-        Field(description='a file, or a table { file = "...", ... }'),
-    ] = None
-
-
-class ParallelTable(PlacedTable):
-    """``model = "parallel"``."""
-
-    model: Literal["parallel"]
-    pixel_size: Annotated[Number, Field(gt=0, description="length per px, a number greater than 0")]
-    principal_point: Annotated[
-        Floats, ArrayOf((2,), "[u, v], the px where the sensor's origin projects")
-    ]
-
-
-class LaterationTable(SensorTable):
-    """``model = "lateration"``."""
-
-    model: Literal["lateration"]
-    position: Annotated[Floats, ArrayOf((3,), "[x, y, z], the sensor's place in the world")]
-    range_bias: Annotated[Number, Field(description="a length")] = 0.0
-    range_min: Annotated[
-        Number | None, Field(description="a length: range of a profile's first bin")
-    ] = None
-    bin_size: Annotated[
-        Number | None, Field(gt=0, description="a length greater than 0: from bin to bin")
-    ] = None
-
-
-AnySensorTable: TypeAlias = Annotated[
-    CameraTable | ParallelTable | LaterationTable, Field(discriminator="model")
-]
+    Example: `fuse = false`
+    """
 
 
 class SessionTable(Table):
-    """The whole file."""
+    """What stands before the first table."""
 
     unit: Annotated[Unit, Field(description=one_of(get_args(Unit)))]
+    """Unit of every length in this file, in the files of markers and recordings that it names,
+    and in the poses.
+
+    Example: `unit = "mm"`
+    """
     object: Annotated[ObjectTable, Field(description="a table [object]")]
+    """See `[object]`."""
     start: Annotated[StartTable | None, Field(description="a table [start]")] = None
+    """See `[start]`."""
     estimator: Annotated[EstimatorTable, Field(description="a table [estimator]")] = (
         EstimatorTable()
     )
+    """See `[estimator]`."""
     extract: Annotated[ExtractTable, Field(description="a table [extract]")] = ExtractTable()
+    """See `[extract]`."""
     sensor: Annotated[
         list[AnySensorTable],
         Field(min_length=1, description="at least one table [[sensor]], in double brackets"),
     ]
+    """See `[[sensor]]`; one for each sensor."""

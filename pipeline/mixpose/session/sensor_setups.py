@@ -15,10 +15,10 @@ from mixpose.session.calibration import read_calibration
 from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
-from mixpose.session.schema import (
+from mixpose.session.schema_common import ExtractTable
+from mixpose.session.schema_sensors import (
     AnySensorTable,
     CameraTable,
-    ExtractTable,
     LaterationTable,
     ParallelTable,
     PlacedTable,

@@ -13,6 +13,7 @@ from pydantic_core import ErrorDetails
 from mixpose.session.messages import BadKeyError, Key, did_you_mean, found, nearest, one_of
 
 _TAG = "model"  # the key that tells the kinds of sensor apart
+_TOP = "the top of the file, before its first [table]"
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ def validate(root: type[BaseModel], data: dict[str, Any]) -> Any:
 def _problem(root: type[BaseModel], finding: ErrorDetails) -> BadKeyError:
     place = _locate(root, finding["loc"])
     kind, value = finding["type"], finding["input"]
-    allowed = _allowed(place.field)
+    allowed = allowed_for(place.field)
     if kind == "extra_forbidden":
         return BadKeyError(_unknown_key(root, place), *place.key)
     if kind.startswith("union_tag"):
@@ -103,7 +104,8 @@ def _literals(field: FieldInfo | None) -> list[str]:
     return list(words(field.annotation)) if field else []
 
 
-def _allowed(field: FieldInfo | None) -> str:
+def allowed_for(field: FieldInfo | None) -> str:
+    """What a key may be, for people; empty where nothing is said."""
     if field is None:
         return ""
     carried = (getattr(mark, "description", None) for mark in field.metadata)
@@ -129,24 +131,36 @@ def _tag_problem(place: _Place, value: Any) -> BadKeyError:
 def _unknown_key(root: type[BaseModel], place: _Place) -> str:
     """Suggest the nearest key of the same table, else say where the key is at home."""
     key, known = str(place.key[-1]), list(place.table.model_fields)
-    homes = dict.fromkeys(path for path, table in _all_tables(root) if key in table.model_fields)
+    homes = _homes(root, key)
     # a key that is right elsewhere is more likely misplaced than misspelt
     close = nearest(key, known, cutoff=0.8) if homes else nearest(key, known)
     if close:
         return f'unknown key; did you mean "{close}"?'
-    home = f"; it is a key of {' and '.join(homes)}" if homes else ""
+    home = f"; it is a key of {' or '.join(homes)}" if homes else ""
     return f"unknown key{home}; allowed here: {', '.join(known)}"
 
 
-def _all_tables(
-    table: type[BaseModel], path: str = "the top of the file"
-) -> Iterator[tuple[str, type[BaseModel]]]:
+def _homes(root: type[BaseModel], key: str) -> list[str]:
+    """Tables that have a key, sensors of all models as one."""
+    every = dict.fromkeys(path for path, _ in _all_tables(root))
+    homes = dict.fromkeys(path for path, table in _all_tables(root) if key in table.model_fields)
+    models = [path for path in every if path.startswith("[[sensor]]")]
+    if all(model in homes for model in models):
+        homes = {("[[sensor]]" if home in models else home): None for home in homes}
+    return list(homes)
+
+
+def _all_tables(table: type[BaseModel], path: str = _TOP) -> Iterator[tuple[str, type[BaseModel]]]:
     yield path, table
     for key, field in table.model_fields.items():
         inside = list(_tables(field.annotation))
         for inner in inside:
             if len(inside) > 1:
                 name = f"[[{key}]] of model {' or '.join(_literals(inner.model_fields[_TAG]))}"
-            else:
+            elif path == _TOP:
                 name = f"[{key}]"
+            else:
+                # [[sensor]] of any model: [sensor.extract]
+                outer = path.strip("[]").partition("]")[0]
+                name = f"[{outer}.{key}]"
             yield from _all_tables(inner, name)

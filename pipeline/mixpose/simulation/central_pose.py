@@ -46,7 +46,7 @@ def central_pose(session: Session, seed: int) -> Floats:
     pivot = pivot_of(session.body)
     rng = generator(seed, Purpose.ORIENTATION)
     rotations = Rotation.random(_ORIENTATIONS, rng=rng).as_matrix()
-    poses = [from_parts(R, place - R @ pivot) for place in _places(session) for R in rotations]
+    poses = [from_parts(R, place - R @ pivot) for place in places(session) for R in rotations]
     counts = [count_seen(session, T) for T in poses]
     best = int(np.argmax(counts))
     if counts[best] == 0:
@@ -73,8 +73,11 @@ def count_seen(session: Session, T_world_object: Floats) -> int:
     return seen
 
 
-def _places(session: Session) -> list[Floats]:
-    """Candidates for the pivot's place in the world, the most natural one first."""
+def places(session: Session) -> list[Floats]:
+    """Candidates for the pivot's place (3,) in the world, the most natural one first.
+
+    Every camera of the session needs a resolution.
+    """
     radius = session.body.radius
     all_rays = [_ray(setup, radius) for setup in session.sensors]
     rays = [ray for ray in all_rays if ray is not None]

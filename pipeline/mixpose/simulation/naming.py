@@ -232,7 +232,7 @@ def _camera_files(
         return SourceFiles(sensor, "detections", _filled(source))
     if suffix in VIDEO_SUFFIXES:
         return SourceFiles(sensor, "video", _filled(source))
-    if suffix in _OTHER_VIDEOS or suffix == ".npy" or "://" in source:
+    if suffix in _OTHER_VIDEOS or suffix == ".npy" or _is_live(source):
         raise SessionError(
             f"{_where(sensor)}: found {source!r}; simulate writes images, .avi, .mp4 and .csv"
         )
@@ -240,6 +240,10 @@ def _camera_files(
         return _globbed_images(sensor, source, numbers)
     digits = max(_FEWEST_DIGITS, len(str(numbers[-1])))
     return SourceFiles(sensor, "images", source.rstrip("/") + "/", ".png", digits)
+
+
+def _is_live(source: str) -> bool:
+    return "://" in source or source.startswith("camera:")
 
 
 def _globbed_images(sensor: str, pattern: str, numbers: Sequence[int]) -> SourceFiles:

@@ -86,6 +86,7 @@ def copy_session(session: Session) -> SessionCopy:
     if moved:
         content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
     sources = [sensor.get("source", "") for sensor in new_data["sensor"]]
+    sources = [f"camera:{s}" if isinstance(s, int) else s for s in sources]
     return SessionCopy(
         content=content,
         sources=tuple(tuple(s) if isinstance(s, list) else s for s in sources),
@@ -109,7 +110,7 @@ def _places(data: dict[str, Any]) -> Iterator[_Place]:
         name = sensor["name"]
         if isinstance(sensor.get("source"), list):
             yield from ((sensor["source"], i, "source", name) for i in range(len(sensor["source"])))
-        elif "source" in sensor:
+        elif isinstance(sensor.get("source"), str):
             yield sensor, "source", "source", name
         if "times" in sensor:
             yield sensor, "times", "times", name

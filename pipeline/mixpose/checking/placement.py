@@ -1,0 +1,205 @@
+"""Where sensors stand, where they look, and whether the body starts in their view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from typing import TypeAlias
+
+import numpy as np
+
+from mixpose.checking.typical import typical_poses
+from mixpose.rigid import Floats, inverse, rotation_angle_deg, transform
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.sensors.base import Mask
+from mixpose.session import SensorSetup, Session
+from mixpose.simulation.sighting import facing
+
+Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
+
+_SAME_ANGLE_DEG = 0.01
+_MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
+_SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
+
+
+def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
+    """Place in the world and viewing direction of a sensor, a line each."""
+    sensor = setup.sensor
+    if isinstance(sensor, RangeSensor):
+        return [f"at {_numbers(sensor.position)} {unit} in the world"]
+    if not isinstance(sensor, Looking):
+        return []
+    looks = f"looks along {_numbers(sensor.T_sensor_world[2, :3], 3)}"
+    if isinstance(sensor, ParallelBeam):
+        return [f"{looks} in the world"]
+    return [f"at {_numbers(_centre(sensor))} {unit}, {looks} in the world"]
+
+
+def placement_warnings(session: Session) -> list[str]:
+    """What is most likely wrong about where sensors and body are, a line each."""
+    warnings = _twins(session)
+    if session.start is None:
+        return warnings + _no_common_view(session)
+    T = session.start.T_world_object
+    seen = {s.name: _seen(s.sensor, session, T) for s in session.sensors}
+    unseen = [setup for setup in session.sensors if not seen[setup.name].any()]
+    hint = _inverted(session, unseen)
+    for setup in unseen:
+        warnings.append(
+            f"sensor {setup.name!r}: the body at [start] is {_why_unseen(setup.sensor, session)}"
+        )
+    for setup in session.sensors:
+        count = int(seen[setup.name].sum())
+        if 0 < count < len(session.body) / 2:
+            warnings.append(
+                f"sensor {setup.name!r}: only {count} of {len(session.body)} features are in view "
+                "at [start]"
+            )
+        warnings += _too_small(setup, session, seen[setup.name])
+    return warnings + hint
+
+
+def _twins(session: Session) -> list[str]:
+    """Sensors that stand at one place with one orientation."""
+    warnings = []
+    for a, b in combinations(session.sensors, 2):
+        if isinstance(a.sensor, RangeSensor) and isinstance(b.sensor, RangeSensor):
+            if np.array_equal(a.sensor.position, b.sensor.position):
+                warnings.append(
+                    f"sensors {a.name!r} and {b.name!r} stand at one position: check position"
+                )
+        elif isinstance(a.sensor, Looking) and isinstance(b.sensor, Looking):
+            T_a, T_b = a.sensor.T_sensor_world, b.sensor.T_sensor_world
+            apart = np.linalg.norm(T_a[:3, 3] - T_b[:3, 3])
+            near = apart <= 1e-6 * max(session.body.radius, float(np.linalg.norm(T_a[:3, 3])))
+            if near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:
+                warnings.append(
+                    f"sensors {a.name!r} and {b.name!r} stand at one place and look the same way: "
+                    "does one of them lack its T_sensor_world?"
+                )
+    return warnings
+
+
+def _no_common_view(session: Session) -> list[str]:
+    """Cameras that look apart, so that no place suits all of them."""
+    cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
+    blind = _blind(session, cameras)
+    if len(cameras) < 2 or not blind:
+        return []
+    text = f"{_names(blind)} would not see the body where the other sensors look"
+    if len(blind) == len(cameras):
+        text = f"no place was found that is in view of {_names(cameras)}"
+    flipped = replace(
+        session, sensors=tuple(replace(s, sensor=_with_inverse(s.sensor)) for s in cameras)
+    )
+    if not _blind(flipped, list(flipped.sensors)):
+        return [f"{text}; with the inverse of each T_sensor_world all would: {_MAPS}"]
+    return [f"{text}: check T_sensor_world"]
+
+
+def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:
+    """Cameras that see nothing of the body at a typical pose."""
+    poses = typical_poses(session, 1)
+    if not poses:
+        return cameras
+    return [setup for setup in cameras if not _seen(setup.sensor, session, poses[0]).any()]
+
+
+def _inverted(session: Session, unseen: list[SensorSetup]) -> list[str]:
+    """A hint where the inverse of what is written would put the body in view."""
+    if not unseen:
+        return []
+    assert session.start is not None
+    T = session.start.T_world_object
+    cameras = [setup for setup in session.sensors if isinstance(setup.sensor, Looking)]
+    placed = [
+        setup
+        for setup in cameras
+        if isinstance(setup.sensor, Looking)
+        and not np.allclose(setup.sensor.T_sensor_world, np.eye(4))
+    ]
+    names = {setup.name for setup in unseen}
+    # only where the inverse mends every camera, chance is no likely reason
+    if placed and all(setup.name in names for setup in placed):
+        flipped = [_with_inverse(setup.sensor) for setup in placed]
+        if all(_seen(sensor, session, T).all() for sensor in flipped):
+            return [
+                "T_sensor_world looks inverted: with its inverse the body at [start] would be in "
+                f"view of {_names(placed)}; {_MAPS}"
+            ]
+    back = inverse(T)
+    if len(unseen) == len(session.sensors) and all(
+        _seen(setup.sensor, session, back).all() for setup in cameras
+    ):
+        return [
+            "start.T_world_object looks inverted: with its inverse the body would be in view of "
+            "all cameras; it maps object to world coordinates"
+        ]
+    return []
+
+
+def _with_inverse(sensor: Sensor) -> Sensor:
+    assert isinstance(sensor, Looking)
+    return replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world))
+
+
+def _why_unseen(sensor: Sensor, session: Session) -> str:
+    assert session.start is not None
+    points = transform(session.start.T_world_object, session.body.means)
+    if not isinstance(sensor, Looking):
+        return "out of reach: check position, range_min and the unit of lengths"
+    in_sensor = transform(sensor.T_sensor_world, points)
+    keys = "check T_sensor_world and [start]"
+    if not isinstance(sensor, ParallelBeam) and (in_sensor[:, 2] <= 0).all():
+        return f"behind it: {keys}"
+    y, _ = replace(sensor, resolution=None).project(points)
+    if isinstance(sensor, ParallelBeam | PinholeCamera) and (y > -1e5).all():
+        u, v = y.mean(axis=0)
+        width, height = sensor.resolution or (0, 0)
+        return f"outside of its image of {width}x{height} px, at u = {u:.0f}, v = {v:.0f}: {keys}"
+    return f"out of its view: {keys}"
+
+
+def _too_small(setup: SensorSetup, session: Session, seen: Mask) -> list[str]:
+    """A body of a few pixels: mostly two units of length in one file."""
+    if not isinstance(setup.sensor, Looking) or not seen.any():
+        return []
+    assert session.start is not None
+    y, _ = setup.sensor.project(transform(session.start.T_world_object, session.body.means))
+    extent = float(np.ptp(y[seen], axis=0).max()) if seen.sum() > 1 else np.inf
+    if extent > _SMALL * setup.extract.sigma:
+        return []
+    return [
+        f"sensor {setup.name!r}: the body at [start] is {extent:.2g} px wide: are points, "
+        f"translation and T_sensor_world all in {session.unit}?"
+    ]
+
+
+def expected_count(setup: SensorSetup, session: Session) -> int:
+    """Features that a sensor should see in a frame: those in view at [start], if that is most."""
+    count = len(session.body)
+    if session.start is None:
+        return count if session.body.normals is None else max(count // 2, 1)
+    T = session.start.T_world_object
+    seen = _seen(setup.sensor, session, T) & facing(setup.sensor, session.body, T)
+    return int(seen.sum()) if seen.sum() >= count / 2 else count
+
+
+def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:
+    """Which features (N,) are inside of a sensor's view."""
+    return np.asarray(sensor.project(transform(T_world_object, session.body.means))[1])
+
+
+def _centre(sensor: PinholeCamera | FisheyeCamera) -> Floats:
+    return np.asarray(inverse(sensor.T_sensor_world)[:3, 3])
+
+
+def _numbers(values: Floats, digits: int = 4) -> str:
+    largest = float(np.abs(values).max())
+    # what is a rounding error beside the largest is zero
+    shown = (0.0 if abs(v) <= 1e-9 * largest else float(f"{v:.{digits}g}") for v in values)
+    return f"({', '.join(f'{value:g}' for value in shown)})"
+
+
+def _names(setups: list[SensorSetup]) -> str:
+    return ", ".join(repr(setup.name) for setup in setups)

@@ -1,0 +1,163 @@
+"""Read every frame of a sensor and count what is found in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+
+from mixpose.errors import RecordingError
+from mixpose.frames import Source
+from mixpose.frames.images import ImageSequence
+from mixpose.frames.prefetch import prefetch
+from mixpose.frames.video import Video
+from mixpose.records import Image, PointPattern, RawFrame
+from mixpose.runner import observation_of
+from mixpose.session import SensorSetup, Session
+
+_QUICK = 5  # frames that are looked at where not all are
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What the frames of one sensor hold.
+
+    Attributes
+    ----------
+    numbers : tuple of int
+        Frames that could be read, ascending.
+    counts : tuple of int or None
+        Features found in each of them; None where frames are grey values or profiles, in which
+        nothing is counted.
+    empty : tuple of int
+        Frames without any feature, or of one value all over.
+    size : (int, int) or None
+        Width and height of the images in px.
+    damage : tuple of str
+        Why a frame could not be read, a line each.
+    damaged : tuple of int
+        Their numbers, as far as known.
+    is_whole : bool
+        Whether all frames were looked at.
+    """
+
+    numbers: tuple[int, ...]
+    counts: tuple[int, ...] | None
+    empty: tuple[int, ...]
+    size: tuple[int, int] | None = None
+    damage: tuple[str, ...] = ()
+    damaged: tuple[int, ...] = ()
+    is_whole: bool = True
+
+    @property
+    def typical_frame(self) -> int | None:
+        """A frame with about the median number of features."""
+        if self.counts is None:
+            return None
+        middle = np.argsort(self.counts, kind="stable")[len(self.counts) // 2]
+        return self.numbers[int(middle)]
+
+
+def survey(
+    session: Session,
+    setup: SensorSetup,
+    source: Source,
+    *,
+    quick: bool = False,
+    done: Callable[[], None] = lambda: None,
+) -> Survey:
+    """Read the frames of a sensor as a run would, past damaged images.
+
+    Parameters
+    ----------
+    session : Session
+    setup : SensorSetup
+    source : Source
+        The sensor's recording.
+    quick : bool
+        Look at a few frames only, as is always done of a stream, which has no end.
+    done : callable
+        Called after each frame.
+
+    Raises
+    ------
+    SessionError
+        If a function of the user's that extracts features fails.
+    """
+    quick = quick or (isinstance(source, Video) and source.size is None)
+    damage: list[tuple[int | None, str]] = []
+    counts: dict[int, int | None] = {}
+    empty: list[int] = []
+    size: tuple[int, int] | None = None
+    with closing(_frames(source, damage, quick=quick)) as frames:
+        for frame in frames:
+            pattern = observation_of(session, setup, frame).pattern
+            if isinstance(pattern, PointPattern):
+                counts[frame.number] = len(pattern.points)
+                is_empty = not len(pattern.points)
+            else:
+                counts[frame.number] = None
+                is_empty = bool(np.ptp(pattern.values) == 0)
+            if is_empty:
+                empty.append(frame.number)
+            if isinstance(frame.data, np.ndarray):
+                size = (frame.data.shape[1], frame.data.shape[0])
+            done()
+    known = [count for count in counts.values() if count is not None]
+    counted = bool(known) and len(known) == len(counts)
+    return Survey(
+        numbers=tuple(counts),
+        counts=tuple(known) if counted else None,
+        empty=tuple(empty),
+        size=size,
+        damage=tuple(text for _, text in damage),
+        damaged=tuple(number for number, _ in damage if number is not None),
+        is_whole=not quick,
+    )
+
+
+def image_of(source: Source, number: int) -> Image | None:
+    """One image of a recording again; None where it holds something else."""
+    with closing(source.frames(number, number + 1)) as frames:
+        frame = next(frames, None)
+    return frame.data if frame is not None and isinstance(frame.data, np.ndarray) else None
+
+
+def _frames(
+    source: Source, damage: list[tuple[int | None, str]], *, quick: bool
+) -> Generator[RawFrame, None, None]:
+    """The frames that can be read; what is said of the others is put into `damage`."""
+    frames: Iterator[RawFrame] = _readable(source, damage, quick=quick)
+    if quick and not isinstance(source, ImageSequence):
+        frames = islice(frames, _QUICK)
+    if source.ahead and not quick:
+        frames = prefetch(frames, source.ahead)
+    yield from frames
+
+
+def _readable(
+    source: Source, damage: list[tuple[int | None, str]], *, quick: bool
+) -> Iterator[RawFrame]:
+    if not isinstance(source, ImageSequence):
+        try:
+            yield from source.frames()
+        except RecordingError as error:
+            damage.append((None, str(error)))
+        return
+    # each image by itself: after a damaged one the next can be read all the same
+    numbers = source.numbers
+    if quick:
+        places = np.linspace(0, len(numbers) - 1, min(_QUICK, len(numbers)))
+        numbers = tuple(numbers[int(place)] for place in places)
+    for number in numbers:
+        try:
+            for frame in source.frames(number, number + 1):
+                if source.resolution is None and isinstance(frame.data, np.ndarray):
+                    height, width = frame.data.shape
+                    source = replace(source, resolution=(width, height))
+                yield frame
+        except RecordingError as error:
+            damage.append((number, str(error)))

@@ -1,0 +1,171 @@
+"""``mixpose convert``: pose lines in the formats of others."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mixpose import __version__
+from mixpose.cli.notices import warn
+from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.session_of_poses import session_of
+from mixpose.errors import SessionError
+from mixpose.poses.estimates import estimate_of, first_answers, header_of, relative_to
+from mixpose.poses.header import UNITS_PER_METRE
+from mixpose.poses.jsonl import PoseFile, read_poses
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Floats
+from mixpose.sensors import RangeSensor
+
+_BY_SUFFIX = {
+    ".jsonl": "jsonl",
+    ".csv": "csv",
+    ".tum": "tum",
+    ".yaml": "ros",
+    ".yml": "ros",
+    ".rrd": "rerun",
+}
+_ONE_TRAJECTORY = ("tum", "ros")
+
+
+@dataclass(frozen=True)
+class ConvertRequest:
+    """The options of ``mixpose convert``."""
+
+    output: Path | None
+    format: str | None
+    unit: str | None
+    object: str | None
+    only_ok: bool
+    scene_id: int | None
+    obj_id: int | None
+    relative_to: str | None
+    session: Path | None
+    sources: tuple[str, ...]
+
+
+def convert_poses(path: Path, request: ConvertRequest) -> None:
+    """Write the poses of a file in another format.
+
+    Raises
+    ------
+    SessionError
+        If the options are wrong or do not say enough.
+    RecordingError
+        If the poses file cannot be read, or holds what the format cannot say.
+    """
+    name = _format(request)
+    _refuse_options_of_other_formats(name, request)
+    poses = read_poses(path)
+    lines = _selected(poses, name, request)
+    if request.output is not None and request.output.is_file() | (not request.output.exists()):
+        refuse_to_overwrite(request.output, [path])
+    if name == "rerun":
+        from mixpose.cli.rerun import write_rerun  # noqa: PLC0415
+
+        write_rerun(poses, lines, request.output, request.session, request.sources)
+    else:
+        _write(poses, lines, name, request)
+    if request.output is not None:
+        print(f"mixpose: {len(lines)} poses -> {request.output}", file=sys.stderr)
+
+
+def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
+    T_sensor_world = _T_sensor_world(poses, request)
+    given = {"scene_id": request.scene_id, "obj_id": request.obj_id}
+    options: dict[str, int | str] = {
+        key: value for key, value in given.items() if value is not None
+    }
+    if name == "ros" and request.relative_to is not None:
+        options["frame_id"] = request.relative_to
+    header = header_of(poses, _unit(poses, request), __version__)
+    with Output(request.output, name, header, options=options) as output:
+        for line in lines:
+            output.write(relative_to(T_sensor_world, estimate_of(line)))
+
+
+def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
+    """What poses are moved by before they are written; identity for poses in the world."""
+    if request.relative_to is None:
+        return np.eye(4)
+    session = session_of(poses, request.session)
+    for setup in session.sensors:
+        if setup.name == request.relative_to and not isinstance(setup.sensor, RangeSensor):
+            return np.asarray(setup.sensor.T_sensor_world)  # type: ignore[attr-defined]
+    cameras = [s.name for s in session.sensors if not isinstance(s.sensor, RangeSensor)]
+    raise SessionError(
+        f"--relative-to {request.relative_to}: no such camera, allowed: {', '.join(cameras)}"
+    )
+
+
+def _format(request: ConvertRequest) -> str:
+    if request.format is not None:
+        return request.format
+    suffix = "" if request.output is None else request.output.suffix.lower()
+    if suffix not in _BY_SUFFIX:
+        found = "no -o" if request.output is None else f"-o {request.output}"
+        raise SessionError(
+            f"--format: found none, and {found} does not tell; name the format, or a file that "
+            f"ends in {', '.join(_BY_SUFFIX)}"
+        )
+    return _BY_SUFFIX[suffix]
+
+
+def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None:
+    given = {
+        "--scene-id": (request.scene_id, ("bop",)),
+        "--obj-id": (request.obj_id, ("bop",)),
+        "--relative-to": (request.relative_to, ("bop", "ros", "tum")),
+        "--source": (request.sources or None, ("rerun",)),
+    }
+    for option, (value, owners) in given.items():
+        if value is not None and name not in owners:
+            raise SessionError(
+                f"{option}: belongs to --format {' or '.join(owners)}, found --format {name}"
+            )
+    if request.session is not None and name != "rerun" and request.relative_to is None:
+        raise SessionError("--session: belongs to --format rerun and to --relative-to")
+
+
+def _unit(poses: PoseFile, request: ConvertRequest) -> str:
+    """Unit of the lengths in the poses file."""
+    allowed = ", ".join(UNITS_PER_METRE)
+    if request.unit is not None and request.unit not in UNITS_PER_METRE:
+        raise SessionError(f"--unit {request.unit}: allowed are {allowed}")
+    unit = poses.unit or request.unit
+    if unit is None:
+        raise SessionError(
+            f"{poses.path}: no header says the unit of its lengths; add --unit, one of {allowed}"
+        )
+    if request.unit not in (None, unit):
+        raise SessionError(f"--unit {request.unit}: {poses.path} says that its unit is {unit}")
+    return unit
+
+
+def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseLine]:
+    """The lines to write, in the order of the file."""
+    objects = list(dict.fromkeys(line.object for line in poses.poses))
+    if request.object is not None and request.object not in objects:
+        raise SessionError(f"--object {request.object}: {poses.path} has {', '.join(objects)}")
+    lines = [
+        line
+        for line in poses.poses
+        if request.object in (None, line.object) and (line.status == "ok" or not request.only_ok)
+    ]
+    if name in _ONE_TRAJECTORY and request.object is None and len(objects) > 1:
+        raise SessionError(
+            f"{poses.path}: holds {', '.join(objects)}, and format {name!r} holds one object; "
+            "choose with --object"
+        )
+    if name == "jsonl":
+        return lines
+    answers = Counter((line.frame, line.object) for line in lines)
+    several = sum(count > 1 for count in answers.values())
+    if several:
+        warn(f"{poses.path}: several right answers in {several} frames; the first is written")
+    return first_answers(lines)

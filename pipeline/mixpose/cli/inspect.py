@@ -1,0 +1,138 @@
+"""``mixpose inspect``: pictures and words about one frame."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from mixpose.cli.run import named_sources
+from mixpose.errors import SessionError
+from mixpose.frames import Source, pair
+from mixpose.pictures.advice import describe
+from mixpose.pictures.finding import Finding, find
+from mixpose.pictures.plots import require_matplotlib
+from mixpose.pictures.sheet import inspection_pictures, possible_names
+from mixpose.pictures.signature import refuse_foreign, write_png
+from mixpose.poses.jsonl import read_poses
+from mixpose.records import Estimate, FrameSet
+from mixpose.runner import begin, observe, open_sources
+from mixpose.session import Session, load_session
+
+
+def inspect_frame(
+    path: Path, number: int, folder: Path, *, poses: Path | None, sources: Sequence[str]
+) -> None:
+    """Write pictures of one frame into a folder and print what was found in it.
+
+    Parameters
+    ----------
+    path : Path
+        The session file.
+    number : int
+        Of the frame.
+    folder : Path
+        Made if there is none.
+    poses : Path or None
+        Poses of a run, in place of estimating this frame on its own.
+    sources : sequence of str
+        ``NAME=PATH``, recordings in place of the session's.
+
+    Raises
+    ------
+    SessionError
+        If the session or an option is wrong, or the folder holds other people's files.
+    RecordingError
+        If the recording or the poses cannot be read.
+    """
+    session = load_session(path)
+    require_matplotlib()
+    _check_folder(folder, session)
+    frame_set = _frame(open_sources(session, named_sources(sources)), number)
+    views = observe(session, frame_set)
+    tracker, track = begin(session)
+    if poses is None:
+        _, estimate = tracker.advance(track, number, frame_set.time_s, views)
+    else:
+        estimate = _from_file(poses, session, number)
+    findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
+    pictures = inspection_pictures(session, tracker, findings, estimate)
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
+    for name, picture in pictures.items():
+        write_png(folder / name, picture)
+    lines = _summary(session, estimate, findings, poses)
+    lines.append(f"pictures in {folder}: {', '.join(pictures)}")
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def _check_folder(folder: Path, session: Session) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise SessionError(f"-o {folder}: is a file; name a folder for the pictures")
+    if not folder.parent.is_dir():
+        raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
+    for name in possible_names(session.sensors):
+        refuse_foreign(folder / name, "-o")
+
+
+def _frame(opened: Mapping[str, Source], number: int) -> FrameSet:
+    """The frames of one number."""
+    if number >= 0:
+        with closing(pair(opened, number, number + 1)) as frames:
+            found = next(frames, None)
+        if found is not None:
+            return found
+    recordings = "; ".join(f"{name}: {source.describe()}" for name, source in opened.items())
+    raise SessionError(f"--frame {number}: the recording has no such frame; it has {recordings}")
+
+
+def _from_file(path: Path, session: Session, number: int) -> Estimate:
+    """The pose of a frame as a run wrote it."""
+    file = read_poses(path)
+    if file.unit is not None and file.unit != session.unit:
+        raise SessionError(
+            f"--poses {path}: lengths are in {file.unit}, those of the session in {session.unit}; "
+            "give poses of this session"
+        )
+    own = [pose for pose in file.poses if pose.object == session.body.name]
+    if not own:
+        others = ", ".join(sorted({pose.object for pose in file.poses})) or "nothing"
+        raise SessionError(
+            f"--poses {path}: found poses of {others}, the session's object is {session.body.name}"
+        )
+    for pose in own:
+        if pose.frame == number:
+            return Estimate(
+                frame=number,
+                time_s=pose.time_s,
+                object=pose.object,
+                status=pose.status,
+                T_world_object=pose.T_world_object,
+                covariance=pose.covariance,
+                score=pose.score or 0.0,
+                sensors=pose.sensors,
+                hypotheses=pose.hypotheses,
+            )
+    numbers = [pose.frame for pose in own]
+    raise SessionError(
+        f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to {max(numbers)}"
+    )
+
+
+def _summary(
+    session: Session, estimate: Estimate, findings: Sequence[Finding], poses: Path | None
+) -> list[str]:
+    origin = "estimated on its own" if poses is None else f"pose of {poses}"
+    head = f"{session.path}, frame {estimate.frame}: {estimate.status} ({origin})"
+    if len(estimate.hypotheses) > 1:
+        weights = ", ".join(f"{one.weight:.2g}" for one in estimate.hypotheses)
+        head += f"; {len(estimate.hypotheses)} poses with weights {weights}, the first is shown"
+    lines = [head]
+    for finding in findings:
+        lines += describe(finding, session.body, session.unit)
+    if estimate.status == "lost":
+        lines.append("lost: once the counts are right, give [start], or check T_sensor_world")
+    return lines

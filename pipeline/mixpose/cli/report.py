@@ -1,0 +1,37 @@
+"""``mixpose report``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mixpose import __version__
+from mixpose.cli.output import open_text, refuse_to_overwrite_but
+from mixpose.errors import SessionError
+from mixpose.poses.jsonl import read_poses, read_unfinished_poses
+from mixpose.report.origin import find_session
+from mixpose.report.page import MARK, render
+
+
+def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
+    """Write the report of a run to a page of its own.
+
+    Raises
+    ------
+    SessionError
+        If the output would overwrite something else, or a library is missing.
+    RecordingError
+        If the poses or the truth cannot be read or compared.
+    """
+    poses, cut = read_unfinished_poses(poses_path)
+    truth = None if truth_path is None else read_poses(truth_path)
+    inputs = (poses_path, truth_path, find_session(poses).path)
+    refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
+    page = render(poses, truth, cut=cut, version=__version__)
+    try:
+        with open_text(output, append=False) as stream:
+            stream.write(page)
+    except OSError as error:
+        raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
+    count = len(poses.poses)
+    print(f"mixpose: {count} frame{'s' * (count != 1)} -> {output}", file=sys.stderr)

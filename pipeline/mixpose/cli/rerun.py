@@ -1,0 +1,57 @@
+"""``mixpose convert --format rerun``: the poses with the recording that they come from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from mixpose.cli.run import named_sources
+from mixpose.cli.session_of_poses import session_of
+from mixpose.errors import SessionError
+from mixpose.poses.jsonl import PoseFile
+from mixpose.poses.poseline import PoseLine
+from mixpose.runner import open_sources
+
+
+def write_rerun(
+    poses: PoseFile,
+    lines: Sequence[PoseLine],
+    output: Path | None,
+    session_file: Path | None,
+    sources: Sequence[str],
+) -> None:
+    """Write poses and the recording of their session as an ``.rrd`` file.
+
+    Raises
+    ------
+    SessionError
+        If the viewer's package is missing, or the session is not found or not that of the poses.
+    RecordingError
+        If the recording cannot be read.
+    """
+    if output is None:
+        raise SessionError("--format rerun: needs -o FILE.rrd, it is no text")
+    if find_spec("rerun") is None:
+        raise SessionError(
+            "--format rerun: needs the package rerun-sdk; install it with: "
+            "python -m pip install 'mixpose[rerun]'"
+        )
+    session = session_of(poses, session_file)
+    opened = open_sources(session, named_sources(sources))
+    for name, source in opened.items():
+        if source.kind == "live":
+            raise SessionError(
+                f"sensor {name!r} is live, so its frames are gone; name a recording of them "
+                f"with --source {name}=PATH"
+            )
+    from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - not everybody has it
+
+    # a half-written file never stands in the place of a whole one
+    half = output.with_name(f".{output.name}.part")
+    try:
+        write_rerun_file(half, session, opened, lines)
+        os.replace(half, output)  # noqa: PTH105 - also where the file exists, on every system
+    finally:
+        half.unlink(missing_ok=True)

@@ -1,0 +1,151 @@
+"""OpenCV's captures: opened, advanced and converted with complaints in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import stat
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from mixpose.errors import RecordingError
+from mixpose.frames.quiet import quieten_opencv
+from mixpose.records import Image
+
+# How long a stream may take to open, and then to deliver its next frame.
+PATIENCE_S = 10.0
+
+# Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
+_GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
+
+
+class NotOpenedError(RecordingError):
+    """Nothing was found that OpenCV can read."""
+
+
+def is_pipe(address: str) -> bool:
+    """Whether a path leads to a named pipe, or to a standard input that is one."""
+    return _is(stat.S_ISFIFO, address)
+
+
+def is_device(address: str) -> bool:
+    """Whether a path leads to a device, as ``/dev/video0``."""
+    return _is(stat.S_ISCHR, address)
+
+
+def is_stream(address: str) -> bool:
+    """Whether frames come from somewhere that is no file."""
+    return "://" in address or is_pipe(address) or is_device(address)
+
+
+def _is(kind: Callable[[int], bool], address: str) -> bool:
+    with contextlib.suppress(OSError, ValueError):
+        return kind(Path(address).stat().st_mode)
+    return False
+
+
+@contextmanager
+def opened(address: str | int) -> Iterator[cv2.VideoCapture]:
+    """A capture that is released at the end; grey videos keep their depth.
+
+    Parameters
+    ----------
+    address : str or int
+        Path of a file, a pipe or a device, address of a stream (with ``://``), or index of a
+        camera.
+
+    Raises
+    ------
+    RecordingError
+        If it does not open, a stream or a pipe within `PATIENCE_S`.
+    """
+    quieten_opencv()
+    with contextlib.ExitStack() as stack:
+        capture = _capture(address, stack)
+        stack.callback(capture.release)
+        if not capture.isOpened():
+            raise NotOpenedError(f"{name_of(address)}: does not open")
+        tag = np.int32(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).tobytes()
+        if tag in _GREY_FORMATS:
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        yield capture
+
+
+def _capture(address: str | int, stack: contextlib.ExitStack) -> cv2.VideoCapture:
+    if isinstance(address, int):
+        return cv2.VideoCapture(address)
+    if is_pipe(address):
+        address = f"pipe:{_reading_end(address, stack)}"
+    elif "://" not in address:
+        return cv2.VideoCapture(address)
+    patience_ms = int(1000 * PATIENCE_S)
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms]
+    limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience_ms]
+    return cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+
+
+def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
+    """Descriptor of a pipe that somebody writes to; closed with the stack.
+
+    It does not block, so that FFmpeg's limits of time hold for a writer that falls silent.
+    """
+    end = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    stack.callback(os.close, end)
+    # a pipe that nobody has opened for writing reads as ended, but is not readable
+    if not select.select([end], [], [], PATIENCE_S)[0]:
+        raise RecordingError(f"{path}: nothing was written to this pipe for {PATIENCE_S:g} s")
+    return end
+
+
+def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
+    """Go to the next frame; False where there is none.
+
+    Raises
+    ------
+    RecordingError
+        If a stream falls silent without ending.
+    """
+    began = time.monotonic()
+    found = capture.grab()
+    silence = time.monotonic() - began
+    # FFmpeg gives up with what it has of a frame, which is damaged then
+    if silence > 0.9 * PATIENCE_S and (isinstance(address, int) or is_stream(address)):
+        raise RecordingError(f"{name_of(address)}: no frame came for {PATIENCE_S:g} s")
+    return bool(found)
+
+
+def retrieve(
+    capture: cv2.VideoCapture, address: str | int, number: int, expected: tuple[int, int] | None
+) -> Image:
+    """Convert the grabbed frame to grey values, (H, W).
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be decoded or has not the expected width and height.
+    """
+    found, image = capture.retrieve()
+    if not found or image is None:
+        raise RecordingError(f"{name_of(address)}: frame {number} cannot be decoded")
+    if image.ndim == 3:
+        code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
+        image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image, code)
+    height, width = image.shape
+    if expected is not None and (width, height) != expected:
+        raise RecordingError(
+            f"{name_of(address)}: frame {number} has {width}x{height} pixels, "
+            f"allowed is {expected[0]}x{expected[1]}"
+        )
+    return cast(Image, image)
+
+
+def name_of(address: str | int) -> str:
+    """What people call a source of frames."""
+    return f"camera:{address}" if isinstance(address, int) else address

@@ -1,0 +1,194 @@
+"""Live sources: cameras and streams that do not wait, of which only the newest frame counts.
+
+A pose that comes late is worth little, so a frame that arrives while the one before it is still
+being estimated is passed over when a newer one is there.  Numbers count all frames that arrived,
+so that those passed over leave gaps.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from types import TracebackType
+from typing import ClassVar
+from urllib.parse import urlsplit
+
+from mixpose.errors import RecordingError
+from mixpose.frames.capture import grab, is_device, name_of, opened, retrieve
+from mixpose.frames.source import SourceKind, selection
+from mixpose.frames.times import Clock
+from mixpose.records import FrameSet, RawFrame
+
+_CAMERA = re.compile(r"camera:(\d{1,4})")
+_SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"}
+# what a server sends from a file is sent as fast as it is read
+_FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
+_FAREWELL_S = 1.0
+
+
+def live_address(source: str) -> str | int | None:
+    """The camera's index or address where a source is live; None where it is a recording."""
+    if camera := _CAMERA.fullmatch(source):
+        return int(camera[1])
+    if is_device(source):
+        return source
+    scheme, _, rest = source.partition("://")
+    if not rest or scheme.lower() not in _SCHEMES:
+        return None
+    suffix = PurePosixPath(urlsplit(source).path).suffix.lower()
+    return None if scheme.lower().startswith("http") and suffix in _FILES else source
+
+
+@dataclass(frozen=True)
+class LiveSource:
+    """A camera or a stream, opened when its frames are asked for.
+
+    Attributes
+    ----------
+    address : str or int
+        Of a stream or a device, or the index of a camera.
+    resolution : (width, height) or None
+        Size that every frame must have, in px.
+    clock : callable or None
+        Gives the time of a frame number; None means when the frame arrived, in s since the start.
+    """
+
+    kind: ClassVar[SourceKind] = "live"
+    ahead: ClassVar[int] = 0
+    first: ClassVar[int] = 0
+    length: ClassVar[None] = None
+
+    address: str | int
+    resolution: tuple[int, int] | None
+    clock: Clock | None
+
+    def describe(self) -> str:
+        """One line for people."""
+        return f"live {name_of(self.address)}, opened when it is needed"
+
+    def caution(self) -> str | None:
+        """Nothing to say before it is opened."""
+        return None
+
+    def frames(
+        self, start: int | None = None, stop: int | None = None, step: int = 1
+    ) -> Generator[RawFrame, None, None]:
+        """Each time the newest frame, once there is one that has not been given yet.
+
+        Raises
+        ------
+        RecordingError
+            If the source does not open or falls silent.
+        """
+        wanted = selection(start, stop, step, self.first)
+        for frame_set in join_live({"": self}, wanted):
+            yield frame_set.frames[""]
+
+
+def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[FrameSet, None, None]:
+    """The newest frames of all sources, once each has one that was not given yet.
+
+    The frames of a set are at most one period of the fastest source apart, or what its
+    transmission adds to that.  A source that has ended is left out of further sets.
+
+    Yields
+    ------
+    FrameSet
+        Numbered by the source that has given most frames.
+
+    Raises
+    ------
+    RecordingError
+        If a source does not open or falls silent.
+    """
+    began = time.monotonic()
+    with ExitStack() as stack:
+        readers = {
+            sensor: stack.enter_context(_Reader(source, began))
+            for sensor, source in sources.items()
+        }
+        given = dict.fromkeys(readers, -1)
+        number = -1
+        while going := [sensor for sensor in readers if readers[sensor].wait(given[sensor])]:
+            frames = {sensor: readers[sensor].newest() for sensor in going}
+            given.update((sensor, frame.number) for sensor, frame in frames.items())
+            number = max(number + 1, *given.values())
+            if number >= wanted.stop:
+                return
+            if number in wanted:
+                frames = {sensor: replace(frame, number=number) for sensor, frame in frames.items()}
+                yield FrameSet(number, next(iter(frames.values())).time_s, frames)
+
+
+class _Reader:
+    """Reads a live source in a thread of its own and keeps its newest frame."""
+
+    def __init__(self, source: LiveSource, began: float) -> None:
+        self._source, self._began = source, began
+        self._changed = threading.Condition()
+        self._newest: RawFrame | None = None
+        self._error: BaseException | None = None
+        self._ended = False
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._read, name="mixpose-live", daemon=True)
+
+    def __enter__(self) -> _Reader:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop.set()
+        # a thread that still waits for a silent camera is left to end by itself
+        self._thread.join(_FAREWELL_S)
+
+    def wait(self, after: int) -> bool:
+        """Wait for a frame with a number above `after`; False if none will come."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_newer_than(after) or self._ended)
+            if self._is_newer_than(after):
+                return True
+        if self._error is not None:
+            raise self._error
+        return False
+
+    def newest(self) -> RawFrame:
+        """The newest frame; `wait` has told that there is one."""
+        assert self._newest is not None
+        return self._newest
+
+    def _is_newer_than(self, number: int) -> bool:
+        return self._newest is not None and self._newest.number > number
+
+    def _read(self) -> None:
+        try:
+            self._keep_newest()
+        except BaseException as caught:  # whatever it is, it belongs to the consumer
+            self._error = caught
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _keep_newest(self) -> None:
+        address, clock = self._source.address, self._source.clock
+        with opened(address) as capture:
+            number = 0
+            while not self._stop.is_set() and grab(capture, address):
+                arrived = time.monotonic() - self._began
+                image = retrieve(capture, address, number, self._source.resolution)
+                time_s = arrived if clock is None else clock(number)
+                with self._changed:
+                    self._newest = RawFrame(number, time_s, image)
+                    self._changed.notify_all()
+                number += 1
+        if isinstance(address, int) and not self._stop.is_set():
+            raise RecordingError(f"{name_of(address)}: gives no frames any more")

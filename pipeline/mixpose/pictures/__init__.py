@@ -1,0 +1,8 @@
+"""Pictures of frames and poses, to tune an extraction by looking and to trust a pose."""
+
+from __future__ import annotations
+
+from mixpose.pictures.display import displayable
+from mixpose.pictures.overlay import Part, draw_pose
+
+__all__ = ["Part", "displayable", "draw_pose"]

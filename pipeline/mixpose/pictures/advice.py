@@ -1,0 +1,361 @@
+"""In words: what a sensor found, what was expected, and what to change in the session file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.extraction.blobs import find_blobs
+from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.threshold import Foreground, above, foreground
+from mixpose.pictures.finding import Expectation, Finding
+from mixpose.records import GridPattern, Image, PointPattern
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
+_NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
+_FLOODED = 0.02  # share of an image above a threshold that would find everything
+_LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
+_SPECK_PX = 2  # pieces up to this area are noise
+_LISTED = 6  # features that are named one by one
+
+
+def describe(finding: Finding, body: Body, unit: str) -> list[str]:
+    """Lines for people about one sensor: counts first, then advice.
+
+    Parameters
+    ----------
+    finding : Finding
+    body : Body
+    unit : str
+        Of lengths.
+    """
+    if finding.frame is None:
+        return [f"{finding.name}: no frame of this number"]
+    lines = [f"{finding.name}: {_counts(finding, body, unit)}"]
+    data = finding.frame.data
+    if isinstance(data, PointPattern | GridPattern):
+        advice = _about_measurements(finding, body)
+    else:
+        lines.append(_threshold(data, finding.setup.extract))
+        method = finding.setup.extract.method
+        advice = (
+            _about_spots(finding, data, body)
+            if method in ("blobs", "intensity")
+            else _about_others(finding, body)
+        )
+    return lines + [f"  {line}" for line in [*advice, *_about_sigma(finding)]]
+
+
+def _counts(finding: Finding, body: Body, unit: str) -> str:
+    unit = "px" if finding.setup.sensor.unit == "px" else unit
+    if finding.points is None:
+        found = f"light as of {finding.count:.1f} points"
+        if finding.setup.sensor.dimension == 1:
+            found = f"echoes as of {finding.count:.1f} points"
+    else:
+        found = f"{len(finding.points)} feature{'s' * (len(finding.points) != 1)} found"
+    expected = finding.expectation
+    if expected is None:
+        return f"{found}; without a pose up to {len(body)} are expected"
+    text = f"{found}; the pose has {int(expected.seen.sum())} of {len(body)} in view"
+    text += f", {int(expected.met.sum())} of them met"
+    if expected.rms is not None:
+        text += f" within {expected.rms:.3g} {unit} RMS"
+    return f"{text}; {100 * expected.explained:.0f} % of the density explained"
+
+
+def _threshold(image: Image, options: ExtractOptions) -> str:
+    """The threshold that was used, in the grey levels of the image."""
+    if options.method == "corners":
+        if isinstance(options.threshold, str):
+            return '  threshold "auto": clear of the noise, and a fifth of the clearest corner'
+        return f"  threshold {options.threshold:g} grey levels from bright to dark fields"
+    if options.method not in ("blobs", "intensity"):
+        return f"  method {options.method} has a threshold of its own"
+    scene = _scene(image, options)
+    share = 100 * float(np.mean(above(scene.grey, scene.zero + scene.level)))
+    side = "above" if options.polarity == "bright" else "below"
+    if scene.judged:
+        text = (
+            f'  threshold "{options.threshold}": {scene.level:.1f} grey levels {side} the '
+            f"background, whose noise is {scene.noise:.1f}; peaks of at least "
+            f"{scene.least_peak:.1f}"
+        )
+    else:
+        text = f"  threshold {_in_image(scene.level, image, options):g}, {side} which is feature"
+    return f"{text}; {share:.2g} % of the pixels"
+
+
+def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
+    """Advice for blobs and intensity."""
+    options = finding.setup.extract
+    scene = _scene(image, options)
+    share = float(np.mean(above(scene.grey, scene.zero + scene.level)))
+    lines = []
+    if share > _FLOODED and finding.points is not None and len(finding.points) > 3 * len(body):
+        lines.append(
+            f"too much of the image counts as feature: {_stricter(options)}, or set threshold "
+            '= "local" where the light is uneven'
+        )
+    expected = finding.expectation
+    if expected is None:
+        return lines + _about_number(finding, body, scene)
+    lines += _about_missing(finding, expected, image, scene)
+    if options.method == "blobs":
+        lines += _about_extra(finding, expected, image, scene)
+    return lines
+
+
+def _about_missing(
+    finding: Finding, expected: Expectation, image: Image, scene: Foreground
+) -> list[str]:
+    """Why expected features were not met, and what would find them."""
+    options = finding.setup.extract
+    raw = _bright(image, options)
+    missing = _sorted_out(finding, expected, scene, raw)
+    lines = []
+    if found := missing["nothing"]:
+        lines.append(
+            f"not met and dark there: {_some(found)}; hidden, out of light, or the pose is wrong"
+        )
+    if found := missing["faint"]:
+        level = _between(min(found.values()), raw)
+        lines.append(
+            f"not met, fainter than the threshold: {_some(found)}; "
+            f"{_looser(options, level, raw, image)}"
+        )
+    if found := missing["small"]:
+        lines.append(
+            f"not met, too small: {_some(found)}; lower min_area = {options.min_area:g} to "
+            f"{min(found.values()):g}, or {_direction(options, lower=True)}"
+        )
+    if found := missing["large"]:
+        lines.append(
+            f"not met, too large: {_some(found)}; raise max_area = {options.max_area:g} to "
+            f"{max(found.values()):g}"
+        )
+    if found := missing["other"]:
+        lines.append(
+            f"not met though bright there: {_some(found)}; they run into something "
+            f"else, are partly hidden, or have no clear shape; {_direction(options, lower=False)}"
+        )
+    return lines
+
+
+def _sorted_out(
+    finding: Finding, expected: Expectation, scene: Foreground, raw: Floats
+) -> dict[str, dict[int, float]]:
+    """Features that were not met, by why: nothing there, faint (with its peak), or by its area."""
+    options = finding.setup.extract
+    labels, areas = _pieces(scene)
+    kinds: dict[str, dict[int, float]] = {
+        kind: {} for kind in ("nothing", "faint", "small", "large", "other")
+    }
+    for i in np.flatnonzero(expected.seen & ~expected.met).tolist():
+        region = _around(expected.y[i], _NEAR_SIGMAS * finding.sigma, scene.grey.shape)
+        signal = float(scene.grey[region].max()) - scene.zero
+        area = float(areas[labels[region]].max())
+        if signal < min(_NOTHING_NOISES * scene.noise, scene.level):
+            kinds["nothing"][i] = signal
+        elif signal <= scene.level:
+            kinds["faint"][i] = float(raw[region].max())
+        elif area < options.min_area:
+            kinds["small"][i] = area
+        elif options.max_area is not None and area > options.max_area:
+            kinds["large"][i] = area
+        else:
+            kinds["other"][i] = area
+    return kinds
+
+
+def _about_extra(
+    finding: Finding, expected: Expectation, image: Image, scene: Foreground
+) -> list[str]:
+    """What tells found things that belong to no feature from those that do."""
+    if finding.points is None or not expected.unexplained.any():
+        return []
+    options = finding.setup.extract
+    raw = _bright(image, options)
+    sizes, peaks = [], []
+    for blob in find_blobs(scene, options):
+        region = _around(np.array([blob.u, blob.v]), np.sqrt(blob.area / np.pi), raw.shape)
+        sizes.append(blob.area)
+        peaks.append(float(raw[region].max()))
+    extra = expected.unexplained
+    text = f"{int(extra.sum())} found belong to no feature"
+    if extra.all():
+        return [f"{text}: the pose is wrong, or {_stricter(options)}"]
+    size, peak = np.array(sizes), np.array(peaks)
+    own = ~extra
+    if size[extra].max() < 0.8 * size[own].min():
+        middle = np.sqrt(size[extra].max() * size[own].min())
+        return [f"{text}, all smaller than those that do: raise min_area to {middle:.0f}"]
+    if size[extra].min() > 1.25 * size[own].max():
+        middle = np.sqrt(size[extra].min() * size[own].max())
+        return [f"{text}, all larger than those that do: set max_area = {middle:.0f}"]
+    if peak[extra].max() < peak[own].min():
+        level = (peak[extra].max() + peak[own].min()) / 2
+        word = "fainter" if options.polarity == "bright" else "less dark"
+        return [
+            f"{text}, all {word} than those that do: set threshold = "
+            f"{_in_image(level, image, options):.0f}"
+        ]
+    return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
+
+
+def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
+    """Advice without a pose: only the number of features is known."""
+    options = finding.setup.extract
+    if finding.count < 0.8 * len(body):
+        lines = []
+        areas = _pieces(scene)[1] if options.method == "blobs" else np.zeros(0, np.int32)
+        small = areas[(areas > _SPECK_PX) & (areas < options.min_area)]
+        if len(small):
+            lines.append(
+                f"{len(small)} pieces above the threshold are too small, the largest of "
+                f"{small.max()} px: lower min_area = {options.min_area:g}"
+            )
+        large = areas[areas > (options.max_area or np.inf)]
+        if len(large):
+            lines.append(
+                f"{len(large)} pieces above the threshold are too large, the smallest of "
+                f"{large.min()} px: raise max_area = {options.max_area:g}"
+            )
+        polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
+        return lines or [f"too few: {_direction(options, lower=True)}{polarity}"]
+    if finding.count > 3 * len(body):
+        return [f"too many: {_stricter(options)}"]
+    return []
+
+
+def _about_others(finding: Finding, body: Body) -> list[str]:
+    """Advice for corners and for the user's own method."""
+    options = finding.setup.extract
+    expected = finding.expectation
+    if expected is None:
+        few, many = finding.count < 0.8 * len(body), finding.count > 3 * len(body)
+        missing, extra = "fewer than the object has", "far more than the object has"
+    else:
+        lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
+        few, many = bool(lost), bool(expected.unexplained.any())
+        missing = f"not met: {_some(lost)}" if lost else ""
+        extra = f"{int(expected.unexplained.sum())} found belong to no feature"
+    lower = raised = f"{options.method} does not tell them"
+    if options.method == "corners":
+        lower, raised = (_direction(options, lower=way) for way in (True, False))
+    lines = []
+    if few:
+        lines.append(f"{missing}; hidden, or {lower}")
+    if many:
+        lines.append(f"{extra}; clutter is allowed for, or {raised}")
+    return lines
+
+
+def _about_measurements(finding: Finding, body: Body) -> list[str]:
+    """Advice for tables of detections and range profiles, which have no threshold."""
+    expected = finding.expectation
+    lines = []
+    if finding.points is None:
+        if finding.count > 2 * len(body):
+            lines.append(
+                "far more echoes than features: noise fills the profile; take its floor off, or "
+                "raise extract.sigma"
+            )
+        return lines
+    if expected is None:
+        return lines
+    lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
+    if lost:
+        lines.append(f"not met: {_some(lost)}; not in the table, or farther off than sigma allows")
+    extra = int(expected.unexplained.sum())
+    if extra:
+        lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
+    return lines
+
+
+def _about_sigma(finding: Finding) -> list[str]:
+    expected = finding.expectation
+    if expected is None or expected.rms is None or expected.rms < _LOOSE_RMS * finding.sigma:
+        return []
+    return [
+        f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
+        f"extract.sigma to about {expected.rms:.2g}, or check calibration and markers"
+    ]
+
+
+def _scene(image: Image, options: ExtractOptions) -> Foreground:
+    return foreground(image, options, (0, 0, image.shape[1], image.shape[0]))
+
+
+def _bright(image: Image, options: ExtractOptions) -> Floats:
+    """Grey values with features bright."""
+    values = image.astype(np.float64)
+    return values if options.polarity == "bright" else _highest(image) - values
+
+
+def _in_image(level: float, image: Image, options: ExtractOptions) -> float:
+    """A grey level of `_bright` as the session file wants it."""
+    return level if options.polarity == "bright" else _highest(image) - level
+
+
+def _highest(image: Image) -> float:
+    if image.dtype == np.float32:
+        return float(image.max())
+    return 255.0 if image.dtype == np.uint8 else 65535.0
+
+
+def _pieces(scene: Foreground) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Connected pieces above the threshold: a label per pixel, and the area of each; 0 is none."""
+    mask = above(scene.grey, scene.zero + scene.level)
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
+    areas = np.asarray(statistics[:, cv2.CC_STAT_AREA], dtype=np.int32)
+    areas[0] = 0
+    return np.asarray(labels, dtype=np.int32), areas
+
+
+def _around(place: Floats, radius: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """A box about a place in view, at least one pixel."""
+    u, v = (int(np.clip(round(x), 0, n - 1)) for x, n in zip(place, shape[::-1], strict=True))
+    r = max(round(radius), 1)
+    return slice(max(v - r, 0), v + r + 1), slice(max(u - r, 0), u + r + 1)
+
+
+def _between(peak: float, raw: Floats) -> float:
+    """A level between a faint peak and the background."""
+    return (peak + float(np.median(raw))) / 2
+
+
+def _looser(options: ExtractOptions, level: float, raw: Floats, image: Image) -> str:
+    if float(np.mean(raw > level)) > _FLOODED:
+        return 'set threshold = "local", as the background is as bright elsewhere'
+    direction = "lower" if options.polarity == "bright" else "raise"
+    return f"{direction} it: threshold = {_in_image(level, image, options):.0f}"
+
+
+def _stricter(options: ExtractOptions) -> str:
+    areas = f", raise min_area = {options.min_area:g} or set max_area"
+    return _direction(options, lower=False) + (areas if options.method == "blobs" else "")
+
+
+def _direction(options: ExtractOptions, *, lower: bool) -> str:
+    """How the threshold is to be moved, which for dark features is the other way round."""
+    down = lower == (options.polarity == "bright" or options.method == "corners")
+    now = options.threshold
+    if isinstance(now, str):
+        return f'{"lower" if down else "raise"} threshold = "{now}" by giving a grey level'
+    return f"{'lower' if down else 'raise'} threshold = {now:g}"
+
+
+def _some(features: Iterable[int]) -> str:
+    """Numbers of features, for people."""
+    features = list(features)
+    shown = ", ".join(str(i) for i in features[:_LISTED])
+    more = len(features) - _LISTED
+    return f"feature{'s' * (len(features) != 1)} {shown}" + (f" and {more} more" * (more > 0))

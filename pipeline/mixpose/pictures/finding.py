@@ -1,0 +1,160 @@
+"""What one sensor found in a frame, against what a pose expects there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.estimation.meeting import LEAST_SHARE, Meeting, meet
+from mixpose.objective import View, matched_objective
+from mixpose.objective.base import facing
+from mixpose.pictures.overlay import projected_features
+from mixpose.records import Estimate, PointPattern, RawFrame
+from mixpose.rigid import transform
+from mixpose.session import SensorSetup
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a pose expects of one sensor, and how far that is met.
+
+    Attributes
+    ----------
+    y : (N, m) float64
+        Where the features are expected.
+    seen : (N,) bool
+        Which of them are in view and face the sensor.
+    met : (N,) bool
+        Which of those were found there.
+    unexplained : (M,) bool
+        Which of the found points (if points they are) belong to no feature.
+    explained : float
+        Share of the sensor's density that the pose accounts for.
+    rms : float or None
+        Residual of the met features, sensor units.
+    """
+
+    y: Floats
+    seen: Mask
+    met: Mask
+    unexplained: Mask
+    explained: float
+    rms: float | None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sensor's frame, the features found in it, and what a pose expects.
+
+    Attributes
+    ----------
+    frame : RawFrame or None
+        None where the sensor has no frame of this number.
+    view : View or None
+        None where it has no frame.
+    points : (M, m) float64 or None
+        The features, where the extraction gives points.
+    count : float
+        Number of points found, or of as many points of light as give the energy of a grid.
+    expectation : Expectation or None
+        None without a pose or without features.
+    """
+
+    setup: SensorSetup
+    frame: RawFrame | None
+    view: View | None
+    points: Floats | None
+    count: float
+    expectation: Expectation | None
+
+    @property
+    def name(self) -> str:
+        """Of the sensor."""
+        return self.setup.name
+
+    @property
+    def sigma(self) -> float:
+        """Finest standard deviation of a feature, sensor units."""
+        return self.setup.extract.sigma if self.view is None else self.view.observation.sigma
+
+
+def find(
+    setups: Sequence[SensorSetup],
+    frames: Mapping[str, RawFrame],
+    views: Sequence[View],
+    body: Body,
+    estimate: Estimate,
+) -> list[Finding]:
+    """Compare what every sensor found with what the estimate expects of it."""
+    by_name = {view.name: view for view in views}
+    return [
+        _finding(setup, frames.get(setup.name), by_name.get(setup.name), body, estimate)
+        for setup in setups
+    ]
+
+
+def _finding(
+    setup: SensorSetup, frame: RawFrame | None, view: View | None, body: Body, estimate: Estimate
+) -> Finding:
+    if view is None:
+        return Finding(setup, frame, None, None, 0.0, None)
+    pattern = view.observation.pattern
+    points = pattern.points if isinstance(pattern, PointPattern) else None
+    count = float(len(points)) if points is not None else _features_worth(view)
+    T = estimate.T_world_object
+    expectation = None if T is None else _expect(view, body, T, points)
+    return Finding(setup, frame, view, points, count, expectation)
+
+
+def _features_worth(view: View) -> float:
+    """How many equal features would have the energy of a grid pattern."""
+    sigma = view.observation.sigma
+    top = (4 * np.pi * sigma**2) ** (-view.sensor.dimension / 2)
+    energy = view.observation.energy(sigma)
+    return float(top / energy) if energy > 0 else 0.0
+
+
+def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expectation:
+    y, _, seen = projected_features(view.sensor, body, T)
+    nodes, nodes_seen = _nodes(view, body, T)
+    meeting = _meeting(view, body, T)
+    met = np.zeros(len(body), dtype=np.bool_)
+    if meeting is not None:
+        feature = body.nodes.feature[nodes_seen]
+        shares = np.bincount(feature, meeting.shares, minlength=len(body))
+        full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
+        met = seen & (shares > LEAST_SHARE * full)
+    unexplained = np.zeros(0, dtype=np.bool_)
+    if points is not None:
+        away = np.linalg.norm(points[:, None] - nodes[nodes_seen], axis=-1)
+        reach = 2 * view.observation.sigma * np.sqrt(-np.log(LEAST_SHARE))
+        unexplained = away.min(axis=1, initial=np.inf) > reach
+    explained = 0.0 if meeting is None else meeting.explained
+    return Expectation(
+        y, seen, met, unexplained, explained, None if meeting is None else meeting.rms
+    )
+
+
+def _meeting(view: View, body: Body, T: Floats) -> Meeting | None:
+    """The pose against the sensor's density; None where the sensor has nothing of either."""
+    if view.observation.is_empty:
+        return None
+    objective = matched_objective([view], body, [view.observation.sigma], T, fine=True)
+    if not objective.stacks:
+        return None
+    return meet(objective.stacks[0], [view.observation], T)[0]
+
+
+def _nodes(view: View, body: Body, T: Floats) -> tuple[Floats, Mask]:
+    """Sensor coordinates (Q, m) of the body's nodes, and which of them it sees."""
+    points = transform(T, body.nodes.points)
+    y, seen = view.sensor.project(points)
+    return y, seen & facing(view.sensor, T, points, body.node_normals)

@@ -1,0 +1,182 @@
+"""Where an overlay goes: a video, or a folder with a picture per frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol
+
+import cv2
+
+from mixpose.errors import SessionError
+from mixpose.objective import View
+from mixpose.pictures.canvas import Picture
+from mixpose.pictures.layout import fit_into
+from mixpose.pictures.scene import draw_scene
+from mixpose.pictures.signature import is_ours, refuse_foreign, sign_video, write_png
+from mixpose.records import Estimate, FrameSet
+from mixpose.session import Session
+
+CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
+"""Codecs by extension, of those that OpenCV's wheels bring along."""
+
+_PICTURES = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"}
+_DEFAULT_FPS = 25.0
+_SLOWEST, _FASTEST = 0.5, 120.0
+
+
+class Sink(Protocol):
+    """Takes the pictures of an overlay, frame by frame."""
+
+    def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
+        """Take the picture of the next frame."""
+
+    def close(self) -> None:
+        """Finish what was written."""
+
+
+class Overlay:
+    """Draws every frame of a run and hands the pictures on; a context for ``run(watch=...)``.
+
+    Parameters
+    ----------
+    session : Session
+    path : Path
+        A video by its extension (.mp4, .mkv, .avi), else a folder.
+    resume : bool
+        Go on in a folder.
+
+    Raises
+    ------
+    SessionError
+        If the path is none of these, or holds something that mixpose did not write.
+    """
+
+    def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
+        self._session = session
+        self._sink = _sink(path, resume)
+
+    def __enter__(self) -> Overlay:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._sink.close()
+
+    def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        """Draw one frame."""
+        picture = draw_scene(self._session, frame_set, estimate)
+        self._sink.add(picture, estimate.frame, estimate.time_s)
+
+
+def _sink(path: Path, resume: bool) -> Sink:
+    if not path.parent.is_dir():
+        raise SessionError(f"--overlay {path}: there is no folder {path.parent}")
+    suffix = path.suffix.casefold()
+    if path.is_dir() or not suffix:
+        return FolderSink(path, resume=resume)
+    if suffix not in CODECS:
+        raise SessionError(
+            f"--overlay {path}: found the extension {suffix}, allowed are {', '.join(CODECS)} for "
+            "a video, and a name without one for a folder of pictures"
+        )
+    if resume:
+        raise SessionError(
+            f"--overlay {path}: --resume cannot go on in a video; name a folder, which gets a "
+            "picture per frame"
+        )
+    return VideoSink(path)
+
+
+class FolderSink:
+    """Writes ``overlay_000012.png`` and so on into a folder, made with the first of them."""
+
+    def __init__(self, folder: Path, *, resume: bool = False) -> None:
+        self._folder = folder
+        if folder.exists() and not folder.is_dir():
+            raise SessionError(f"--overlay {folder}: is a file; name a folder or a video")
+        self._earlier: list[Path] = []
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if path.suffix.casefold() in _PICTURES and path.is_file():
+                if not is_ours(path):
+                    raise SessionError(
+                        f"--overlay {folder}: holds {path.name}, which mixpose did not write; "
+                        "name another folder"
+                    )
+                if not resume and path.match("overlay_*.png"):
+                    self._earlier.append(path)
+
+    def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
+        """Write the picture of a frame; the first one replaces those of an earlier run."""
+        try:
+            self._folder.mkdir(exist_ok=True)
+            for path in self._earlier:
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise SessionError(
+                f"--overlay {self._folder}: cannot be written: {error.strerror}"
+            ) from error
+        self._earlier = []
+        write_png(self._folder / f"overlay_{frame:06d}.png", picture)
+
+    def close(self) -> None:
+        """Nothing is left to do: every picture is whole."""
+
+
+class VideoSink:
+    """Writes a video that plays as fast as the frames were taken, where they have times."""
+
+    def __init__(self, path: Path) -> None:
+        refuse_foreign(path, "--overlay")
+        self._path = path
+        self._first: tuple[Picture, float | None] | None = None
+        self._writer: cv2.VideoWriter | None = None
+        self._size = (0, 0)
+
+    def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
+        """Write the picture of a frame; the first waits for the second, which tells the rate."""
+        if self._writer is None and self._first is None:
+            self._first = picture, time_s
+            return
+        if self._first is not None:
+            self._open(_rate(self._first[1], time_s))
+        self._write(picture)
+
+    def close(self) -> None:
+        """Finish the file and sign it."""
+        if self._first is not None:
+            self._open(_DEFAULT_FPS)
+        if self._writer is not None:
+            self._writer.release()
+            sign_video(self._path)
+
+    def _open(self, fps: float) -> None:
+        if self._first is None:
+            return
+        picture, self._first = self._first[0], None
+        # codecs want even sides
+        self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
+        codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
+        self._writer = cv2.VideoWriter(str(self._path), codec, fps, self._size)
+        if not self._writer.isOpened():
+            self._writer = None
+            raise SessionError(
+                f"--overlay {self._path}: cannot be written as a video; name an .avi, or a folder"
+            )
+        self._write(picture)
+
+    def _write(self, picture: Picture) -> None:
+        if self._writer is not None:
+            self._writer.write(fit_into(picture, self._size))
+
+
+def _rate(first: float | None, second: float | None) -> float:
+    """Frames per second from the times of two frames."""
+    if first is None or second is None or second <= first:
+        return _DEFAULT_FPS
+    return min(max(1 / (second - first), _SLOWEST), _FASTEST)

@@ -1,0 +1,261 @@
+"""A pose drawn on the frame of a camera: features, their uncertainty, the object's axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.objective import pose_jacobian
+from mixpose.objective.base import facing
+from mixpose.pictures.canvas import (
+    GREY,
+    WHITE,
+    Colour,
+    Picture,
+    cross,
+    line_height,
+    polyline,
+    ring,
+    stroke,
+    words,
+)
+from mixpose.records import Status
+from mixpose.rigid import transform
+from mixpose.sensors import Sensor
+
+Floats: TypeAlias = NDArray[np.float64]
+
+STATUS_COLOURS: dict[Status, Colour] = {
+    "ok": (90, 230, 70),
+    "ambiguous": (0, 180, 255),
+    "lost": (80, 80, 255),
+}
+FOUND: Colour = (255, 220, 60)
+AXES: tuple[tuple[str, Colour], ...] = (
+    ("x", (80, 80, 255)),
+    ("y", (90, 230, 70)),
+    ("z", (255, 150, 60)),
+)
+
+CHI2_95 = {1: 3.841, 2: 5.991}
+"""Squared standard deviations that hold 95 % of a Gaussian of one or two coordinates."""
+
+_AXIS_SHARE = 0.5  # of the body's radius
+_AXIS_PIECES = 24  # an axis is bent by the lens
+_MARK_PX = 7.0
+_CLEAR_SHARE = 0.3  # of the distance to the next feature that a mark takes
+_MOST_NUMBERS = 30  # features with their numbers beside them
+_LEAST_ELLIPSE_PX = 3.0  # of the larger half-axis; smaller ones hide behind the mark
+
+
+@dataclass(frozen=True)
+class Part:
+    """What a picture shows of a sensor: pixels from `corner` on, `zoom` times as large.
+
+    Attributes
+    ----------
+    zoom : float
+        Pixels of the picture per pixel of the sensor.
+    corner : (float, float)
+        The sensor's pixel (u, v) in the upper left.
+    """
+
+    zoom: float = 1.0
+    corner: tuple[float, float] = (0.0, 0.0)
+
+    def places(self, y: Floats) -> Floats:
+        """Places on the picture of sensor coordinates (..., 2)."""
+        return np.asarray((y - self.corner + 0.5) * self.zoom - 0.5)
+
+
+WHOLE = Part()
+
+
+def draw_pose(
+    image_bgr: Picture,
+    sensor: Sensor,
+    body: Body,
+    T_world_object: Floats | None,
+    covariance: Floats | None = None,
+    status: Status | None = None,
+    frame: int | None = None,
+    *,
+    part: Part = WHOLE,
+    found: Floats | None = None,
+    magnified: float = 1.0,
+) -> Picture:
+    """Draw a pose on a camera's frame.
+
+    Parameters
+    ----------
+    image_bgr : (H, W, 3) uint8
+        The frame, as of `mixpose.pictures.displayable`; it is left as it is.
+    sensor : Sensor
+        A camera.
+    body : Body
+    T_world_object : (4, 4) array or None
+        None draws no pose, as for a lost frame.
+    covariance : (6, 6) array or None
+        Of the pose, order of `mixpose.rigid`; draws the ellipse that holds a feature's place with
+        95 %, where it is large enough to be seen.
+    status : {"ok", "ambiguous", "lost"} or None
+        Written in the corner, and the colour of the features.
+    frame : int or None
+        Number of the frame, written in the corner.
+    part : Part
+        What the picture shows of the sensor, where the frame was cut or resized.
+    found : (M, 2) array or None
+        Features found in the frame, in pixels of the sensor; marked too.
+    magnified : float
+        Factor by which ellipses are drawn larger than they are.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        A new picture.
+    """
+    picture = np.ascontiguousarray(image_bgr).copy()
+    radius = _MARK_PX * stroke(picture)
+    if T_world_object is not None:
+        radius = mark_radius(picture, sensor, body, T_world_object, part)
+    for place in part.places(found) if found is not None else ():
+        cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
+    if T_world_object is not None:
+        colour = STATUS_COLOURS[status] if status is not None else STATUS_COLOURS["ok"]
+        _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
+        _draw_features(picture, sensor, body, T_world_object, part, colour)
+        _draw_axes(picture, sensor, body, T_world_object, part)
+    caption(picture, status, frame)
+    return picture
+
+
+def projected_features(
+    sensor: Sensor, body: Body, T_world_object: Floats
+) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Where a sensor has the features of a body.
+
+    Returns
+    -------
+    y : (N, m) float64
+    inside : (N,) bool
+        Whether the sensor can measure there.
+    seen : (N,) bool
+        Whether the feature also faces the sensor.
+    """
+    points = transform(T_world_object, body.means)
+    y, inside = sensor.project(points)
+    return y, inside, inside & facing(sensor, T_world_object, points, body.normals)
+
+
+def projected_covariances(
+    sensor: Sensor, body: Body, T_world_object: Floats, covariance: Floats
+) -> Floats:
+    """Covariances (N, m, m) of the projected features that the pose's covariance (6, 6) makes."""
+    _, by_world, _ = sensor.linearise(transform(T_world_object, body.means))
+    J = pose_jacobian(by_world, T_world_object, body.means)
+    return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
+
+
+def ellipse_95(covariance: Floats) -> Floats:
+    """Points (n, 2) about the origin of the ellipse that holds 95 % of a Gaussian (2, 2)."""
+    values, vectors = np.linalg.eigh(covariance)
+    turn = np.linspace(0, 2 * np.pi, 65)[:-1]
+    circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return np.asarray((circle * np.sqrt(CHI2_95[2] * np.maximum(values, 0))) @ vectors.T)
+
+
+def _draw_features(
+    picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part, colour: Colour
+) -> None:
+    radius = mark_radius(picture, sensor, body, T, part)
+    nodes, inside = sensor.project(transform(T, body.nodes.points))
+    for feature in np.flatnonzero(np.bincount(body.nodes.feature) > 1):
+        along = inside & (body.nodes.feature == feature)
+        polyline(picture, part.places(nodes[along]), colour)
+    y, inside, seen = projected_features(sensor, body, T)
+    for i, place in enumerate(part.places(y)):
+        if not inside[i]:
+            continue
+        if not seen[i]:  # turned away
+            ring(picture, place, radius / 2, GREY)
+            continue
+        ring(picture, place, radius, colour)
+        if len(body) <= _MOST_NUMBERS:
+            beside = (place[0] + 1.2 * radius, place[1] - 0.9 * radius)
+            words(picture, str(i), beside, colour, size=0.8)
+
+
+def mark_radius(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> float:
+    """Radius in px of a feature's ring: visible, and clear of the features beside it."""
+    y, _, seen = projected_features(sensor, body, T)
+    usual = _MARK_PX * stroke(picture)
+    return min(usual, max(_CLEAR_SHARE * part.zoom * median_gap(y[seen]), 3.0))
+
+
+def median_gap(y: Floats) -> float:
+    """Median distance of places (n, 2) from their nearest neighbours; infinite for a lone one."""
+    if len(y) < 2:
+        return float("inf")
+    apart = np.linalg.norm(y[:, None] - y, axis=-1)
+    np.fill_diagonal(apart, np.inf)
+    return float(np.median(apart.min(axis=1)))
+
+
+def _draw_ellipses(
+    picture: Picture,
+    sensor: Sensor,
+    body: Body,
+    T: Floats,
+    covariance: Floats | None,
+    part: Part,
+    magnified: float,
+) -> None:
+    if covariance is None or not np.isfinite(covariance).all():
+        return
+    y, _, seen = projected_features(sensor, body, T)
+    spreads = projected_covariances(sensor, body, T, covariance)
+    for place, spread in zip(part.places(y)[seen], spreads[seen], strict=True):
+        outline = magnified * part.zoom * ellipse_95(spread)
+        if np.linalg.norm(outline, axis=1).max() >= _LEAST_ELLIPSE_PX * stroke(picture):
+            polyline(picture, place + outline, WHITE, closed=True)
+
+
+def _draw_axes(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> None:
+    """The object's axes at its origin, or amid the features where that is out of view."""
+    origin = np.zeros(3)
+    if not sensor.project(transform(T, origin[None]))[1].all():
+        origin = body.means.mean(axis=0)
+    length = _AXIS_SHARE * body.radius
+    centre, seen = sensor.project(transform(T, origin[None]))
+    if not seen.all():
+        return
+    start = part.places(centre[0])
+    # a feature at the origin stays visible
+    y, _, seen = projected_features(sensor, body, T)
+    radius = mark_radius(picture, sensor, body, T, part)
+    marked = np.linalg.norm(part.places(y[seen]) - start, axis=1).min(initial=np.inf) < radius
+    along = np.linspace(0.0, length, _AXIS_PIECES)[:, None]
+    for k, (name, colour) in enumerate(AXES):
+        y, inside = sensor.project(transform(T, origin + along * np.eye(3)[k]))
+        line = part.places(y[: len(inside) if inside.all() else int(np.argmin(inside))])
+        line = line[np.linalg.norm(line - start, axis=1) >= (1.3 * radius if marked else 0)]
+        if len(line) < 2:
+            continue
+        polyline(picture, line, colour, width=2)
+        shift = 0.3 * line_height(picture)
+        if np.linalg.norm(line[-1] - start) < 1.5 * line_height(picture):
+            continue  # letters would hide what they are beside
+        words(picture, name, (line[-1, 0] + shift, line[-1, 1] + shift), colour, size=0.9)
+
+
+def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
+    """Write number and status of a frame into the upper left corner, in place."""
+    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
+    if frame is not None:
+        u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
+    if status is not None:
+        words(picture, status, (u, v), STATUS_COLOURS[status])

@@ -1,0 +1,248 @@
+"""Plots with axes: range sensors, and the objective around a pose.  These need matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.errors import SessionError
+from mixpose.pictures.canvas import Picture
+from mixpose.pictures.finding import Finding
+from mixpose.pictures.overlay import ellipse_95
+from mixpose.pictures.ranges import half_widths_95
+from mixpose.pictures.slices import Map, Slice
+from mixpose.records import Estimate, GridPattern, PointPattern
+from mixpose.rigid import TWIST_NAMES
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_DPI = 100
+_MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"
+_AROUND = 0.6  # of the extent of the expected ranges, shown around them
+_LEAST_AROUND = 6.0  # in σ
+
+
+def require_matplotlib() -> None:
+    """Make sure that plots can be made.
+
+    Raises
+    ------
+    SessionError
+        If matplotlib is not installed.
+    """
+    try:
+        import matplotlib.figure  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise SessionError(
+            "inspect: plots need matplotlib, which is not installed; pip install 'mixpose[plots]'"
+        ) from error
+
+
+def ranges_picture(
+    findings: Sequence[Finding],
+    sigmas: Sequence[Sequence[float]],
+    body: Body,
+    estimate: Estimate,
+    unit: str,
+    width: int,
+    row_height: int,
+) -> Picture:
+    """Range sensors one below the other: measurement, densities g, and the ranges of the pose.
+
+    Parameters
+    ----------
+    findings : sequence of Finding
+        Of range sensors.
+    sigmas : sequence of sequence of float
+        Blurs of each sensor whose density is drawn, coarse to fine.
+    body, estimate
+    unit : str
+        Of lengths.
+    width, row_height : int
+        Of the picture and of a sensor, in px.
+    """
+    figure = _figure(width, row_height * len(findings))
+    rows = figure.subplots(len(findings), 1, squeeze=False)[:, 0]
+    for axes, finding, blurs in zip(rows, findings, sigmas, strict=True):
+        _plot_ranges(axes, finding, blurs, body, estimate)
+    rows[0].legend(fontsize=7, loc="upper right")
+    rows[-1].set_xlabel(f"range, {unit}")
+    return _raster(figure)
+
+
+def objective_picture(
+    slices: Sequence[Slice],
+    maps: Sequence[Map],
+    levels: Sequence[float],
+    covariance: Floats | None,
+    unit: str,
+    width: int,
+) -> Picture:
+    """Slices and maps of the objective.
+
+    Parameters
+    ----------
+    slices, maps
+        As of `objective_around`.
+    levels : sequence of float
+        Blur of each level in units of the finest.
+    covariance : (6, 6) array or None
+        Its 95 % ellipses are drawn on the maps.
+    unit : str
+        Of lengths.
+    width : int
+        In px.
+    """
+    import matplotlib as mpl  # noqa: PLC0415 - heavy
+
+    heights = [290, 470] if maps else [290]
+    figure = _figure(width, sum(heights))
+    parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    rows = parts[0].subplots(1, max(len(slices), 3), squeeze=False)[0]
+    colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(levels)))
+    for axes in rows[len(slices) :]:
+        axes.set_axis_off()
+    for k, (axes, one) in enumerate(zip(rows, slices, strict=False)):
+        for values, colour, level in zip(one.values, colours, levels, strict=True):
+            label = "σ" if level < 1.001 else f"{level:.2g} σ"
+            axes.plot(_shown(one.offsets, one.direction), values, color=colour, label=label)
+        axes.axvline(0, color="0.6", lw=0.8, ls=":")
+        axes.set_xlabel(_label(one.direction, unit))
+        axes.set_ylim(0, 1.05)
+        axes.locator_params(axis="x", nbins=5)
+        if k == 0:
+            axes.set_ylabel("objective / its largest")
+            axes.legend(fontsize=7, title="blur", title_fontsize=7, loc="upper right")
+        else:
+            axes.set_yticklabels([])
+    for axes, surface in zip(parts[-1].subplots(1, max(len(maps), 1), squeeze=False)[0], maps):
+        _plot_map(axes, surface, covariance, unit)
+    return _raster(figure)
+
+
+def _plot_map(axes: Axes, one: Map, covariance: Floats | None, unit: str) -> None:
+    i, j = one.directions
+    across, up = _shown(one.offsets[0], i), _shown(one.offsets[1], j)
+    axes.contourf(across, up, one.values, levels=np.linspace(min(one.values.min(), 0), 1, 21))
+    axes.plot(0, 0, "+", color="white", ms=9)
+    title = "finest blur"
+    if covariance is not None and np.isfinite(covariance).all():
+        outline = ellipse_95(covariance[np.ix_([i, j], [i, j])])
+        scale = _magnification(outline, one)
+        closed = np.vstack([outline, outline[:1]]) * scale
+        axes.plot(_shown(closed[:, 0], i), _shown(closed[:, 1], j), color="white", lw=1.2)
+        title += "; 95 % ellipse" + (f", {scale} times as large" if scale > 1 else "")
+    axes.locator_params(nbins=7)
+    axes.set_xlim(across[0], across[-1])
+    axes.set_ylim(up[0], up[-1])
+    axes.set_xlabel(_label(i, unit))
+    axes.set_ylabel(_label(j, unit))
+    axes.set_title(title, fontsize=9)
+
+
+def _magnification(outline: Floats, one: Map) -> int:
+    """A round factor that makes an ellipse large enough to be seen on a map."""
+    share = max(float(np.abs(outline[:, k]).max() / one.offsets[k].max()) for k in range(2))
+    return next((n for n in (1, 2, 5, 10, 20, 50, 100, 200, 500) if n * share >= 0.15), 1000)
+
+
+def _plot_ranges(
+    axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
+) -> None:
+    """One range sensor; everything is scaled to its own height."""
+    axes.set_title(_range_title(finding), fontsize=9, loc="left")
+    axes.set_yticks([])
+    axes.set_ylim(-0.03, 1.55)
+    if finding.view is None:
+        axes.text(0.5, 0.5, "no frame", transform=axes.transAxes, ha="center")
+        return
+    low, high = _span(finding)
+    pattern = finding.view.observation.pattern
+    if isinstance(pattern, GridPattern):
+        ranges = pattern.origin[0] + pattern.step * np.arange(pattern.values.shape[1])
+        inside = (ranges >= low) & (ranges <= high)
+        top = max(float(pattern.values[0, inside].max(initial=0)), 1e-30)
+        axes.plot(ranges, pattern.values[0] / top, color=_MEASURED, lw=1.2, label="profile")
+    elif isinstance(pattern, PointPattern):
+        axes.vlines(pattern.points[:, 0], 0, 1, color=_MEASURED, lw=1.5, label="measured")
+    if not finding.view.observation.is_empty:
+        shades = np.linspace(0.75, 0.35, len(blurs))
+        for sigma, shade in zip(blurs, shades, strict=True):
+            ends = np.array([low]), np.array([high])
+            g = finding.view.observation.density(sigma, ends)
+            values = np.ravel(g.values)
+            axes.fill_between(
+                g.window.axis(0),
+                values / max(float(values.max()), 1e-30),
+                color=str(shade),
+                alpha=0.45,
+                lw=0,
+                label=f"g, σ = {sigma:.2g}",
+            )
+    _plot_expected(axes, finding, body, estimate)
+    axes.set_xlim(low, high)
+
+
+def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate) -> None:
+    expected = finding.expectation
+    if expected is None or estimate.T_world_object is None:
+        return
+    sensor, T = finding.setup.sensor, estimate.T_world_object
+    spread = half_widths_95(sensor, body, T, estimate.covariance)
+    for n, i in enumerate(np.flatnonzero(expected.seen)):
+        r = float(expected.y[i, 0])
+        label = "pose, 95 %" if n == 0 else None
+        axes.errorbar(
+            r, 1.08, xerr=spread[i], fmt="v", ms=5, color=_EXPECTED, capsize=2, label=label
+        )
+        axes.text(r, 1.2, str(i), color=_EXPECTED, ha="center", fontsize=8)
+
+
+def _span(finding: Finding) -> tuple[float, float]:
+    """The ranges worth showing: around what is expected, else all that was measured."""
+    if finding.view is None or (finding.expectation is None and finding.view.observation.is_empty):
+        return 0.0, 1.0
+    shown = np.zeros(0)
+    if finding.expectation is not None:
+        shown = finding.expectation.y[finding.expectation.seen, 0]
+    if not len(shown):
+        shown = np.concatenate(finding.view.observation.extent)
+    margin = max(_AROUND * float(np.ptp(shown)), _LEAST_AROUND * finding.sigma)
+    return float(shown.min()) - margin, float(shown.max()) + margin
+
+
+def _range_title(finding: Finding) -> str:
+    if finding.points is None:
+        return f"{finding.name}: echoes as of {finding.count:.1f} points"
+    return f"{finding.name}: {len(finding.points)} ranges"
+
+
+def _shown(offsets: Floats, direction: int) -> Floats:
+    return np.degrees(offsets) if direction >= 3 else offsets
+
+
+def _label(direction: int, unit: str) -> str:
+    return f"{TWIST_NAMES[direction]}, {'deg' if direction >= 3 else unit}"
+
+
+def _figure(width: int, height: int) -> Figure:
+    from matplotlib.figure import Figure  # noqa: PLC0415 - heavy, and an extra
+
+    return Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
+
+
+def _raster(figure: Figure) -> Picture:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()
+    rgba = np.asarray(canvas.buffer_rgba())
+    return np.ascontiguousarray(rgba[..., 2::-1], dtype=np.uint8)

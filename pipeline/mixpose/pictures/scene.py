@@ -1,0 +1,144 @@
+"""All sensors of one moment in one picture, with the pose: a frame of an overlay."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, line_height, ring, stroke, words
+from mixpose.pictures.display import displayable
+from mixpose.pictures.layout import columns_for, in_grid, stacked
+from mixpose.pictures.overlay import FOUND, Part, caption, draw_pose
+from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
+from mixpose.records import Estimate, FrameSet, GridPattern, PointPattern, RawFrame
+from mixpose.session import SensorSetup, Session
+
+Floats: TypeAlias = NDArray[np.float64]
+
+LARGEST = (1920, 1080)
+_MOST_ENLARGED = 2
+_BLANK_SIZE = (640, 480)
+_DETECTION_PX = 2.5
+
+
+def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Picture:
+    """Draw the frames of all sensors with the pose that was estimated from them.
+
+    Cameras stand side by side, range sensors are strips below them.
+
+    Parameters
+    ----------
+    session : Session
+    frame_set : FrameSet
+    estimate : Estimate
+        Of these frames.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        The same size for every frame, as long as the frames are.
+    """
+    cameras = [setup for setup in session.sensors if setup.sensor.dimension == 2]
+    strips = [setup for setup in session.sensors if setup.sensor.dimension == 1]
+    rows: list[Picture] = []
+    if cameras:
+        columns = columns_for(len(cameras))
+        room = LARGEST[0] // columns, LARGEST[1] // -(-len(cameras) // columns)
+        panels = [_camera(session.body, one, frame_set, estimate, room) for one in cameras]
+        for panel, setup in zip(panels, cameras, strict=True):
+            if setup.name not in frame_set.frames:
+                _name(panel, f"{setup.name}: no frame", GREY)
+            elif len(cameras) > 1:
+                _name(panel, setup.name, WHITE)
+        rows.append(in_grid(panels, columns))
+    else:
+        head = np.full((36, STRIP_SIZE[0], 3), BACKGROUND, np.uint8)
+        caption(head, estimate.status, estimate.frame)
+        rows.append(head)
+    rows += [_strip(session.body, setup, frame_set, estimate) for setup in strips]
+    return stacked(rows)
+
+
+def backdrop(
+    setup: SensorSetup, frame: RawFrame | None, room: tuple[int, int] | None
+) -> tuple[Picture, Part]:
+    """A camera's frame as a picture that fits into some room, before anything is drawn on it.
+
+    Without a room it keeps its size.
+
+    Where the camera has detections in place of images they are dots on a dark ground.
+    """
+    data = None if frame is None else frame.data
+    if data is None or isinstance(data, PointPattern | GridPattern):
+        width, height = setup.resolution or _size_of(data)
+        zoom = _zoom((width, height), room)
+        shape = max(round(height * zoom), 1), max(round(width * zoom), 1), 3
+        picture = np.full(shape, BACKGROUND, np.uint8)
+        part = Part(zoom)
+        if isinstance(data, PointPattern):
+            for place in part.places(data.points):
+                ring(picture, place, _DETECTION_PX * stroke(picture), FOUND)
+        return picture, part
+    zoom = _zoom((data.shape[1], data.shape[0]), room)
+    if zoom != 1:
+        size = max(round(data.shape[1] * zoom), 1), max(round(data.shape[0] * zoom), 1)
+        way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
+        return displayable(cv2.resize(data, size, interpolation=way)), Part(zoom)
+    return displayable(data), Part()
+
+
+def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
+    """Factor by which a picture fits into some room; small ones grow a little, by whole pixels."""
+    if room is None:
+        return 1.0
+    zoom = min(room[0] / size[0], room[1] / size[1])
+    return zoom if zoom < 1 else float(min(int(zoom), _MOST_ENLARGED))
+
+
+def _size_of(data: PointPattern | GridPattern | None) -> tuple[int, int]:
+    """A size that holds detections of a camera that states no resolution."""
+    if not isinstance(data, PointPattern) or not len(data.points):
+        return _BLANK_SIZE
+    width, height = np.ceil(1.1 * data.points.max(axis=0)).astype(int)
+    return max(int(width), _BLANK_SIZE[0]), max(int(height), _BLANK_SIZE[1])
+
+
+def _camera(
+    body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate, room: tuple[int, int]
+) -> Picture:
+    frame = frame_set.frames.get(setup.name)
+    picture, part = backdrop(setup, frame, room)
+    return draw_pose(
+        picture,
+        setup.sensor,
+        body,
+        estimate.T_world_object,
+        estimate.covariance,
+        estimate.status,
+        estimate.frame,
+        part=part,
+    )
+
+
+def _strip(body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate) -> Picture:
+    frame = frame_set.frames.get(setup.name)
+    data = None if frame is None else frame.data
+    return draw_ranges(
+        setup.name,
+        data if isinstance(data, PointPattern | GridPattern) else None,
+        setup.sensor,
+        body,
+        estimate.T_world_object,
+        estimate.covariance,
+        estimate.status,
+    )
+
+
+def _name(picture: Picture, name: str, colour: Colour) -> None:
+    """Write a sensor's name below the caption."""
+    place = 0.5 * line_height(picture), 2.1 * line_height(picture)
+    words(picture, name, place, colour, size=0.9)

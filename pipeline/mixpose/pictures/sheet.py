@@ -1,0 +1,176 @@
+"""All pictures of one inspected frame, and the sheet that puts them together."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.estimation import Tracker
+from mixpose.estimation.annealing import RATIO, ladder
+from mixpose.objective import View
+from mixpose.pictures.canvas import WHITE, Picture, words
+from mixpose.pictures.finding import Finding
+from mixpose.pictures.layout import in_grid, stacked
+from mixpose.pictures.overlay import STATUS_COLOURS
+from mixpose.pictures.plots import objective_picture, ranges_picture
+from mixpose.pictures.slices import objective_around
+from mixpose.pictures.stages import (
+    densities_picture,
+    features_picture,
+    pose_picture,
+    threshold_picture,
+)
+from mixpose.records import Estimate
+from mixpose.session import SensorSetup, Session
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_LARGE = (1400, 1050)  # room of a picture of its own
+_SMALL = (460, 345)  # and on the sheet
+_WIDTH = 4 * _SMALL[0] + 12
+_BLURS_ON_SHEET = 4
+_LEVELS_WITHOUT_POSE = 4
+_RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
+
+
+def inspection_pictures(
+    session: Session, tracker: Tracker, findings: Sequence[Finding], estimate: Estimate
+) -> dict[str, Picture]:
+    """Make all pictures of one frame.
+
+    Parameters
+    ----------
+    session : Session
+    tracker : Tracker
+        Of the session: how far from its pose a search begins, and with it the widest blur.
+    findings : sequence of Finding
+        One per sensor.
+    estimate : Estimate
+
+    Returns
+    -------
+    dict of str to (H, W, 3) uint8
+        By file name, ``sheet.png`` first.
+    """
+    body, C = session.body, estimate.covariance
+    views = [
+        finding.view
+        for finding in findings
+        if finding.view is not None and not finding.view.observation.is_empty
+    ]
+    blurs = blur_levels(views, tracker, estimate)
+    pictures: dict[str, Picture] = {}
+    rows = [_heading(session, estimate)]
+    names = _file_names(session.sensors)
+    for finding, name in zip(findings, names, strict=True):
+        if finding.setup.sensor.dimension != 2:
+            continue
+        sigmas = blurs.get(finding.name, [])
+        made = _camera_pictures(finding, session, estimate, sigmas)
+        pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
+        rows.append(_camera_row(finding, session, estimate, sigmas))
+    ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
+    if ranged:
+        ends = [_ends(blurs.get(finding.name, [])) for finding in ranged]
+        height = _RANGE_ROW if len(ranged) <= 4 else _LOW_RANGE_ROW
+        picture = ranges_picture(ranged, ends, body, estimate, session.unit, _WIDTH, height)
+        pictures["ranges.png"] = picture
+        rows.append(picture)
+    if estimate.T_world_object is not None and views:
+        pictures["objective.png"] = _objective(session, views, blurs, estimate.T_world_object, C)
+        rows.append(pictures["objective.png"])
+    return {"sheet.png": stacked(rows), **pictures}
+
+
+def _objective(
+    session: Session,
+    views: Sequence[View],
+    blurs: Mapping[str, Sequence[float]],
+    T: Floats,
+    covariance: Floats | None,
+) -> Picture:
+    levels = list(zip(*(blurs[view.name] for view in views), strict=True))
+    slices, maps = objective_around(views, session.body, T, covariance, session.estimator, levels)
+    factors = [max(a / b for a, b in zip(level, levels[-1])) for level in levels]
+    return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
+
+
+def possible_names(setups: Sequence[SensorSetup]) -> list[str]:
+    """Names of all files that `inspection_pictures` may make."""
+    stages = ("features", "threshold", "density", "pose")
+    names = [f"{name}_{stage}.png" for name in _file_names(setups) for stage in stages]
+    return ["sheet.png", "objective.png", "ranges.png", *names]
+
+
+def blur_levels(
+    views: Sequence[View], tracker: Tracker, estimate: Estimate
+) -> dict[str, list[float]]:
+    """Blurs that the estimator descends through, coarse to fine, by sensor."""
+    if not views:
+        return {}
+    if estimate.T_world_object is None:
+        steps = range(_LEVELS_WITHOUT_POSE - 1, -1, -1)
+        return {view.name: [view.observation.sigma * RATIO**k for k in steps] for view in views}
+    around = np.where(tracker.free, tracker.start_uncertainty, 0.0)
+    levels = ladder(views, tracker.body, estimate.T_world_object, around)
+    return {view.name: [level[k] for level in levels] for k, view in enumerate(views)}
+
+
+def _camera_pictures(
+    finding: Finding, session: Session, estimate: Estimate, sigmas: Sequence[float]
+) -> dict[str, Picture]:
+    pictures = {
+        "features": features_picture(finding, _LARGE),
+        "threshold": threshold_picture(finding, _LARGE),
+        "pose": pose_picture(finding, session.body, estimate, _LARGE),
+    }
+    if finding.view is not None and sigmas:
+        T = estimate.T_world_object
+        pictures["density"] = densities_picture(
+            finding.view, session.body, T, sigmas, (460, 460), min(len(sigmas), 4)
+        )
+    return pictures
+
+
+def _camera_row(
+    finding: Finding, session: Session, estimate: Estimate, sigmas: Sequence[float]
+) -> Picture:
+    """One camera on the sheet: features, threshold, densities, pose."""
+    panels = [features_picture(finding, _SMALL), threshold_picture(finding, _SMALL)]
+    if finding.view is not None and sigmas:
+        chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, _BLURS_ON_SHEET)).astype(int))
+        half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - 2
+        few = [sigmas[k] for k in chosen]
+        T = estimate.T_world_object
+        panels.append(densities_picture(finding.view, session.body, T, few, half, 2))
+    panels.append(pose_picture(finding, session.body, estimate, _SMALL))
+    return in_grid(panels, 4, _SMALL)
+
+
+def _heading(session: Session, estimate: Estimate) -> Picture:
+    picture = np.zeros((40, _WIDTH, 3), np.uint8)
+    text = f"{session.path.name}, frame {estimate.frame}: "
+    u = words(picture, text, (10, 27), WHITE, size=1.2)
+    u = words(
+        picture, f"{estimate.status}  ", (u + 8, 27), STATUS_COLOURS[estimate.status], size=1.2
+    )
+    return picture
+
+
+def _ends(sigmas: Sequence[float]) -> list[float]:
+    """The coarsest and the finest blur."""
+    return list(dict.fromkeys([sigmas[0], sigmas[-1]])) if sigmas else []
+
+
+def _file_names(setups: Sequence[SensorSetup]) -> list[str]:
+    """Names of sensors that any file system takes, no two alike."""
+    names: list[str] = []
+    for setup in setups:
+        name = re.sub(r"[^\w.-]", "_", setup.name)
+        taken = {one.casefold() for one in names}
+        names.append(name if name.casefold() not in taken else f"{name}_{len(names)}")
+    return names

@@ -1,0 +1,85 @@
+"""Pictures and videos carry a signature, so that mixpose overwrites its own and nobody else's."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mixpose.errors import SessionError
+from mixpose.pictures.canvas import Picture
+
+SIGNATURE = b"mixpose picture"
+_PNG_HEAD = 33  # bytes of a PNG's signature and its first chunk
+_LOOK_AT = 1024  # bytes at either end of a file that are searched for the signature
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write a picture (H, W, 3) as a PNG with the signature.
+
+    Raises
+    ------
+    SessionError
+        If it cannot be written.
+    """
+    encoded, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not encoded:
+        raise SessionError(f"{path}: a picture of {picture.shape} cannot be made a PNG")
+    write_signed(path, np.asarray(data).tobytes())
+
+
+def write_signed(path: Path, png: bytes) -> None:
+    """Write the bytes of a PNG with the signature in a text chunk.
+
+    Raises
+    ------
+    SessionError
+        If they cannot be written.
+    """
+    body = b"tEXt" + b"Software\0" + SIGNATURE
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    try:
+        path.write_bytes(png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:])
+    except OSError as error:
+        raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def sign_video(path: Path) -> None:
+    """Append the signature to a video in an element that its container lets players skip."""
+    text = SIGNATURE + b" " * (len(SIGNATURE) % 2)
+    elements = {
+        ".mp4": struct.pack(">I4s", 8 + len(text), b"free") + text,
+        ".avi": b"JUNK" + struct.pack("<I", len(text)) + text,
+        ".mkv": b"\xec" + bytes([0x80 | len(text)]) + text,
+    }
+    with path.open("ab") as stream:
+        stream.write(elements[path.suffix.casefold()])
+
+
+def is_ours(path: Path) -> bool:
+    """Whether a file is empty or carries the signature."""
+    with path.open("rb") as stream:
+        beginning = stream.read(_LOOK_AT)
+        size = stream.seek(0, 2)
+        stream.seek(max(size - _LOOK_AT, 0))
+        end = stream.read(_LOOK_AT)
+    return size == 0 or SIGNATURE in beginning or SIGNATURE in end
+
+
+def refuse_foreign(path: Path, option: str) -> None:
+    """Make sure that a file about to be written is new, or a picture that mixpose wrote.
+
+    Raises
+    ------
+    SessionError
+        If it is something else.
+    """
+    if path.is_dir():
+        raise SessionError(f"{option}: {path} is a folder where a file is to be written")
+    if path.is_file() and not is_ours(path):
+        raise SessionError(
+            f"{option}: {path} holds something that mixpose did not write; name another place"
+        )

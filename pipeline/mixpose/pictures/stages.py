@@ -1,0 +1,225 @@
+"""Pictures of what happens to one camera's frame: features, threshold, densities, pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import Density
+from mixpose.extraction.corners import SIGMA_PX, saddle_strength
+from mixpose.extraction.threshold import above, feature_values, foreground
+from mixpose.objective import View
+from mixpose.objective.base import region_of_interest
+from mixpose.pictures.canvas import (
+    WHITE,
+    Colour,
+    Picture,
+    cross,
+    line_height,
+    stroke,
+    words,
+)
+from mixpose.pictures.display import displayable
+from mixpose.pictures.finding import Finding
+from mixpose.pictures.layout import in_grid
+from mixpose.pictures.overlay import (
+    FOUND,
+    Part,
+    draw_pose,
+    ellipse_95,
+    median_gap,
+    projected_covariances,
+    projected_features,
+)
+from mixpose.pictures.scene import backdrop
+from mixpose.records import Estimate, GridPattern, PointPattern
+from mixpose.rigid import transform
+
+Floats: TypeAlias = NDArray[np.float64]
+Size: TypeAlias = tuple[int, int]
+
+ABOVE: Colour = (0, 140, 255)
+_DIMMED = 0.45
+_MARK_PX = 9.0
+_STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
+_MAGNIFIERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_ELLIPSE_PX = 20.0  # larger half-axis of an ellipse that is easily seen
+_AROUND = 0.35  # of the body's extent, shown around it
+_LEAST_AROUND_PX = 25.0
+_MOST_LEVELS = 8
+
+
+def features_picture(finding: Finding, room: Size) -> Picture:
+    """The frame with a cross at every feature found."""
+    picture, part = backdrop(finding.setup, finding.frame, room)
+    _mark(picture, part, finding.points)
+    count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
+    text = f"{count} found" if finding.points is not None else f"light as of {count} points"
+    return _titled(picture, f"{finding.name}: {text}")
+
+
+def threshold_picture(finding: Finding, room: Size) -> Picture:
+    """What the extraction goes by: pixels above the threshold, grey values, or the response."""
+    picture, part = backdrop(finding.setup, finding.frame, room)
+    options = finding.setup.extract
+    data = None if finding.frame is None else finding.frame.data
+    if data is None or isinstance(data, PointPattern | GridPattern):
+        return _titled(picture, "detections: no threshold")
+    size = picture.shape[1], picture.shape[0]
+    window = 0, 0, data.shape[1], data.shape[0]
+    if options.method == "corners":
+        blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), SIGMA_PX)
+        response = np.sqrt(np.maximum(saddle_strength(blurred), 0))
+        picture = displayable(_resized(response, size))
+        title = "strength of saddles"
+    elif options.method == "intensity":
+        picture = displayable(_resized(feature_values(data, options, window), size))
+        title = "grey values above the threshold"
+    elif options.method == "blobs":
+        scene = foreground(data, options, window)
+        mask = above(scene.grey, scene.zero + scene.level)
+        picture = np.asarray(np.round(_DIMMED * picture), dtype=np.uint8)
+        # a pixel of the picture is marked if any of those behind it is
+        shown = cv2.resize(cv2.dilate(mask, _block(part.zoom)), size, None, 0, 0, cv2.INTER_NEAREST)
+        picture[shown > 0] = ABOVE
+        title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
+    else:
+        return _titled(picture, f"{options.method}: its own threshold")
+    if options.method != "intensity":
+        _mark(picture, part, finding.points)
+    return _titled(picture, title)
+
+
+def densities_picture(
+    view: View, body: Body, T: Floats | None, sigmas: Sequence[float], room: Size, columns: int
+) -> Picture:
+    """G of one camera at several blurs around the body, in panels of some size."""
+    if len(sigmas) > _MOST_LEVELS:
+        keep = np.round(np.linspace(0, len(sigmas) - 1, _MOST_LEVELS)).astype(int)
+        sigmas = [sigmas[k] for k in keep]
+    box = _box(view, body, T, 4 * max(sigmas))
+    part, size = _fitted(box, room)
+    panels = []
+    for sigma in sigmas:
+        values = _sampled(view.observation.density(sigma, box), part, size)
+        share = np.clip(values / max(float(values.max()), 1e-30), 0, 1)
+        grey = np.round(255 * np.sqrt(share)).astype(np.uint8)
+        panel = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
+        panels.append(_titled(panel, f"g, σ = {sigma:.3g} px"))
+    return in_grid(panels, columns)
+
+
+def _sampled(density: Density, part: Part, size: Size) -> NDArray[np.float32]:
+    """Values of a density on a picture (H, W): of each pixel the largest, lest peaks be missed."""
+    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * density.sigma))), 1)
+    u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    values = density.sample((pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner)
+    blocks = values.reshape(size[1], fine, size[0], fine)
+    return np.asarray(blocks.max(axis=(1, 3)))
+
+
+def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -> Picture:
+    """The part of the frame around the body, enlarged, with the pose on it."""
+    T = estimate.T_world_object
+    if finding.view is None or T is None:
+        picture, _ = backdrop(finding.setup, finding.frame, room)
+        return draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
+    box = _box(finding.view, body, T, None)
+    part, size = _fitted(box, room)
+    whole, native = backdrop(finding.setup, finding.frame, None)
+    matrix = np.array(
+        [
+            [native.zoom / part.zoom, 0, native.zoom * (part.corner[0] + 0.5 / part.zoom) - 0.5],
+            [0, native.zoom / part.zoom, native.zoom * (part.corner[1] + 0.5 / part.zoom) - 0.5],
+        ]
+    )
+    way = cv2.INTER_NEAREST if part.zoom > 3 else cv2.INTER_LINEAR
+    cut = cv2.warpAffine(whole, matrix, size, flags=way | cv2.WARP_INVERSE_MAP)
+    factor, note = _magnifier(finding, body, estimate, part.zoom, stroke(np.asarray(cut)))
+    drawn = draw_pose(
+        np.asarray(cut, dtype=np.uint8),
+        finding.setup.sensor,
+        body,
+        T,
+        estimate.covariance,
+        estimate.status,
+        estimate.frame,
+        part=part,
+        found=finding.points,
+        magnified=factor,
+    )
+    if note:
+        words(drawn, note, (0.5 * line_height(drawn), drawn.shape[0] - 8), WHITE, size=0.8)
+    return drawn
+
+
+def _magnifier(
+    finding: Finding, body: Body, estimate: Estimate, zoom: float, scale: float
+) -> tuple[int, str]:
+    """A round factor that makes ellipses large enough to be seen, and what to say of them."""
+    T, covariance = estimate.T_world_object, estimate.covariance
+    if T is None or covariance is None or not np.isfinite(covariance).all():
+        return 1, ""
+    sensor = finding.setup.sensor
+    y, _, seen = projected_features(sensor, body, T)
+    spreads = projected_covariances(sensor, body, T, covariance)[seen]
+    if not len(spreads):
+        return 1, ""
+    largest = [np.linalg.norm(ellipse_95(spread), axis=1).max() for spread in spreads]
+    room = min(_ELLIPSE_PX * scale, 0.4 * zoom * median_gap(y[seen]))
+    allowed = room / max(zoom * float(np.median(largest)), 1e-12)
+    factor = max((each for each in _MAGNIFIERS if each <= allowed), default=1)
+    enlarged = f", drawn {factor} times as large" if factor > 1 else ""
+    return factor, f"95 % within {max(largest):.2g} px{enlarged}"
+
+
+def _box(view: View, body: Body, T: Floats | None, margin: float | None) -> tuple[Floats, Floats]:
+    """The part of a camera's image around the body, or around all that was found."""
+    y = np.zeros((0, 2))
+    if T is not None:
+        y, seen = view.sensor.project(transform(T, body.nodes.points))
+        y = y[seen]
+    if not len(y):
+        y = np.stack(view.observation.extent) if not view.observation.is_empty else y
+    if not len(y):
+        return np.zeros(2), np.array([639.0, 479.0])
+    if margin is None:
+        margin = max(_AROUND * float(np.ptp(y, axis=0).max()), _LEAST_AROUND_PX)
+    return region_of_interest(view.sensor, y, margin)
+
+
+def _fitted(box: tuple[Floats, Floats], room: Size) -> tuple[Part, Size]:
+    """How a box of sensor coordinates fits into some room."""
+    extent = np.maximum(box[1] - box[0] + 1, 1)
+    zoom = float(min(room[0] / extent[0], room[1] / extent[1]))
+    # the box in the middle; what else there is room for is shown too
+    corner = np.floor(box[0] - (np.array(room) / zoom - extent) / 2)
+    return Part(zoom, (float(corner[0]), float(corner[1]))), room
+
+
+def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
+    if points is None or not len(points):
+        return
+    reach = min(_MARK_PX * stroke(picture), max(0.45 * part.zoom * median_gap(points), 3.0))
+    for place in part.places(points):
+        cross(picture, place, reach / 3, reach, FOUND)
+
+
+def _titled(picture: Picture, title: str) -> Picture:
+    words(picture, title, (0.5 * line_height(picture), 1.1 * line_height(picture)), WHITE, size=0.9)
+    return picture
+
+
+def _resized(values: NDArray[np.float32], size: Size) -> NDArray[np.float32]:
+    return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _block(zoom: float) -> NDArray[np.uint8]:
+    side = max(int(np.ceil(1 / zoom)), 1)
+    return np.ones((side, side), np.uint8)

@@ -1,0 +1,227 @@
+"""What the figures of a report show: each is one small SVG that takes on the page's colours.
+
+Words by people stay out of the figures (the page escapes them); figures hold only our own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mixpose.records import Floats
+from mixpose.report.drawing import (
+    BAND,
+    BARS,
+    POSE,
+    TRUTH,
+    TimeAxes,
+    blank,
+    count_axes,
+    drawn,
+    line,
+    mark_ambiguous,
+    stacked,
+)
+from mixpose.report.series import Errors, Series
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+AXES = ("x", "y", "z")
+_BINS = 40
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One figure of the page.
+
+    Attributes
+    ----------
+    title : str
+        May hold names that people gave; the page escapes it.
+    alt : str
+        What is seen, for those who do not see it.
+    svg : str
+        An ``<svg>`` element.
+    """
+
+    title: str
+    alt: str
+    svg: str
+
+
+def trajectory(series: Series, errors: Errors | None) -> list[Chart]:
+    """The object's origin in three planes of the world."""
+    return [_plane(series, errors, a, b) for a, b in ((0, 1), (0, 2), (1, 2))]
+
+
+def motion(series: Series, errors: Errors | None) -> list[Chart]:
+    """Position and turn over time with their 95 % bands, an axis each."""
+    right = (None, None) if errors is None else (errors.position, errors.turn_deg)
+    kinds = (
+        ("position", series.unit, series.position, right[0]),
+        ("turn about", "deg", series.turn_deg, right[1]),
+    )
+    charts = []
+    for kind, (word, unit, values, right_values) in enumerate(kinds):
+        for k, axis in enumerate(AXES):
+            truth = None if right_values is None else right_values[:, k]
+            half_width = series.half_width[:, 3 * kind + k]
+            # a rotation vector that passes half a turn comes in again on the other side
+            wrap = 180.0 if kind else np.inf
+            title = f"{word.capitalize()} {axis}, {unit}"
+            svg = _values(series, values[:, k], half_width, truth, wrap)
+            charts.append(Chart(title, _spoken(title, values[:, k]), svg))
+    return charts
+
+
+def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
+    """Residual and explained share of each sensor over time.
+
+    Parameters
+    ----------
+    series : Series
+    unit_of : callable
+        Unit of a sensor's residuals, by its name.
+    """
+    charts = []
+    for name, rms in series.rms.items():
+        explained = series.explained[name]
+        unit = unit_of(name)
+        figure, (upper, lower) = stacked((1.0, 1.0))
+        for axes, values, label in ((upper, rms, f"rms, {unit}"), (lower, explained, "explained")):
+            panel = TimeAxes(axes, series)
+            panel.mark_lost()
+            panel.draw(values)
+            panel.mark_ambiguous(values)
+            panel.frame()
+            axes.set_ylabel(label)
+            axes.set_ylim(bottom=0.0)
+        lower.set_ylim(0.0, 1.02)
+        upper.tick_params(labelbottom=False)
+        lower.set_xlabel(series.x_label)
+        alt = f"{_spoken(f'{name}: rms, {unit}', rms)}; {_spoken('explained share', explained)}"
+        charts.append(Chart(name, alt, drawn(figure)))
+    return charts
+
+
+def latency(series: Series) -> list[Chart]:
+    """How long frames took, as a histogram over a logarithmic axis."""
+    known = series.latency_ms[series.latency_ms > 0]  # NaN is not greater either
+    if not known.size:
+        return []
+    low, high = float(known.min()), float(known.max())
+    low, high = (low / 1.5, high * 1.5) if high < 1.5 * low else (low, high)
+    edges = np.geomspace(low, high, min(_BINS, 8 + len(known) // 4) + 1)
+    figure, axes = blank()
+    axes.hist(known, bins=np.clip(edges, low, high).tolist(), **BARS)
+    count_axes(axes)
+    axes.set_xscale("log")
+    plain_ticks(axes)
+    axes.set_xlabel("latency, ms")
+    axes.set_ylabel("frames")
+    title = "Time per frame"
+    return [Chart(title, _spoken("Time per frame, ms", known), drawn(figure))]
+
+
+def errors_over_time(series: Series, errors: Errors) -> list[Chart]:
+    """Errors of rotation and position, frame by frame."""
+    charts = []
+    for title, values in (
+        ("Rotation error, deg", errors.rotation_deg),
+        (f"Position error, {series.unit}", errors.distance),
+    ):
+        figure, axes = blank()
+        panel = TimeAxes(axes, series)
+        panel.mark_lost()
+        panel.draw(values)
+        panel.mark_ambiguous(values)
+        panel.frame()
+        axes.set_ylim(bottom=0.0)
+        axes.set_xlabel(series.x_label)
+        charts.append(Chart(title, _spoken(title, values), drawn(figure)))
+    return charts
+
+
+def plain_ticks(axes: Axes) -> None:
+    """Ticks of a logarithmic axis as people write numbers."""
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter  # noqa: PLC0415
+
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
+    figure, axes = blank(height=3.6)
+    position = series.position
+    if errors is not None:
+        line(axes, errors.position[:, a], errors.position[:, b], series.breaks, TRUTH)
+    line(axes, position[:, a], position[:, b], series.breaks)
+    mark_ambiguous(axes, position[:, a], position[:, b], series)
+    known = position[series.status != "lost"]
+    if len(known):
+        ink = {"linestyle": "none", "color": POSE["color"], "zorder": 5}
+        axes.plot(*known[0, [a, b]], marker="o", markersize=7, fillstyle="none", **ink)
+        axes.plot(*known[-1, [a, b]], marker="s", markersize=7, fillstyle="none", **ink)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.ticklabel_format(useOffset=False)
+    axes.set_xlabel(f"{AXES[a]}, {series.unit}")
+    axes.set_ylabel(f"{AXES[b]}, {series.unit}")
+    title = f"Plane {AXES[a]}{AXES[b]}"
+    spoken = [_spoken(AXES[k], position[:, k]) for k in (a, b)]
+    return Chart(title, f"{title}, {series.unit}: {'; '.join(spoken)}", drawn(figure))
+
+
+def _values(
+    series: Series, values: Floats, half_width: Floats, truth: Floats | None, wrap: float
+) -> str:
+    """Values with their band above, the band's half-width alone below."""
+    figure, (upper, lower) = stacked((3.0, 1.2))
+    panel = TimeAxes(upper, series, wrap)
+    panel.mark_lost()
+    panel.band(values, half_width)
+    if truth is not None:
+        panel.draw(truth, TRUTH)
+    panel.draw(values)
+    panel.mark_ambiguous(values)
+    panel.frame()
+    _limit(upper, values, truth, half_width)
+    upper.tick_params(labelbottom=False)
+    below = TimeAxes(lower, series)
+    below.mark_lost()
+    below.draw(half_width, BAND)
+    below.frame()
+    positive = half_width[half_width > 0]
+    # one frame without support must not hide how good the others are
+    if positive.size and positive.max() > 30 * np.median(positive):
+        lower.set_yscale("log")
+    else:
+        lower.set_ylim(0.0, 1.15 * float(positive.max()) if positive.size else 1.0)
+    lower.set_ylabel("± 95 %")
+    lower.set_xlabel(series.x_label)
+    return drawn(figure)
+
+
+def _limit(axes: Axes, values: Floats, truth: Floats | None, half_width: Floats) -> None:
+    """Let the values fill the figure, not the widest of the bands."""
+    shown = values if truth is None else np.concatenate([values, truth])
+    shown = shown[np.isfinite(shown)]
+    if not shown.size:
+        return
+    low, high = float(shown.min()), float(shown.max())
+    widths = half_width[np.isfinite(half_width)]
+    band = 1.2 * float(np.median(widths)) if widths.size else 0.0
+    least = 1e-3 * max(abs(low), abs(high)) or 1.0  # an axis that is held does not move at all
+    margin = max(0.06 * (high - low), band, least if high - low < 1e-9 * least else 0.0)
+    axes.set_ylim(low - margin, high + margin)
+
+
+def _spoken(title: str, values: Floats) -> str:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return f"{title}: no values"
+    return f"{title}: from {known.min():.4g} to {known.max():.4g}, median {np.median(known):.4g}"

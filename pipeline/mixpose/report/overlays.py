@@ -1,0 +1,221 @@
+"""A few frames of the recording with their poses drawn on them."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Generator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from mixpose.errors import MixposeError, RecordingError
+from mixpose.frames import Source, open_source, pair
+from mixpose.pictures import Part, displayable, draw_pose
+from mixpose.poses.jsonl import PoseFile
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame, Status
+from mixpose.report.series import Errors, Series
+from mixpose.rigid import transform
+from mixpose.runner import observation_of, source_spec
+from mixpose.session import SensorSetup, Session
+
+_EVENLY = 4  # frames, beside the best, the worst and one that is lost
+_MOST_CAMERAS = 6  # the page must stay small
+_WIDEST = 720  # px
+_JPEG_QUALITY = 80
+_MARGIN = 2.0  # how much larger than the object its surroundings are
+_MOST_SHARE = 0.7  # of an image; larger surroundings show all of it
+_LEAST_PX = 120  # of the camera; smaller surroundings show grains
+_LARGEST_ZOOM = 4.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera's frame with the pose on it.
+
+    Attributes
+    ----------
+    sensor : str
+    uri : str
+        Holds the whole JPEG.
+    width, height : int
+        Of the JPEG in px.
+    zoom : float
+        Pixels of the JPEG per pixel of the camera.
+    is_part : bool
+        Whether it shows only the surroundings of the object.
+    """
+
+    sensor: str
+    uri: str
+    width: int
+    height: int
+    zoom: float
+    is_part: bool
+
+
+@dataclass(frozen=True)
+class OverlayFrame:
+    """The shots of one frame number, and why it was chosen ("" for an evenly spaced one)."""
+
+    frame: int
+    status: Status
+    why: str
+    shots: tuple[Shot, ...]
+
+
+def overlay_frames(
+    session: Session, poses: PoseFile, series: Series, errors: Errors | None
+) -> tuple[list[OverlayFrame], list[str]]:
+    """Read a few frames again and draw their poses.
+
+    Returns
+    -------
+    frames : list of OverlayFrame
+        Ascending; empty where no camera's recording can be read.
+    notices : list of str
+        What could not be read, a sentence each.
+    """
+    setups, opened, notices = _open(session)
+    chosen = chosen_frames(series, errors)
+    lines = {line.frame: line for line in poses.poses}
+    frames: list[OverlayFrame] = []
+    if not opened or not chosen:
+        return frames, notices
+    try:
+        with closing(_read(opened, chosen)) as frame_sets:
+            for frame_set in frame_sets:
+                line = lines[frame_set.number]
+                shots = _shots(session, setups, frame_set, line)
+                why = chosen[frame_set.number]
+                frames.append(OverlayFrame(frame_set.number, line.status, why, shots))
+    except RecordingError as error:
+        notices.append(f"The recording cannot be read to the end: {error}")
+    absent = sorted(set(chosen) - {frame.frame for frame in frames})
+    if absent and not notices:
+        notices.append(f"The recording has no frame {', '.join(map(str, absent))} any more.")
+    return frames, notices
+
+
+def chosen_frames(series: Series, errors: Errors | None) -> dict[int, str]:
+    """Frames worth looking at with the reason: evenly spaced, best, worst and first lost one."""
+    count = len(series.frames)
+    if not count:
+        return {}
+    reasons: dict[int, list[str]] = {
+        round(i): [] for i in np.linspace(0, count - 1, min(_EVENLY, count))
+    }
+    if errors is None:
+        badness, words = -series.score, ("best score", "worst score")
+    else:
+        badness, words = errors.rotation_deg, ("smallest rotation error", "largest rotation error")
+    badness = np.where(series.status == "lost", np.nan, badness)
+    if np.isfinite(badness).any():
+        reasons.setdefault(int(np.nanargmin(badness)), []).append(words[0])
+        reasons.setdefault(int(np.nanargmax(badness)), []).append(words[1])
+    lost = np.flatnonzero(series.status == "lost")
+    if lost.size:
+        reasons.setdefault(int(lost[0]), []).append("first lost frame")
+    return {series.frames[i]: ", ".join(why) for i, why in sorted(reasons.items())}
+
+
+def _open(session: Session) -> tuple[dict[str, SensorSetup], dict[str, Source], list[str]]:
+    """Recordings with images; a stream is over, and is not asked for again."""
+    opened: dict[str, Source] = {}
+    notices: list[str] = []
+    for setup in session.sensors:
+        names = (setup.source,) if isinstance(setup.source, str) else setup.source
+        if setup.model == "lateration" or not names or any("://" in name for name in names):
+            continue
+        if len(opened) == _MOST_CAMERAS:
+            notices.append(f"Only the first {_MOST_CAMERAS} cameras are shown.")
+            break
+        try:
+            source = open_source(source_spec(session, setup, None))
+        except MixposeError as error:
+            notices.append(f"The recording of {setup.name} cannot be read again: {error}")
+            continue
+        if source.kind in ("images", "video"):
+            opened[setup.name] = source
+    return {setup.name: setup for setup in session.sensors}, opened, notices
+
+
+def _read(
+    opened: Mapping[str, Source], wanted: Mapping[int, str]
+) -> Generator[FrameSet, None, None]:
+    if any(source.kind == "video" for source in opened.values()):
+        # once through: going to a frame of a video means decoding all before it
+        for frame_set in pair(opened, min(wanted), max(wanted) + 1):
+            if frame_set.number in wanted:
+                yield frame_set
+        return
+    for number in sorted(wanted):
+        yield from pair(opened, number, number + 1)
+
+
+def _shots(
+    session: Session, setups: Mapping[str, SensorSetup], frame_set: FrameSet, line: PoseLine
+) -> tuple[Shot, ...]:
+    return tuple(
+        _shot(session, setups[name], frame, frame.data, line)
+        for name, frame in frame_set.frames.items()
+        if isinstance(frame.data, np.ndarray)
+    )
+
+
+def _found(session: Session, setup: SensorSetup, frame: RawFrame) -> Floats | None:
+    """Features as the run found them; None where they are no points."""
+    try:
+        pattern = observation_of(session, setup, frame).pattern
+    except MixposeError:  # the pose can be drawn all the same
+        return None
+    return pattern.points if isinstance(pattern, PointPattern) else None
+
+
+def _shot(
+    session: Session, setup: SensorSetup, frame: RawFrame, image: Image, line: PoseLine
+) -> Shot:
+    picture = displayable(image)
+    height, width = picture.shape[:2]
+    (left, top), (right, bottom) = _surroundings(session, setup, line, width, height)
+    is_part = (right - left, bottom - top) != (width, height)
+    zoom = min(_WIDEST / (right - left), _LARGEST_ZOOM if is_part else 1.0)
+    size = round((right - left) * zoom), max(round((bottom - top) * zoom), 1)
+    kind = cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC
+    scaled = cv2.resize(picture[top:bottom, left:right], size, interpolation=kind)
+    drawn = draw_pose(
+        np.asarray(scaled, dtype=np.uint8),
+        setup.sensor,
+        session.body,
+        line.T_world_object,
+        line.covariance,
+        line.status,
+        line.frame,
+        part=Part(zoom, (left, top)),
+        found=_found(session, setup, frame),
+    )
+    _, jpeg = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    uri = f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode('ascii')}"
+    return Shot(setup.name, uri, *size, zoom, is_part)
+
+
+def _surroundings(
+    session: Session, setup: SensorSetup, line: PoseLine, width: int, height: int
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Corners of the part of an image to show: all of it, or about an object small in it."""
+    whole = (0, 0), (width, height)
+    if line.T_world_object is None:
+        return whole
+    y, inside = setup.sensor.project(transform(line.T_world_object, session.body.means))
+    if not inside.any():
+        return whole
+    low, high = y[inside].min(axis=0), y[inside].max(axis=0)
+    size = np.array([width, height])
+    share = max(_MARGIN * float(((high - low) / size).max()), _LEAST_PX / width)
+    if share > _MOST_SHARE:
+        return whole
+    corner = np.clip(np.round((low + high - share * size) / 2), 0, size - np.ceil(share * size))
+    end = np.minimum(corner + np.ceil(share * size), size)
+    return (int(corner[0]), int(corner[1])), (int(end[0]), int(end[1]))

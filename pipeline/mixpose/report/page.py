@@ -1,0 +1,254 @@
+"""The page: what it says, put into its template."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose.errors import SessionError
+from mixpose.poses.evaluate import Evaluation, evaluate
+from mixpose.poses.jsonl import PoseFile
+from mixpose.records import Floats, Status
+from mixpose.report.origin import Origin, find_session
+from mixpose.report.series import Series, errors_of, frame_ranges, series_of
+
+MARK = '<meta name="generator" content="mixpose report'
+"""By which a page is known as one of ours."""
+
+_TEMPLATE = "page.html.j2"
+_STATUSES: tuple[Status, ...] = ("ok", "ambiguous", "lost")
+_MOST_RANGES = 40
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number that sums a run up."""
+
+    name: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class SensorRow:
+    """How one sensor took part in the run."""
+
+    name: str
+    model: str
+    used: int
+    explained: str
+    rms: str
+    unit: str
+
+
+def require_libraries() -> None:
+    """Make sure that what a page is made with is installed.
+
+    Raises
+    ------
+    SessionError
+        Naming the extra that brings it.
+    """
+    try:
+        import jinja2  # noqa: F401, PLC0415
+        import matplotlib  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise SessionError(
+            f"report: found no {error.name}, which makes the page; install it with the extra "
+            "'report': python -m pip install 'mixpose[report]'"
+        ) from error
+
+
+def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
+    """The report of a run as one HTML page without anything outside it.
+
+    Parameters
+    ----------
+    poses : PoseFile
+    truth : PoseFile or None
+    cut : bool
+        Whether the last line of the poses was cut off.
+    version : str
+        Of mixpose, which makes the page.
+
+    Raises
+    ------
+    SessionError
+        If a library is missing.
+    RecordingError
+        If the poses are of several objects, or cannot be compared with the truth.
+    """
+    require_libraries()
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
+
+    environment = Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(_TEMPLATE).render(
+        mark=MARK, version=version, **_content(poses, truth, cut)
+    )
+
+
+def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, Any]:
+    from mixpose.report import figures  # noqa: PLC0415 - needs matplotlib
+    from mixpose.report.overlays import overlay_frames  # noqa: PLC0415
+
+    series = series_of(poses)
+    errors = None if truth is None else errors_of(series, poses, truth)
+    evaluation = None if truth is None else evaluate(poses, truth)
+    origin = find_session(poses)
+    overlays, overlay_notices = (
+        ([], [])
+        if origin.session is None
+        else overlay_frames(origin.session, poses, series, errors)
+    )
+    unit_of = _unit_of(origin, series)
+    has_poses = bool(np.any(series.status != "lost"))
+    return {
+        "name": _name(poses),
+        "poses": poses,
+        "truth": truth,
+        "series": series,
+        "facts": _facts(poses, series),
+        "notices": _notices(poses, series, cut),
+        "counts": [(status, int(np.sum(series.status == status))) for status in _STATUSES],
+        "ranges": [(status, _ranges_text(series, status)) for status in _STATUSES[1:]],
+        "numbers": _numbers(series, evaluation),
+        "evaluation": evaluation,
+        "sensor_rows": _sensor_rows(poses, series, origin, unit_of),
+        "error_charts": [] if errors is None else figures.errors_over_time(series, errors),
+        "trajectory_charts": figures.trajectory(series, errors) if has_poses else [],
+        "motion_charts": figures.motion(series, errors) if has_poses else [],
+        "sensor_charts": figures.sensors(series, unit_of) if has_poses else [],
+        "latency_charts": figures.latency(series),
+        "overlays": overlays,
+        "overlay_notices": overlay_notices,
+        "origin": origin,
+    }
+
+
+def _name(poses: PoseFile) -> str:
+    """The session's file with its folder, which says more than the file alone."""
+    named = poses.header.get("session")
+    path = Path(named) if isinstance(named, str) and named else poses.path
+    return "/".join(path.parts[-2:])
+
+
+def _facts(poses: PoseFile, series: Series) -> list[tuple[str, str]]:
+    header = poses.header
+    facts = [("Poses", str(poses.path)), ("Session", header.get("session"))]
+    facts += [("Object", series.object or None), ("Unit", poses.unit)]
+    facts += [("mixpose", header.get("mixpose")), ("Seed", header.get("seed"))]
+    return [(name, str(value)) for name, value in facts if value is not None]
+
+
+def _notices(poses: PoseFile, series: Series, cut: bool) -> list[str]:
+    notices = []
+    if cut:
+        notices.append(
+            "The last line of the poses file is cut off: the run is not finished, or was "
+            "interrupted. This report is about the frames before it."
+        )
+    if not poses.header:
+        notices.append(
+            "The poses file has no header, so unit, session and symmetries are not known."
+        )
+    elif poses.unit is None:
+        notices.append("The header of the poses file states no unit of length.")
+    if not series.frames:
+        notices.append("The poses file holds no frame.")
+    elif np.all(series.status == "lost"):
+        notices.append("Every frame is lost, so there is no pose to draw.")
+    return notices
+
+
+def _ranges_text(series: Series, status: Status) -> str:
+    ranges = frame_ranges(series, status)
+    words = [str(first) if first == last else f"{first}–{last}" for first, last in ranges]
+    more = len(words) - _MOST_RANGES
+    return ", ".join(words[:_MOST_RANGES]) + (f" and {more} more stretches" if more > 0 else "")
+
+
+def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
+    found = [Figure("frames", str(len(series.frames)), _span(series))]
+    if evaluation is not None and evaluation.rotation_deg and evaluation.translation:
+        rotation, translation = evaluation.rotation_deg, evaluation.translation
+        found += [
+            Figure(
+                "rotation error, RMS",
+                f"{_short(rotation.rms)}°",
+                f"at most {_short(rotation.max)}°",
+            ),
+            Figure(
+                "position error, RMS",
+                f"{_short(translation.rms)} {series.unit}",
+                f"at most {_short(translation.max)} {series.unit}",
+            ),
+        ]
+    position, turn = series.half_width[:, :3], series.half_width[:, 3:]
+    for name, widths, unit in (
+        ("position, 95 %", position, f" {series.unit}"),
+        ("turn, 95 %", turn, "°"),
+    ):
+        widest = widths.max(axis=1) if len(widths) else np.empty(0)
+        if np.isfinite(widest).any():
+            value = f"± {_short(float(np.nanmedian(widest)))}{unit}"
+            found.append(Figure(name, value, "median of the least certain axis"))
+    if np.isfinite(series.score).any():
+        found.append(Figure("score", _median(series.score), "median; 1 is best"))
+    if np.isfinite(series.latency_ms).any():
+        slow = float(np.nanpercentile(series.latency_ms, 95))
+        value = f"{_median(series.latency_ms)} ms"
+        found.append(Figure("per frame", value, f"median; 95 % within {_short(slow)} ms"))
+    return found
+
+
+def _span(series: Series) -> str:
+    if not series.frames:
+        return ""
+    span = f"{series.frames[0]} to {series.frames[-1]}"
+    if series.x_label.startswith("time"):
+        span += f", {series.x[-1] - series.x[0]:.4g} s"
+    return span
+
+
+def _sensor_rows(
+    poses: PoseFile, series: Series, origin: Origin, unit_of: Callable[[str], str]
+) -> list[SensorRow]:
+    setups = {} if origin.session is None else {s.name: s for s in origin.session.sensors}
+    return [
+        SensorRow(
+            name=name,
+            model=setups[name].model if name in setups else "",
+            used=sum(name in line.sensors and line.sensors[name].used for line in poses.poses),
+            explained=_median(series.explained[name]),
+            rms=_median(series.rms[name]),
+            unit=unit_of(name),
+        )
+        for name in series.rms
+    ]
+
+
+def _unit_of(origin: Origin, series: Series) -> Callable[[str], str]:
+    """Unit of the residuals of a sensor, as far as the session can tell."""
+    setups = () if origin.session is None else origin.session.sensors
+    units = {s.name: series.unit if s.model == "lateration" else "px" for s in setups}
+    return lambda name: units.get(name, "sensor units")
+
+
+def _median(values: Floats) -> str:
+    known = values[np.isfinite(values)]
+    return _short(float(np.median(known))) if known.size else "–"
+
+
+def _short(value: float) -> str:
+    """Three digits that count, and no power of ten where people would write none."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"

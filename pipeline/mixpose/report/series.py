@@ -1,0 +1,249 @@
+"""The poses of a run, and their errors, as arrays over frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.evaluate import errors_to_truth
+from mixpose.poses.jsonl import PoseFile
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Floats, Status
+
+Texts: TypeAlias = NDArray[np.str_]
+Flags: TypeAlias = NDArray[np.bool_]
+
+SIGMAS_95 = 1.96
+"""Standard deviations to either side that hold 95 % of a Gaussian."""
+
+_DECIMALS_DEG = 7  # an axis that is held turns by rounding errors, and should be seen to stand
+
+
+@dataclass(frozen=True)
+class Series:
+    """A run over its n frames, ascending; NaN where a frame does not have a value.
+
+    Attributes
+    ----------
+    object : str
+    unit : str
+        Unit of lengths; "units" where the file does not say it.
+    frames : tuple of int
+        They come from file names, and may be longer than an int64.
+    x : (n,) float64
+        Where a frame stands in figures: its time in s, or its number where times are missing.
+    x_label : str
+    breaks : (n,) bool
+        Whether frame numbers are missing before a frame.
+    status : (n,) str
+    position : (n, 3) float64
+    turn_deg : (n, 3) float64
+        Rotation vector in world axes, degrees, of the turn from `T_reference`.
+    half_width : (n, 6) float64
+        Half-widths of the 95 % bands of position and turn, length units and degrees.
+    T_reference : (4, 4) float64
+        The first pose that is "ok", or else the first pose.
+    score, latency_ms : (n,) float64
+    rms, explained : mapping of str to (n,) float64
+        By sensor; NaN in lost frames too.
+    """
+
+    object: str
+    unit: str
+    frames: tuple[int, ...]
+    x: Floats
+    x_label: str
+    breaks: Flags
+    status: Texts
+    position: Floats
+    turn_deg: Floats
+    half_width: Floats
+    T_reference: Floats
+    score: Floats
+    latency_ms: Floats
+    rms: Mapping[str, Floats]
+    explained: Mapping[str, Floats]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors against the truth at the frames of a `Series`; NaN where there is none.
+
+    Attributes
+    ----------
+    rotation_deg, distance : (n,) float64
+    position : (n, 3) float64
+        Of the right answer that the pose was held against.
+    turn_deg : (n, 3) float64
+        Its turn, as in `Series`.
+    """
+
+    rotation_deg: Floats
+    distance: Floats
+    position: Floats
+    turn_deg: Floats
+
+
+def series_of(file: PoseFile) -> Series:
+    """Arrange the lines of a poses file by frame.
+
+    Raises
+    ------
+    RecordingError
+        If the file holds poses of several objects.
+    """
+    lines = sorted(file.poses, key=lambda line: line.frame)
+    names = sorted({line.object for line in lines})
+    if len(names) > 1:
+        raise RecordingError(
+            f"{file.path}: holds poses of {', '.join(map(repr, names))}; a report is about one "
+            "object, so split the file"
+        )
+    T = np.array([_matrix(line) for line in lines], dtype=np.float64).reshape(-1, 4, 4)
+    status = np.array([line.status for line in lines], dtype=np.str_)
+    T_reference = _reference(T, status)
+    frames = tuple(line.frame for line in lines)
+    times = _numbers([line.time_s for line in lines])
+    timed = len(lines) > 0 and bool(np.all(np.isfinite(times)))
+    sensors = list(dict.fromkeys(name for line in lines for name in line.sensors))
+    return Series(
+        object=names[0] if names else "",
+        unit=file.unit or "units",
+        frames=frames,
+        x=times if timed else np.array(frames, dtype=np.float64),
+        x_label="time, s" if timed else "frame",
+        breaks=_breaks(frames),
+        status=status,
+        position=T[:, :3, 3],
+        turn_deg=turns_deg(T, T_reference),
+        half_width=_half_widths(lines, T, T_reference),
+        T_reference=T_reference,
+        score=_numbers([line.score for line in lines]),
+        latency_ms=_numbers([line.latency_ms for line in lines]),
+        rms={name: _of_sensor(lines, name, "rms") for name in sensors},
+        explained={name: _of_sensor(lines, name, "explained") for name in sensors},
+    )
+
+
+def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
+    """Errors of every frame, modulo symmetries, as `mixpose.poses.evaluate` has them.
+
+    Raises
+    ------
+    RecordingError
+        If the files cannot be compared.
+    """
+    by_frame = {error.frame: error.twist for error in errors_to_truth(poses, truth)}
+    nothing = np.full(6, np.nan)
+    found = [by_frame.get(frame) for frame in series.frames]
+    twists = np.array([nothing if twist is None else twist for twist in found]).reshape(-1, 6)
+    position = series.position - twists[:, :3]
+    turned = np.full_like(position, np.nan)
+    known = np.isfinite(twists[:, 0])
+    pose = Rotation.from_rotvec(np.radians(series.turn_deg[known]))
+    right = Rotation.from_rotvec(twists[known, 3:]).inv() * pose
+    turned[known] = np.degrees(right.as_rotvec())
+    return Errors(
+        rotation_deg=np.degrees(np.linalg.norm(twists[:, 3:], axis=1)),
+        distance=np.linalg.norm(twists[:, :3], axis=1),
+        position=position,
+        turn_deg=turned,
+    )
+
+
+def turns_deg(T: Floats, T_reference: Floats) -> Floats:
+    """Rotation vectors (n, 3) in world axes, degrees, from the reference to poses (n, 4, 4)."""
+    turns = np.full((len(T), 3), np.nan)
+    known = np.isfinite(T[:, 0, 0])
+    if known.any():
+        turns[known] = np.degrees(rigid.twist_between(T_reference, T[known])[:, 3:])
+    return np.round(turns, _DECIMALS_DEG)
+
+
+def frame_ranges(series: Series, status: Status) -> list[tuple[int, int]]:
+    """First and last frame of each stretch of frames in a row that have a status."""
+    ranges: list[tuple[int, int]] = []
+    goes_on = False
+    for frame, is_break, found in zip(series.frames, series.breaks, series.status, strict=True):
+        if found == status:
+            first = ranges.pop()[0] if goes_on and not is_break else frame
+            ranges.append((first, frame))
+        goes_on = found == status
+    return ranges
+
+
+def _matrix(line: PoseLine) -> Floats:
+    return np.full((4, 4), np.nan) if line.T_world_object is None else line.T_world_object
+
+
+def _reference(T: Floats, status: Texts) -> Floats:
+    for wanted in (status == "ok", status != "lost"):
+        if wanted.any():
+            return np.asarray(T[np.argmax(wanted)])
+    return np.eye(4)
+
+
+def _numbers(values: list[float | None]) -> Floats:
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
+
+def _of_sensor(lines: list[PoseLine], name: str, what: str) -> Floats:
+    """What a sensor says of the poses; of a lost frame it says how little the best guess fits."""
+    return _numbers(
+        [
+            None if line.status == "lost" else getattr(line.sensors.get(name), what, None)
+            for line in lines
+        ]
+    )
+
+
+def _breaks(frames: Sequence[int]) -> Flags:
+    """Where more frame numbers are left out than usual in the file."""
+    steps = np.array([0, *(after - before for before, after in pairwise(frames))], dtype=np.float64)
+    usual = np.median(steps[1:]) if len(steps) > 1 else 1.0
+    return np.asarray(steps[: len(frames)] > 1.5 * usual)
+
+
+def _half_widths(lines: list[PoseLine], T: Floats, T_reference: Floats) -> Floats:
+    widths = np.full((len(lines), 6), np.nan)
+    turns = np.radians(turns_deg(T, T_reference))
+    for i, line in enumerate(lines):
+        if line.covariance is None or line.T_world_object is None:
+            continue
+        J = np.eye(6)
+        J[3:, 3:] = rotation_vector_jacobian(turns[i])
+        variances = np.diag(J @ line.covariance @ J.T)
+        widths[i] = SIGMAS_95 * np.sqrt(np.maximum(variances, 0.0))
+    widths[:, 3:] = np.round(np.degrees(widths[:, 3:]), _DECIMALS_DEG)
+    return widths
+
+
+def rotation_vector_jacobian(vector: Floats) -> Floats:
+    """Change of a rotation vector by a small further turn in world axes.
+
+    Inverse of the left Jacobian of SO(3): J. Solà et al., A micro Lie theory for state estimation
+    in robotics, 2018, equation 146.
+
+    Parameters
+    ----------
+    vector : (3,) array
+        Radians, at most π long.
+
+    Returns
+    -------
+    (3, 3) array
+    """
+    x, y, z = vector
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = float(np.linalg.norm(vector))
+    # 1/12 is the limit; near it the difference of large numbers would say nothing
+    share = 1 / 12 if angle < 1e-4 else 1 / angle**2 - 1 / (2 * angle * np.tan(angle / 2))
+    return np.asarray(np.eye(3) - across / 2 + share * across @ across)

@@ -1,0 +1,254 @@
+"""A recording for the Rerun viewer: what the sensors saw, what was found in it, and the poses.
+
+Entities, on the timelines ``frame`` and, where the recording has times, ``time``:
+
+* ``world/<sensor>``: where the sensor is; below it ``image`` with the frames as JPEG, on it
+  ``features`` (found) and ``predicted`` (of the pose, lens distortion included).  Rerun's camera
+  has no distortion: in the view of the world, images are shown as if the lens had none.
+* ``density/<sensor>``: g_l, as an image or, for ranges, as a bar chart.
+* ``world/<object>``: the pose, with the features as ``points``; beside it ``world/<object>
+  covariance``, the ellipsoid that holds the position with 95 %.
+* ``plots/score`` and ``status``.
+
+Lengths are in the session's unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from mixpose import rigid
+from mixpose.density import Observation, Window, render
+from mixpose.frames import Source, pair
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import FrameSet, GridPattern, Image, PointPattern
+from mixpose.rigid import Floats
+from mixpose.runner import observation_of
+from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
+from mixpose.session import SensorSetup, Session
+
+_COLOURS = {"ok": (80, 200, 120), "ambiguous": (255, 170, 40)}
+_FOUND = (90, 170, 255)
+_CHI2_95 = 7.815  # of three degrees of freedom
+_DENSITY_WIDTH = 640
+_JPEG_QUALITY = 85
+# Rerun's pixels have their corners at integers
+_HALF = 0.5
+
+
+def write_rerun_file(
+    path: Path, session: Session, sources: Mapping[str, Source], lines: Sequence[PoseLine]
+) -> None:
+    """Write the recording of the frames that have a pose line.
+
+    Parameters
+    ----------
+    path : Path
+    session : Session
+        That the poses were estimated with.
+    sources : mapping of str to Source
+        Its recordings, opened.
+    lines : sequence of PoseLine
+        By ascending frame number, in the unit of the session.
+
+    Raises
+    ------
+    RecordingError
+        If a frame cannot be read; the file then holds the frames before it.
+    """
+    stream = rr.RecordingStream("mixpose", send_properties=False)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    stream.save(path, default_blueprint=_blueprint(session))
+    try:
+        scene = _Scene(stream, session)
+        scene.stand_still(lines)
+        scene.play(sources, lines)
+    finally:
+        stream.flush()
+        stream.disconnect()
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is logged, and where to."""
+
+    stream: Any
+    session: Session
+
+    def stand_still(self, lines: Sequence[PoseLine]) -> None:
+        """Log what does not move: sensors, and the object's features in its own frame."""
+        for setup in self.session.sensors:
+            self._sensor(setup, lines)
+        body = self.session.body
+        # no radii: what stands still overrules what moves, and a lost body's points are hidden
+        points = rr.Points3D(body.means)
+        self._log(["world", body.name, "points"], points, static=True)
+
+    def play(self, sources: Mapping[str, Source], lines: Sequence[PoseLine]) -> None:
+        """Log frame by frame; poses of frames that no source has come last."""
+        waiting: dict[int, list[PoseLine]] = {}
+        for line in lines:
+            waiting.setdefault(line.frame, []).append(line)
+        if waiting:
+            for frame_set in pair(sources, min(waiting), max(waiting) + 1):
+                if frame_set.number in waiting:
+                    self._moment(waiting.pop(frame_set.number), frame_set)
+        for rest in waiting.values():
+            self._moment(rest, None)
+
+    def _moment(self, lines: Sequence[PoseLine], frames: FrameSet | None) -> None:
+        self.stream.reset_time()
+        self.stream.set_time("frame", sequence=lines[0].frame)
+        if lines[0].time_s is not None:
+            self.stream.set_time("time", duration=lines[0].time_s)
+        for setup in self.session.sensors:
+            if frames is not None and setup.name in frames.frames:
+                self._seen(setup, frames)
+        for line in lines:
+            self._pose(line)
+
+    def _log(self, place: Sequence[str], *what: Any, static: bool = False) -> None:
+        self.stream.log(list(place), *what, static=static)
+
+    def _sensor(self, setup: SensorSetup, lines: Sequence[PoseLine]) -> None:
+        sensor = setup.sensor
+        place = ["world", setup.name]
+        if isinstance(sensor, RangeSensor):
+            self._log(place, rr.Points3D([sensor.position], labels=[setup.name]), static=True)
+            return
+        if not isinstance(sensor, PinholeCamera | FisheyeCamera):
+            return
+        T_world_sensor = rigid.inverse(sensor.T_sensor_world)
+        self._log(place, _transform(T_world_sensor), static=True)
+        K = sensor.camera_matrix.copy()
+        K[:2, 2] += _HALF
+        resolution = sensor.resolution or tuple(np.round(2 * K[:2, 2]).astype(int))
+        origins = [line.T_world_object for line in lines if line.T_world_object is not None]
+        away = [np.linalg.norm(T[:3, 3] - T_world_sensor[:3, 3]) for T in origins[:1]]
+        self._log(
+            [*place, "image"],
+            rr.Pinhole(
+                image_from_camera=K,
+                resolution=resolution,
+                camera_xyz=rr.ViewCoordinates.RDF,
+                image_plane_distance=0.4 * float(away[0]) if away else None,
+            ),
+            static=True,
+        )
+
+    def _seen(self, setup: SensorSetup, frames: FrameSet) -> None:
+        """The frame of one sensor, the features found in it and their density."""
+        frame = frames.frames[setup.name]
+        size = setup.resolution
+        place = ["world", setup.name, "image"]
+        if not isinstance(frame.data, PointPattern | GridPattern):
+            self._log(place, _jpeg(_eight_bits(frame.data)))
+            size = (frame.data.shape[1], frame.data.shape[0])
+        observation = observation_of(self.session, setup, frame)
+        pattern = observation.pattern
+        if isinstance(pattern, PointPattern) and pattern.points.shape[1] == 2:
+            found, radius = pattern.points + _HALF, rr.Radius.ui_points(4)
+            self._log([*place, "features"], rr.Points2D(found, radii=radius, colors=_FOUND))
+        density = _density(observation, size)
+        if density is not None:
+            self._log(["density", setup.name], density)
+
+    def _pose(self, line: PoseLine) -> None:
+        self._log(["plots", "score"], rr.Scalars(line.score if line.score is not None else 1.0))
+        self._log(["status"], rr.TextLog(f"frame {line.frame}: {line.status}"))
+        places = (["world", line.object], ["world", f"{line.object} covariance"])
+        T = line.T_world_object
+        predicted = [["world", setup.name, "image", "predicted"] for setup in self.session.sensors]
+        if T is None:
+            for place in (*places, *predicted):
+                self._log(place, rr.Clear(recursive=False))
+            # a transform that is cleared leaves the points where the world's origin is
+            self._log(["world", line.object, "points"], rr.Points3D.from_fields(radii=[0.0]))
+            return
+        colour = _COLOURS[line.status]
+        self._log(places[0], _transform(T))
+        shown = rr.Points3D.from_fields(radii=[0.03 * self.session.body.radius], colors=[colour])
+        self._log([*places[0], "points"], shown)
+        if line.covariance is None:
+            self._log(places[1], rr.Clear(recursive=False))
+        else:
+            self._log(places[1], _ellipsoid(T[:3, 3], line.covariance, colour))
+        world = rigid.transform(T, self.session.body.means)
+        for setup, place in zip(self.session.sensors, predicted, strict=True):
+            if setup.sensor.dimension == 2:
+                points, seen = setup.sensor.project(world)
+                radius = rr.Radius.ui_points(2)
+                self._log(place, rr.Points2D(points[seen] + _HALF, radii=radius, colors=colour))
+
+
+def _transform(T_parent_child: Floats) -> Any:
+    return rr.Transform3D(translation=T_parent_child[:3, 3], mat3x3=T_parent_child[:3, :3])
+
+
+def _ellipsoid(centre: Floats, covariance: Floats, colour: tuple[int, int, int]) -> Any:
+    """Where the position is with 95 %; `covariance` is (6, 6)."""
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    axes[:, 0] *= np.linalg.det(axes)  # right-handed, as a rotation is
+    turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
+    return rr.Ellipsoids3D(
+        half_sizes=[np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))],
+        centers=[centre],
+        quaternions=[rr.Quaternion(xyzw=turn)],
+        colors=[colour],
+    )
+
+
+def _eight_bits(image: Image) -> NDArray[np.uint8]:
+    if image.dtype == np.uint8:
+        return np.asarray(image, dtype=np.uint8)
+    top = 65535.0 if image.dtype == np.uint16 else max(float(image.max()), 1e-12)
+    return np.asarray(np.clip(image * (255.0 / top), 0, 255), dtype=np.uint8)
+
+
+def _jpeg(image: NDArray[np.uint8]) -> Any:
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")
+
+
+def _density(observation: Observation, size: tuple[int, int] | None) -> Any:
+    """g_l over the whole sensor, brightest where it is largest; None where nothing was seen."""
+    if observation.is_empty:
+        return None
+    lower, upper = observation.extent
+    margin = 4 * observation.sigma
+    lower, upper = lower - margin, upper + margin
+    if observation.dimension == 2 and size is not None:
+        lower, upper = np.zeros(2), np.array(size) - 1.0
+    step = max(float(upper[0] - lower[0]) / _DENSITY_WIDTH, observation.sigma / 4)
+    blur = np.sqrt(max(observation.sigma**2 - observation.intrinsic**2, (0.5 * step) ** 2))
+    window = Window.around(lower, upper, step)
+    values = render(observation.pattern, float(blur), window).values
+    if observation.dimension == 1:
+        return rr.BarChart(values.ravel(), abscissa=window.axis(0))
+    return _jpeg(_eight_bits(np.sqrt(np.maximum(values, 0.0))))
+
+
+def _blueprint(session: Session) -> Any:
+    """The world beside the sensors' images and densities."""
+    world = rrb.Spatial3DView(origin="/world", name="world")
+    cameras = [setup.name for setup in session.sensors if setup.sensor.dimension == 2]
+    part = {name: rr.escape_entity_path_part(name) for name in cameras}
+    rows = [
+        rrb.Horizontal(
+            rrb.Spatial2DView(origin=f"/world/{part[name]}/image", name=name),
+            rrb.Spatial2DView(origin=f"/density/{part[name]}", name=f"density {name}"),
+        )
+        for name in cameras
+    ]
+    views = [world, rrb.Vertical(*rows)] if rows else [world]
+    return rrb.Blueprint(rrb.Horizontal(*views), collapse_panels=True)

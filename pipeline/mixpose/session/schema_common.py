@@ -1,0 +1,119 @@
+"""What several tables of a session file share: their rules, placements, and ``[extract]``.
+
+How keys are described is said in `schema`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, PlainValidator
+
+from mixpose.rigid import Floats
+from mixpose.session.arrays import LARGEST
+from mixpose.session.values import (
+    METHOD_ALLOWED,
+    THRESHOLD_ALLOWED,
+    ArrayOf,
+    read_method,
+    read_threshold,
+)
+
+Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
+Number: TypeAlias = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+
+
+class Table(BaseModel):
+    """A TOML table: no keys but these, no text for numbers, no NaN and no infinity."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        strict=True,
+        frozen=True,
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+        str_strip_whitespace=False,
+    )
+
+
+class Placement(Table):
+    """The forms of a rigid motion beside the 4x4 matrix."""
+
+    rotation_vector: Annotated[
+        Floats | None, ArrayOf((3,), "three numbers: axis times angle in radians")
+    ] = None
+    """The rotation, in place of the matrix and together with `translation`.
+
+    Example: `rotation_vector = [0.1, -0.2, 1.0]`
+    """
+    quaternion_xyzw: Annotated[Floats | None, ArrayOf((4,), "four numbers: x, y, z, w")] = None
+    """The same rotation as a quaternion of length 1, the real part last.
+
+    Example: `quaternion_xyzw = [0.0, 0.0, 0.7071068, 0.7071068]`
+    """
+    translation: Annotated[Floats | None, ArrayOf((3,), "three numbers: x, y, z")] = None
+    """The last column of the matrix, in `unit`; beside a rotation.
+
+    Example: `translation = [20, 10, 900]`
+    """
+
+
+class ExtractTable(Table):
+    """How features are found in images. `[extract]` holds for all sensors; `[sensor.extract]`
+    below a `[[sensor]]` changes single keys for that sensor. In a table of detections features
+    are found already, and of these keys only `sigma` counts.
+    """
+
+    method: Annotated[
+        str | None, PlainValidator(read_method), Field(description=METHOD_ALLOWED)
+    ] = None
+    """Centres of spots and disks, corners of a chessboard, the grey values themselves, or a
+    function of your own in a module beside the session file.
+
+    Example: `method = "corners"`
+    """
+    polarity: Annotated[Literal["bright", "dark"] | None, Field(description='"bright", "dark"')] = (
+        None
+    )
+    """Whether features are brighter or darker than what surrounds them.
+
+    Example: `polarity = "dark"`
+    """
+    threshold: Annotated[
+        str | Number | None, PlainValidator(read_threshold), Field(description=THRESHOLD_ALLOWED)
+    ] = None
+    """Grey level that parts features from the background: by the noise of the image, by Otsu's
+    rule, by the surroundings of each pixel, or a level in grey values of the image.
+
+    Example: `threshold = 120`
+    """
+    min_area: Annotated[Number | None, Field(ge=0, description="an area in px, at least 0")] = None
+    """Blobs smaller than this, in px, are no features.
+
+    Example: `min_area = 20`
+    """
+    max_area: Annotated[
+        Number | None, Field(gt=0, description="an area in px, greater than min_area")
+    ] = None
+    """Blobs larger than this, in px, are no features; left out: there is no limit.
+
+    Example: `max_area = 500`
+    """
+    sigma: Annotated[
+        Number | None,
+        Field(gt=0, description="greater than 0: px for cameras, a length for lateration"),
+    ] = None
+    """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
+    a predicted and a found feature draw each other in the final fit.
+
+    Example: `sigma = 2.0`
+    """
+    spot_sigma: Annotated[
+        Number | None,
+        Field(ge=0, description="at least 0: px for cameras, a length for lateration"),
+    ] = None
+    """Width that features have already in grey values (`method = "intensity"`) and in range
+    profiles, in px or in `unit`.
+
+    Example: `spot_sigma = 5.0`
+    """

@@ -1,0 +1,209 @@
+"""The tables ``[[sensor]]`` of a session file, one for each kind of sensor.
+
+How keys are described is said in `schema`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
+
+from mixpose.rigid import Floats
+from mixpose.session.arrays import RESOLUTION_FORM
+from mixpose.session.arrays import resolution as resolution_of
+from mixpose.session.intrinsics import MATRIX_FORM
+from mixpose.session.schema_common import ExtractTable, Number, Placement, Table, Text
+from mixpose.session.values import (
+    SOURCE_ALLOWED,
+    ArrayOf,
+    read_calibration_key,
+    read_sensor_name,
+    read_source,
+)
+
+
+class CalibrationTable(Table):
+    """A calibration file, and what to read in it. `calibration = "cam.yml"` is short for
+    `calibration = { file = "cam.yml" }`.
+    """
+
+    file: Text
+    """An OpenCV file (YAML or XML), a Kalibr camchain or a ROS camera_info, told apart by
+    content.
+
+    Example: `file = "stereo.yml"`
+    """
+    camera_matrix: Annotated[
+        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
+    ] = None
+    """Node of the camera matrix, where a file holds several cameras.
+
+    Example: `camera_matrix = "M2"`
+    """
+    distortion: Annotated[
+        str | None, Field(min_length=1, description="the name of a node of an OpenCV file")
+    ] = None
+    """Node of the distortion coefficients.
+
+    Example: `distortion = "D2"`
+    """
+    camera: Annotated[
+        str | None, Field(min_length=1, description='a camera of a Kalibr file, like "cam0"')
+    ] = None
+    """Camera to take where a Kalibr file holds several.
+
+    Example: `camera = "cam1"`
+    """
+
+
+class SensorTable(Table):
+    """What every `[[sensor]]` has, whatever its `model`."""
+
+    name: Annotated[
+        str, AfterValidator(read_sensor_name), Field(description="a name for the sensor, as text")
+    ]
+    """Name of the sensor, a different one for each.
+
+    Example: `name = "left"`
+    """
+    source: Annotated[
+        str | tuple[str, ...], PlainValidator(read_source), Field(description=SOURCE_ALLOWED)
+    ] = ()
+    """The recording, relative to the session file: images, a video, a table of detections
+    (`frame` or `time_s`, then `u,v` or `range`, and optionally `weight`), or range profiles
+    (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the address of
+    a stream, a named pipe.
+
+    Example: `source = "left*.png"`
+    """
+    times: Annotated[str | None, Field(min_length=1, description="a CSV file: frame,time_s")] = None
+    """When frames were taken, in seconds.
+
+    Example: `times = "times.csv"`
+    """
+    fps: Annotated[Number | None, Field(gt=0, description="frames per second, greater than 0")] = (
+        None
+    )
+    """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
+
+    Example: `fps = 25`
+    """
+    extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
+    """Keys of `[extract]` that differ for this sensor.
+
+    Example: `extract = { polarity = "dark" }`
+    """
+
+
+class PlacedTable(SensorTable, Placement):
+    """A sensor that stands somewhere and looks somewhere."""
+
+    T_sensor_world: Annotated[
+        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
+    ] = None
+    """Maps coordinates of the world to those of the sensor, which looks along +z with x to the
+    right and y down; in place of a rotation with `translation`. Left out: the sensor stands at
+    the origin of the world.
+
+    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`
+    """
+    resolution: Annotated[
+        tuple[int, int] | None, PlainValidator(resolution_of), Field(description=RESOLUTION_FORM)
+    ] = None
+    """Size of the images in px. Left out: that of the calibration file, else of the first image.
+
+    Example: `resolution = [640, 512]`
+    """
+
+
+class CameraTable(PlacedTable):
+    """A camera with perspective. It needs `camera_matrix` or `calibration`."""
+
+    model: Annotated[Literal["pinhole", "fisheye"], Field(description='"pinhole", "fisheye"')]
+    """The lens: OpenCV's pinhole model, or its fisheye model.
+
+    Example: `model = "pinhole"`
+    """
+    camera_matrix: Annotated[Floats | None, ArrayOf((3, 3), MATRIX_FORM)] = None
+    """Focal lengths and principal point in px; pixel centres have integer coordinates.
+
+    Example: `camera_matrix = [[812.4, 0, 322.7], [0, 811.9, 251.3], [0, 0, 1]]`
+    """
+    distortion: Annotated[
+        Any, Field(description="a list of 4, 5, 8, 12 or 14 numbers (fisheye: 4)")
+    ] = None
+    """OpenCV's distortion coefficients, in OpenCV's order. Left out: none.
+
+    Example: `distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]`
+    """
+    calibration: Annotated[
+        CalibrationTable | None,
+        BeforeValidator(read_calibration_key),
+        Field(description='a file, or a table { file = "...", ... }'),
+    ] = None
+    """A calibration file in place of `camera_matrix` and `distortion`.
+
+    Example: `calibration = "left.yml"`
+    """
+
+
+class ParallelTable(PlacedTable):
+    """A camera without perspective: pixel = (x, y) / pixel_size + principal_point."""
+
+    model: Annotated[Literal["parallel"], Field(description='"parallel"')]
+    """Parallel beams.
+
+    Example: `model = "parallel"`
+    """
+    pixel_size: Annotated[Number, Field(gt=0, description="length per px, a number greater than 0")]
+    """Length in the world, in `unit`, that one px shows.
+
+    Example: `pixel_size = 0.5`
+    """
+    principal_point: Annotated[
+        Floats, ArrayOf((2,), "[u, v], the px where the sensor's origin projects")
+    ]
+    """Where the sensor's origin is in the image, in px.
+
+    Example: `principal_point = [150, 160]`
+    """
+
+
+class LaterationTable(SensorTable):
+    """A sensor of distances: range = distance from `position` + `range_bias`."""
+
+    model: Annotated[Literal["lateration"], Field(description='"lateration"')]
+    """Ranges, in `unit`.
+
+    Example: `model = "lateration"`
+    """
+    position: Annotated[Floats, ArrayOf((3,), "[x, y, z], the sensor's place in the world")]
+    """Where ranges are measured from, in `unit`.
+
+    Example: `position = [0, -1000, 0]`
+    """
+    range_bias: Annotated[Number, Field(description="a length")] = 0.0
+    """What every reading is too long by, in `unit`.
+
+    Example: `range_bias = 0.15`
+    """
+    range_min: Annotated[
+        Number | None, Field(description="a length: range of a profile's first bin")
+    ] = None
+    """For range profiles: the range that their first bin stands for, in `unit`.
+
+    Example: `range_min = 700`
+    """
+    bin_size: Annotated[
+        Number | None, Field(gt=0, description="a length greater than 0: from bin to bin")
+    ] = None
+    """For range profiles: length from one bin to the next, in `unit`.
+
+    Example: `bin_size = 1.0`
+    """
+
+
+AnySensorTable: TypeAlias = Annotated[
+    CameraTable | ParallelTable | LaterationTable, Field(discriminator="model")
+]

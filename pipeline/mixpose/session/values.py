@@ -1,0 +1,95 @@
+"""Values of a session file that need more than a type: how they are read and what is allowed."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import core_schema
+
+from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.session.arrays import is_number, numbers
+from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
+
+EXTRACT_METHODS = ("blobs", "corners", "intensity")
+THRESHOLDS = ("auto", "otsu", "local")
+
+_FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
+METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
+SIGMA_ALLOWED = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
+FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
+SOURCE_ALLOWED = (
+    "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
+)
+THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
+
+
+@dataclass(frozen=True)
+class ArrayOf:
+    """Annotation of a key that holds nested lists of numbers, see `arrays.numbers`."""
+
+    shape: tuple[int | None, ...]
+    description: str
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def read(self, value: Any) -> Floats:
+        """Read what the file holds."""
+        return numbers(value, self.shape, self.description)
+
+
+def read_sensor_name(name: str) -> str:
+    """A sensor's name: text that can stand in NAME=PATH."""
+    if not name.strip() or name != name.strip() or re.search(r"[=/\\\x00-\x1f\x7f]", name):
+        raise BadKeyError(
+            found(name, 'text without "=", "/" or "\\", not empty, no blanks around it')
+        )
+    return name
+
+
+def read_method(value: Any) -> str:
+    """A method's name, or a function of one's own."""
+    if isinstance(value, str) and (value in EXTRACT_METHODS or _FUNCTION.fullmatch(value)):
+        return value
+    raise BadKeyError(found(value, METHOD_ALLOWED) + did_you_mean(value, EXTRACT_METHODS))
+
+
+def read_threshold(value: Any) -> str | float:
+    """A rule's name, or a grey level."""
+    if isinstance(value, str) and value in THRESHOLDS:
+        return value
+    if is_number(value):
+        return float(value)
+    raise BadKeyError(found(value, THRESHOLD_ALLOWED) + did_you_mean(value, THRESHOLDS))
+
+
+def read_source(value: Any) -> str | tuple[str, ...]:
+    """Text, or a list of texts as a tuple; the number of a camera as text."""
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return f"camera:{value}"
+    texts = value if isinstance(value, list) else [value]
+    if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
+        raise BadKeyError(found(value, SOURCE_ALLOWED))
+    return tuple(texts) if isinstance(value, list) else str(value)
+
+
+def read_free(value: Any) -> tuple[str, ...]:
+    """Directions in the order of the twist."""
+    if not isinstance(value, list) or not value:
+        raise BadKeyError(found(value, FREE_ALLOWED))
+    for i, name in enumerate(value):
+        if name not in TWIST_NAMES:
+            raise BadKeyError(found(name, one_of(TWIST_NAMES)), i)
+        if name in value[:i]:
+            raise BadKeyError(found(value, FREE_ALLOWED) + f'; "{name}" stands there twice')
+    return tuple(name for name in TWIST_NAMES if name in value)
+
+
+def read_calibration_key(value: Any) -> Any:
+    """A file alone is short for a table."""
+    return {"file": value} if isinstance(value, str) else value

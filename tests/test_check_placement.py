@@ -1,0 +1,114 @@
+"""Where `mixpose check` says that sensors stand, and what it suspects of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.checking import placement_lines, placement_warnings
+from mixpose.rigid import from_rotation_vector, inverse
+from mixpose.sensors import PinholeCamera
+from mixpose.session import Session, load_session
+from mixpose.session.setup import Start
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+
+
+@pytest.fixture
+def session() -> Session:
+    return load_session(SYNTHETIC / "two_cameras" / "session.toml")
+
+
+def with_poses(session: Session, *poses: np.ndarray) -> Session:
+    setups = []
+    for setup, T in zip(session.sensors, poses, strict=True):
+        assert isinstance(setup.sensor, PinholeCamera)
+        setups.append(replace(setup, sensor=replace(setup.sensor, T_sensor_world=T)))
+    return replace(session, sensors=tuple(setups))
+
+
+def camera_poses(session: Session) -> list[np.ndarray]:
+    cameras = [setup.sensor for setup in session.sensors]
+    return [camera.T_sensor_world for camera in cameras if isinstance(camera, PinholeCamera)]
+
+
+def test_a_camera_is_said_to_stand_where_it_stands(session: Session) -> None:
+    # turned by a quarter about y it looks along -x; its centre is at (900, 0, 0)
+    T = from_rotation_vector([0.0, np.pi / 2, 0.0], [0.0, 0.0, 900.0])
+    moved = with_poses(session, T, T)
+    assert placement_lines(moved.sensors[0], "mm") == [
+        "at (900, 0, 0) mm, looks along (-1, 0, 0) in the world"
+    ]
+
+
+def test_a_range_sensor_has_a_place_only() -> None:
+    session = load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    assert placement_lines(session.sensors[0], "mm") == ["at (0, -1000, 0) mm in the world"]
+
+
+def test_a_good_session_raises_no_suspicion(session: Session) -> None:
+    assert placement_warnings(session) == []
+    assert placement_warnings(replace(session, start=None)) == []
+
+
+def test_two_cameras_at_one_place_are_suspicious(session: Session) -> None:
+    warnings = placement_warnings(with_poses(session, *[camera_poses(session)[0]] * 2))
+    assert len(warnings) == 1
+    assert "'left' and 'right' stand at one place" in warnings[0]
+    assert "T_sensor_world" in warnings[0]
+
+
+def test_cameras_side_by_side_are_not(session: Session) -> None:
+    T = camera_poses(session)[0]
+    beside = T.copy()
+    beside[0, 3] += 5.0
+    assert placement_warnings(with_poses(session, T, beside)) == []
+
+
+@pytest.mark.parametrize("with_start", [True, False])
+def test_inverted_camera_poses_are_recognised(session: Session, with_start: bool) -> None:
+    flipped = with_poses(session, *(inverse(T) for T in camera_poses(session)))
+    if not with_start:
+        flipped = replace(flipped, start=None)
+    warnings = placement_warnings(flipped)
+    assert any("inverse" in warning and "world to sensor" in warning for warning in warnings)
+
+
+def test_a_body_behind_one_camera_is_told_without_a_guess(session: Session) -> None:
+    left, right = camera_poses(session)
+    behind = right.copy()
+    behind[2, 3] *= -1
+    warnings = placement_warnings(with_poses(session, left, behind))
+    assert warnings == [
+        "sensor 'right': the body at [start] is behind it: check T_sensor_world and [start]"
+    ]
+
+
+def test_a_body_beside_the_image_is_told_with_its_place(session: Session) -> None:
+    assert session.start is not None
+    T = session.start.T_world_object.copy()
+    T[1, 3] += 700.0
+    warnings = placement_warnings(replace(session, start=Start(T)))
+    assert len(warnings) == 2
+    assert "outside of its image of 640x512 px, at u = " in warnings[0]
+
+
+def test_an_inverted_start_is_recognised(session: Session) -> None:
+    assert session.start is not None
+    left, right = camera_poses(session)
+    # the world moved into the left camera, where a pose and its inverse are far from each other
+    moved = with_poses(session, np.eye(4), right @ inverse(left))
+    start = Start(inverse(left @ session.start.T_world_object))
+    warnings = placement_warnings(replace(moved, start=start))
+    assert any(warning.startswith("start.T_world_object looks inverted") for warning in warnings)
+
+
+def test_lengths_in_two_units_are_suspicious(session: Session) -> None:
+    far = [T.copy() for T in camera_poses(session)]
+    for T in far:
+        T[:3, 3] *= 1000.0
+    warnings = placement_warnings(with_poses(session, *far))
+    assert any("px wide: are points" in w and "all in mm?" in w for w in warnings)

@@ -1,0 +1,175 @@
+"""`mixpose check`: every frame is read, features are counted, and odd things are told."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mixpose.checking.advice import judge
+from mixpose.cli.check import check_session
+from mixpose.errors import RecordingError
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    source = SYNTHETIC / "two_cameras"
+    shutil.copy(source / "session.toml", tmp_path)
+    for n in range(8):
+        for side in ("left", "right"):
+            shutil.copy(source / f"{side}{n:04d}.png", tmp_path)
+    return tmp_path
+
+
+def report_on(session: Path, capsys: pytest.CaptureFixture[str], *, quick: bool = False) -> str:
+    check_session(session, quick=quick)
+    return capsys.readouterr().out
+
+
+def with_extract(recording: Path, line: str) -> Path:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    session.write_text(text.replace("sigma = 1.5", f"sigma = 1.5\n{line}", 1), encoding="utf-8")
+    return session
+
+
+@pytest.mark.parametrize("name", ["two_cameras", "one_camera_video", "range_profiles"])
+def test_a_good_recording_has_no_warnings(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    report = report_on(SYNTHETIC / name / "session.toml", capsys, quick=True)
+    assert "warnings  none" in report
+
+
+def test_features_are_counted_beside_what_the_body_has(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = report_on(recording / "session.toml", capsys)
+    # a false spot in every second frame, a marker hidden now and then: 6 to 8 of 7
+    assert report.count("features per frame: 6 / 7 / 8 (least / median / most), expected: 7") == 1
+    assert "8 images 640x512, frames 0-7; all read" in report
+
+
+def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (recording / "left0003.png").write_bytes(b"this is no image")
+    (recording / "left0005.png").write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"left0003\.png: .*\(and 1 more, see above\)$"):
+        check_session(recording / "session.toml")
+    report = capsys.readouterr().out
+    assert "2 of the 8 looked at cannot be read" in report
+    assert "left0005.png: the file is empty" in report
+    assert "missing" not in report
+    assert report.count("features per frame") == 2
+
+
+def test_an_image_of_another_size_is_damaged(recording: Path) -> None:
+    cv2.imwrite(str(recording / "right0004.png"), np.zeros((100, 120), dtype=np.uint8))
+    with pytest.raises(RecordingError, match=r"right0004\.png: found 120x100"):
+        check_session(recording / "session.toml")
+
+
+def test_a_video_that_ends_early_is_told_with_the_frames_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in (SYNTHETIC / "one_camera_video").iterdir():
+        shutil.copy(path, tmp_path)
+    video = tmp_path / "camera.avi"
+    video.write_bytes(video.read_bytes()[: video.stat().st_size // 2])
+    with pytest.raises(RecordingError, match="cut short"):
+        check_session(tmp_path / "session.toml")
+    assert "features per frame: " in capsys.readouterr().out
+
+
+def test_frames_without_features_are_named(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for n in (2, 6):
+        black = np.zeros((512, 640), dtype=np.uint8)
+        cv2.imwrite(str(recording / f"right{n:04d}.png"), black)
+    report = report_on(recording / "session.toml", capsys)
+    assert "warning   sensor 'right': no feature in frame 2, 6" in report
+
+
+def test_frames_that_other_sensors_have_are_missing(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (recording / "left0003.png").unlink()
+    report = report_on(recording / "session.toml", capsys)
+    assert "missing: 3 of the 8 frames of all sensors" in report
+    assert "warnings  none" in report
+
+
+def test_sensors_whose_numbers_do_not_pair_are_told(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in sorted(recording.glob("left*.png"), reverse=True):
+        path.rename(recording / f"left{int(path.stem[4:]) + 100:04d}.png")
+    report = report_on(recording / "session.toml", capsys)
+    assert "sensor 'left': 0 of its 8 frames pair with those of other sensors" in report
+    assert "paired by the number that their names end in" in report
+
+
+@pytest.mark.parametrize(
+    ("line", "hint"),
+    [
+        ('polarity = "dark"', 'with polarity = "bright" in [extract]'),
+        ("min_area = 400", "with min_area = 3 in [extract]"),
+        ("threshold = 250", 'with threshold = "auto" in [extract]'),
+    ],
+)
+def test_too_few_features_name_the_key_that_mends_it(
+    recording: Path, line: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = report_on(with_extract(recording, line), capsys, quick=True)
+    assert "sensor 'left': too few features, 0 in frame" in report
+    assert hint in report
+
+
+def test_far_too_many_features_name_the_key_that_mends_it(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    for path in recording.glob("*.png"):  # specks of a pixel or two, brighter than noise
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        for u, v in rng.integers(5, 500, (80, 2)):
+            image[v : v + 2, u : u + 2] = 160
+        cv2.imwrite(str(path), image)
+    report = report_on(recording / "session.toml", capsys, quick=True)
+    assert "sensor 'left': too many features" in report
+    assert "with min_area = 10 in [extract] it would be" in report
+
+
+def test_a_look_at_a_few_frames_passes_over_the_others(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (recording / "left0002.png").write_bytes(b"")  # of 0 to 7 a quick look takes 0, 1, 3, 5, 7
+    report = report_on(recording / "session.toml", capsys, quick=True)
+    assert "8 images 640x512, frames 0-7; looked at 5" in report
+
+
+@pytest.mark.parametrize(
+    ("count", "expected", "verdict"),
+    [(4, 7, "too few"), (5, 7, None), (7, 7, None), (30, 7, None), (60, 7, "too many"),
+     (2, 3, None), (1, 3, "too few"), (0, 1, None)],
+)  # fmt: skip
+def test_clutter_is_no_mistake_but_a_flood_is(
+    count: float, expected: int, verdict: str | None
+) -> None:
+    assert judge(count, expected) == verdict
+
+
+def test_of_a_stream_only_its_beginning_is_looked_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = SYNTHETIC / "one_camera_video"
+    text = (source / "session.toml").read_text(encoding="utf-8")
+    stream = f"file://{(source / 'camera.avi').as_posix()}"
+    session = tmp_path / "session.toml"
+    session.write_text(text.replace("camera.avi", stream), encoding="utf-8")
+    assert "camera.avi; looked at 5" in report_on(session, capsys)

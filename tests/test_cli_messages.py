@@ -1,0 +1,110 @@
+"""What the command line says about wrong options, sources and resumed runs: one line each."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mixpose.cli import main
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+SESSION = str(SYNTHETIC / "two_cameras" / "session.toml")
+
+
+def said(capsys: pytest.CaptureFixture[str], status: int, *arguments: str) -> str:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    text = capsys.readouterr().err
+    assert caught.value.code == status, text
+    return text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["run", "x.toml", "--steps", "3"],
+         "--steps: no such option; did you mean --step? See mixpose run --help"),
+        (["run", "x.toml", "--zzz"], "--zzz: no such option; see mixpose run --help"),
+        (["run"], "SESSION.toml: missing; see mixpose run --help"),
+        (["run", "x.toml", "--start", "a"],
+         "--start: found a; allowed: integer; see mixpose run --help"),
+        (["run", "x.toml", "--step=0"],
+         "--step: found 0; allowed: greater than or equal to 1; see mixpose run --help"),
+        (["run", "x.toml", "--format", "xml"],
+         "--format: found xml; allowed: 'jsonl', 'csv', 'tum', 'bop', 'ros'; see mixpose run --help"),
+        (["run", "x.toml", "-o"], "-o: found no value; see mixpose run --help"),
+        (["rum"], "rum: no such command; did you mean 'run'? See mixpose --help"),
+        (["check", "a.toml", "b.toml"],
+         "b.toml: found, but no argument is left for it; see mixpose check --help"),
+        (["simulate", "x.toml", "--frames", "3"],
+         "--output: missing; see mixpose simulate --help"),
+    ],
+)  # fmt: skip
+def test_wrong_options_are_worded_like_all_errors(
+    arguments: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert said(capsys, 2, *arguments) == f"mixpose: {line}\n"
+
+
+def test_a_source_is_looked_for_in_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for n in range(12):
+        (tmp_path / f"img{n}.jpg").touch()
+    monkeypatch.chdir(tmp_path)
+    line = said(capsys, 3, "run", SESSION, "--source", "left=img*.png")
+    assert f"looked in {tmp_path}, where there is img0.jpg, ... (12 in all)" in line
+    line = said(capsys, 3, "run", SESSION, "--source", "left=frames/img*.png")
+    assert f"there is no folder {tmp_path / 'frames'}" in line
+    (tmp_path / "empty").mkdir()
+    line = said(capsys, 3, "run", SESSION, "--source", "left=empty")
+    assert f"looked in {tmp_path / 'empty'}, which is empty" in line
+    assert len(line.splitlines()) == 1
+
+
+def test_a_run_resumes_with_the_same_recording_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "left"
+    other.mkdir()
+    for path in (SYNTHETIC / "two_cameras").glob("left000*.png"):
+        shutil.copy(path, other)
+    poses = tmp_path / "poses.jsonl"
+    to_file = ["run", SESSION, "-o", str(poses), "--stop"]
+    said(capsys, 0, *to_file, "2", "--source", f"left={other}")
+    header = json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+    assert header["sources"] == {"left": str(other)}
+    before = poses.read_bytes()
+    line = said(capsys, 2, *to_file, "3", "--resume")
+    assert f"was written with --source left={other}, this run has no --source" in line
+    assert poses.read_bytes() == before
+    said(capsys, 0, *to_file, "3", "--resume", "--source", f"left={other}")
+    assert len(poses.read_text(encoding="utf-8").splitlines()) == 4
+
+
+def test_a_run_of_the_sessions_own_recording_names_no_sources(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = tmp_path / "poses.jsonl"
+    said(capsys, 0, "run", SESSION, "-o", str(poses), "--stop", "1")
+    assert "sources" not in json.loads(poses.read_text(encoding="utf-8").splitlines()[0])
+
+
+def test_the_shell_completes_commands_and_options() -> None:
+    def completed(words: str) -> list[str]:
+        asked = {"_MIXPOSE_COMPLETE": "complete_bash", "COMP_WORDS": words}
+        result = subprocess.run(
+            [sys.executable, "-m", "mixpose"], capture_output=True, text=True, check=False,
+            env=os.environ | asked | {"COMP_CWORD": str(words.count(" "))},
+        )  # fmt: skip
+        return result.stdout.split()
+
+    assert "check" in completed("mixpose ch")
+    assert "--quick" in completed("mixpose check --")
+    assert completed("mixpose run s.toml --format ") == ["jsonl", "csv", "tum", "bop", "ros"]

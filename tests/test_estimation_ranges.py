@@ -1,0 +1,164 @@
+"""Ranges that are not labelled, of tags that lie as close together as ranges err."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.estimation import EstimatorOptions, Tracker
+from mixpose.estimation.labelling import _summed, are_labelled, label
+from mixpose.objective import View
+from mixpose.records import Estimate, PointPattern
+from mixpose.rigid import (
+    from_rotation_vector,
+    perturb,
+    rotation_angle_deg,
+    transform,
+    twist_between,
+)
+from mixpose.sensors import RangeSensor
+
+Floats = NDArray[np.float64]
+
+SIGMA = 0.08
+FREE = (0, 1, 5)
+TAGS = 1.6 * np.array([[-0.07, -0.14, 0.0], [-0.075, 0.14, 0.0], [0.2, 0.145, 0.0]])
+TROLLEY = Body("trolley", tuple(PointFeature(tag) for tag in TAGS))
+SMALL = Body("small trolley", tuple(PointFeature(tag / 1.6) for tag in TAGS))
+ANCHORS = [
+    RangeSensor(np.array([x, y, 0.1]))
+    for x, y in [(-3.5, 3), (0, 3), (3.5, 3), (3.5, 0), (3.5, -3), (0, -3), (-3.5, -3), (-3.5, 0)]
+]
+
+
+def views_at(
+    T: Floats, rng: np.random.Generator, body: Body = TROLLEY, sigma: float = SIGMA
+) -> list[View]:
+    """Shuffled ranges of all tags to all anchors."""
+    views = []
+    for k, anchor in enumerate(ANCHORS):
+        ranges = anchor.project(transform(T, body.means))[0][:, 0] + rng.normal(0, sigma, len(TAGS))
+        pattern = PointPattern(rng.permutation(ranges)[:, None], np.ones(len(TAGS)))
+        views.append(View(f"anchor{k}", anchor, Observation(pattern, sigma)))
+    return views
+
+
+def drive(count: int) -> Iterator[tuple[float, Floats]]:
+    """Times and poses of a trolley on a circle: 0.4 m/s, 16 degrees a second, 10 Hz."""
+    for k in range(count):
+        turn = 0.028 * k
+        place = [1.4 * np.sin(turn), -1.4 * np.cos(turn), 0.0]
+        yield 0.1 * k, from_rotation_vector([0.0, 0.0, turn], place)
+
+
+def followed(tracker: Tracker, count: int, seed: int) -> list[tuple[Estimate, Floats]]:
+    rng, track, found = np.random.default_rng(seed), tracker.begin(), []
+    for k, (time_s, T) in enumerate(drive(count)):
+        track, estimate = tracker.advance(track, k, time_s, views_at(T, rng))
+        found.append((estimate, T))
+    return found
+
+
+def error(estimate: Estimate, T_true: Floats) -> Floats:
+    """Twist from estimate to truth in the free directions (3,)."""
+    assert estimate.T_world_object is not None
+    return twist_between(estimate.T_world_object, T_true)[list(FREE)]
+
+
+def is_wrong(estimate: Estimate, T_true: Floats) -> bool:
+    x, y, turn = error(estimate, T_true)
+    return bool(np.hypot(x, y) > 0.15 or abs(turn) > np.radians(15))
+
+
+def sum_by_hand(odds: Floats, used: frozenset[int] = frozenset()) -> float:
+    if odds.shape[1] == 0:
+        return 1.0
+    rest = odds[:, 1:]
+    met = sum(
+        float(odds[i, 0]) * sum_by_hand(rest, used | {i}) for i in range(len(odds)) if i not in used
+    )
+    return sum_by_hand(rest, used) + met
+
+
+def test_the_sum_over_labellings_is_that_of_all_of_them() -> None:
+    odds = 5 * np.random.default_rng(0).random((2, 3, 4))
+    total, shares = _summed(odds)
+    assert total == pytest.approx([sum_by_hand(one) for one in odds], rel=1e-12)
+    # how probable a pair is: the derivative of the logarithm by that of its odds
+    more = odds.copy()
+    more[:, 1, 2] *= 1 + 1e-6
+    slope = np.log(_summed(more)[0] / total) / 1e-6
+    assert shares[:, 1, 2] == pytest.approx(slope, rel=1e-4)
+
+
+def test_the_gradient_of_the_likelihood_is_its_slope() -> None:
+    T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
+    views = views_at(T, np.random.default_rng(1))
+    steps = 1e-5 * np.eye(6)
+    ahead, behind = (label(views, TROLLEY, perturb(T, s)).log_odds for s in (steps, -steps))
+    gradient = label(views, TROLLEY, T[None]).gradient[0]
+    assert gradient == pytest.approx((ahead - behind) / 2e-5, rel=1e-5, abs=1e-5)
+
+
+def test_bodies_of_many_features_and_images_keep_the_matched_objective() -> None:
+    views = views_at(np.eye(4), np.random.default_rng(2))
+    assert are_labelled(views, TROLLEY)
+    many = Body("many", tuple(PointFeature(x) for x in np.random.default_rng(0).random((9, 3))))
+    assert not are_labelled(views, many)
+
+
+def test_one_frame_leaves_the_turn_open_and_says_so() -> None:
+    options = EstimatorOptions(free=("x", "y", "rz"))
+    tracker = Tracker.create(SMALL, options, next(drive(1))[1])
+    views = views_at(next(drive(1))[1], np.random.default_rng(3), SMALL)
+    _, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
+    assert estimate.status == "ambiguous"
+    assert estimate.covariance is not None
+    # labels known, ranges of 8 cm give 5.0 degrees; not known, never less
+    assert np.sqrt(estimate.covariance[5, 5]) > np.radians(5.0)
+
+
+def test_a_drive_is_followed_with_an_honest_covariance() -> None:
+    options = EstimatorOptions(free=("x", "y", "rz"))
+    found = followed(Tracker.create(TROLLEY, options, next(drive(1))[1]), 30, seed=4)
+    sure = [(e, T) for e, T in found if e.status == "ok"]
+    assert len(sure) > 15
+    assert not any(is_wrong(e, T) for e, T in sure)
+    errors = np.array([error(e, T) for e, T in found])
+    # one frame alone gives a median of 4 degrees at best
+    assert np.median(np.abs(errors[:, 2])) < np.radians(4.0)
+    assert np.median(np.hypot(errors[:, 0], errors[:, 1])) < 0.035
+    inside = 0
+    for estimate, T_true in sure:
+        assert estimate.covariance is not None
+        e, C = error(estimate, T_true), estimate.covariance[np.ix_(FREE, FREE)]
+        inside += bool(e @ np.linalg.solve(C, e) < chdtri(3, 0.05))
+    assert inside > 0.88 * len(sure)
+
+
+def test_frames_are_kept_apart_on_request() -> None:
+    T_start = next(drive(1))[1]
+    options = EstimatorOptions(free=("x", "y", "rz"), fuse=False)
+    tracker = Tracker.create(TROLLEY, options, T_start)
+    track, _ = tracker.advance(tracker.begin(), 0, 0.0, views_at(T_start, np.random.default_rng(5)))
+    assert [branch.spread for branch in track.branches] == [None] * len(track.branches)
+
+
+def test_precise_ranges_need_no_help_of_earlier_frames() -> None:
+    options = EstimatorOptions(free=("x", "y", "rz"))
+    T_start = next(drive(1))[1]
+    tracker = Tracker.create(TROLLEY, options, T_start)
+    track, rng = tracker.begin(), np.random.default_rng(6)
+    for k, (time_s, T) in enumerate(drive(8)):
+        track, estimate = tracker.advance(track, k, time_s, views_at(T, rng, sigma=0.002))
+        assert estimate.status == "ok"
+        assert estimate.T_world_object is not None
+        # steps of 4 cm are twenty times the error of a range
+        assert np.linalg.norm((estimate.T_world_object - T)[:3, 3]) < 0.004
+        assert float(rotation_angle_deg(estimate.T_world_object, T)) < 1.0

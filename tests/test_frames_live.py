@@ -1,0 +1,331 @@
+"""Cameras, streams and pipes as they run: what is read, what is passed over, how they end."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mixpose.cli import main
+from mixpose.errors import RecordingError, SessionError
+from mixpose.frames import SourceSpec, capture, open_source, pair
+from mixpose.frames.source import Source
+from mixpose.records import RawFrame
+from mixpose.session import load_session
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+CLIP = SYNTHETIC / "one_camera_video" / "camera.avi"
+needs_pipes = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+
+
+def opened(source: str | Path) -> Source:
+    return open_source(SourceSpec("s1", str(source), Path(), "camera"))
+
+
+def numbered(number: int) -> bytes:
+    """A JPEG whose grey value tells its number."""
+    found, data = cv2.imencode(".jpg", np.full((48, 64), 10 * number, np.uint8))
+    assert found
+    return data.tobytes()
+
+
+def number_in(image: Any) -> int:
+    return round(float(np.mean(image)) / 10)
+
+
+class Camera(http.server.BaseHTTPRequestHandler):
+    """Sends `/clip.avi` as a file, and anything else as a camera in the network sends JPEGs."""
+
+    frames = 20
+    period_s = 0.03
+
+    def do_GET(self) -> None:
+        self.send_response(200)
+        if self.path == "/clip.avi":
+            self.end_headers()
+            self.wfile.write(CLIP.read_bytes())
+            return
+        self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
+        self.end_headers()
+        for number in range(self.frames):
+            data = numbered(number)
+            head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+            try:
+                self.wfile.write(head.encode() + data + b"\r\n")
+            except ConnectionError:  # the reader has seen enough
+                return
+            time.sleep(self.period_s)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[str]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Camera) as running:
+        thread = threading.Thread(target=running.serve_forever, args=(0.05,))
+        thread.start()
+        yield f"http://127.0.0.1:{running.server_address[1]}"
+        running.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(capture, "PATIENCE_S", 1.0)
+
+
+@contextmanager
+def piped(path: Path, write: Callable[[Any], None]) -> Iterator[Path]:
+    """A named pipe that a thread writes to."""
+    os.mkfifo(path)
+
+    def work() -> None:
+        try:
+            with path.open("wb") as stream:
+                write(stream)
+        except BrokenPipeError:
+            pass
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    yield path
+    thread.join()
+
+
+def images_of(source: Source) -> list[NDArray[np.uint8]]:
+    return [np.asarray(frame.data) for frame in source.frames()]
+
+
+@needs_pipes
+def test_pipe_gives_every_frame_of_the_file_sent_through_it(tmp_path: Path) -> None:
+    with piped(tmp_path / "left", lambda stream: stream.write(CLIP.read_bytes())) as pipe:
+        source = opened(pipe)
+        assert source.length is None
+        found = []
+        for frame in source.frames():
+            time.sleep(0.002)  # slower than the frames come
+            found.append(np.asarray(frame.data))
+    expected = images_of(opened(CLIP))
+    assert len(found) == 60
+    assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+@needs_pipes
+def test_pipe_of_bare_jpegs_gives_every_frame(tmp_path: Path) -> None:
+    def write(stream: Any) -> None:
+        for number in range(20):
+            stream.write(numbered(number))
+
+    with piped(tmp_path / "left.mjpeg", write) as pipe:
+        assert [number_in(image) for image in images_of(opened(pipe))] == list(range(20))
+
+
+@needs_pipes
+def test_descriptors_of_pipes_are_given_back(tmp_path: Path) -> None:
+    before = len(list(Path("/dev/fd").iterdir()))
+    with piped(tmp_path / "left", lambda stream: stream.write(CLIP.read_bytes())) as pipe:
+        images_of(opened(pipe))
+    assert len(list(Path("/dev/fd").iterdir())) == before
+
+
+@needs_pipes
+@pytest.mark.usefixtures("impatient")
+def test_pipe_that_nobody_writes_to_is_told(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left")
+    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 1 s"):
+        next(opened(tmp_path / "left").frames())
+
+
+@needs_pipes
+@pytest.mark.usefixtures("impatient")
+def test_pipe_whose_writer_falls_silent_is_told_after_the_frames_that_came(tmp_path: Path) -> None:
+    enough = threading.Event()
+
+    def write(stream: Any) -> None:
+        stream.write(CLIP.read_bytes()[:200_000])
+        stream.flush()
+        enough.wait(20)
+
+    with piped(tmp_path / "left", write) as pipe:
+        found: list[RawFrame] = []
+        with pytest.raises(RecordingError, match=r"left: no frame came for 1 s"):
+            found.extend(opened(pipe).frames())
+        enough.set()
+    assert 15 < len(found) < 40  # 200 of 470 kB hold about 25 of the 60 frames
+
+
+def test_video_file_on_a_server_gives_every_frame(server: str) -> None:
+    source = opened(f"{server}/clip.avi")
+    assert source.kind == "video"
+    assert len(images_of(source)) == 60
+
+
+def test_live_stream_gives_its_frames_in_order_and_ends_with_the_last(server: str) -> None:
+    source = opened(f"{server}/live")
+    assert source.kind == "live"
+    frames = list(source.frames())
+    numbers = [frame.number for frame in frames]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == Camera.frames - 1
+    assert [number_in(frame.data) for frame in frames] == numbers
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    assert len(times) == len(numbers)
+    assert all(a < b for a, b in pairwise(times))
+    # sent every 30 ms in 0.57 s; the first few come together, when FFmpeg has seen enough
+    assert 0.25 < times[-1] - times[0] < 20
+
+
+def test_slow_consumer_of_a_live_stream_gets_the_newest_frame(server: str) -> None:
+    numbers = []
+    for frame in opened(f"{server}/live").frames():
+        numbers.append(frame.number)
+        time.sleep(10 * Camera.period_s)
+    assert numbers[-1] == Camera.frames - 1
+    assert len(numbers) <= 10  # of 20; three or four where the machine is not busy
+
+
+def test_live_cameras_are_paired_by_arrival_and_end_with_the_last(server: str) -> None:
+    sources = {"left": opened(f"{server}/left"), "right": opened(f"{server}/right")}
+    sets = list(pair(sources))
+    assert [s.number for s in sets] == sorted({s.number for s in sets})
+    both = [s for s in sets if set(s.frames) == {"left", "right"}]
+    assert both
+    assert sets[: len(both)] == both  # where one has ended, the other goes on alone
+    for each in both:
+        times = [frame.time_s for frame in each.frames.values() if frame.time_s is not None]
+        assert abs(times[0] - times[1]) < 0.5  # a frame comes every 0.03 s
+        assert {frame.number for frame in each.frames.values()} == {each.number}
+
+
+def test_selected_frames_of_a_live_stream_end_the_reading(server: str) -> None:
+    numbers = [frame.number for frame in pair({"s1": opened(f"{server}/live")}, 2, 9)]
+    assert numbers
+    assert min(numbers) >= 2
+    assert max(numbers) < 9
+
+
+def test_live_source_beside_a_recording_is_refused(server: str) -> None:
+    with pytest.raises(SessionError, match="'b' is live and 'a' is a recording"):
+        pair({"a": opened(CLIP), "b": opened(f"{server}/live")})
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("source", ["http://127.0.0.1:9/live", "udp://127.0.0.1:9", "camera:97"])
+def test_live_source_that_does_not_open_is_told_in_time(source: str) -> None:
+    began = time.monotonic()
+    with pytest.raises(RecordingError, match=f"^{source}: does not open$"):
+        next(opened(source).frames())
+    assert time.monotonic() - began < 5
+
+
+class Device:
+    """Stands for a camera on the machine: four frames, then its cable is pulled."""
+
+    def __init__(self, index: int) -> None:
+        assert index == 3
+        self.count = -1
+
+    def isOpened(self) -> bool:
+        return True
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def grab(self) -> bool:
+        self.count += 1
+        time.sleep(0.03)
+        return self.count < 4
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
+        return True, np.full((48, 64, 3), 10 * self.count, np.uint8)
+
+    def release(self) -> None:
+        pass
+
+
+def test_camera_is_read_by_its_number_until_it_is_pulled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", Device)
+    found: list[RawFrame] = []
+    with pytest.raises(RecordingError, match=r"^camera:3: gives no frames any more$"):
+        found.extend(opened("camera:3").frames())
+    assert [number_in(frame.data) for frame in found] == [frame.number for frame in found]
+    assert found[-1].number == 3
+
+
+def run_mixpose(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mixpose", "run", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@needs_pipes
+def test_poses_of_a_pipe_appear_while_it_is_written_and_its_end_ends_the_run(
+    tmp_path: Path,
+) -> None:
+    pipe = tmp_path / "camera"
+    os.mkfifo(pipe)
+    session = str(CLIP.with_name("session.toml"))
+    data = CLIP.read_bytes()
+    seen = threading.Event()
+
+    def write() -> None:
+        with pipe.open("wb") as stream:
+            stream.write(data[:250_000])
+            stream.flush()
+            seen.wait(60)
+            stream.write(data[250_000:])
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    with run_mixpose(session, "--source", f"camera={pipe}") as process:
+        assert process.stdout is not None
+        early = [process.stdout.readline() for _ in range(10)]  # the rest is not sent yet
+        seen.set()
+        rest, errors = process.communicate(timeout=60)
+    writer.join()
+    assert process.returncode == 0, errors
+    assert '"frame": 8,' in early[-1]
+    assert len(early) + len(rest.splitlines()) == 61
+    assert "60 ok" in errors
+
+
+def test_camera_that_is_not_there_ends_a_run_with_one_line(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    session = str(CLIP.with_name("session.toml"))
+    with pytest.raises(SystemExit) as left:
+        main(["run", session, "--source", "camera=camera:97"])
+    assert left.value.code == 3
+    assert capfd.readouterr() == ("", "mixpose: camera:97: does not open\n")
+
+
+def test_live_run_cannot_be_resumed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    session = str(CLIP.with_name("session.toml"))
+    output = str(tmp_path / "poses.jsonl")
+    with pytest.raises(SystemExit) as left:
+        main(["run", session, "--source", "camera=camera:0", "-o", output, "--resume"])
+    assert left.value.code == 2
+    assert capfd.readouterr().err.startswith("mixpose: --resume: sensor 'camera' is live")
+
+
+def test_number_as_source_is_a_camera(tmp_path: Path) -> None:
+    path = tmp_path / "session.toml"
+    text = CLIP.with_name("session.toml").read_text()
+    path.write_text(text.replace('source = "camera.avi"', "source = 2"))
+    assert load_session(path).sensors[0].source == "camera:2"
+    path.write_text(text.replace('source = "camera.avi"', "source = -1"))
+    with pytest.raises(SessionError, match=r"source: found -1; allowed: .*a camera's number"):
+        load_session(path)

@@ -1,0 +1,271 @@
+"""`mixpose inspect`: pictures of one frame, and what to change in the session file."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mixpose
+from mixpose.body import Body
+from mixpose.cli import main
+from mixpose.density import Observation
+from mixpose.estimation import EstimatorOptions
+from mixpose.frames import pair
+from mixpose.objective import View
+from mixpose.pictures.advice import describe
+from mixpose.pictures.finding import Finding, find
+from mixpose.pictures.signature import write_png
+from mixpose.pictures.slices import objective_around
+from mixpose.records import Estimate, PointPattern
+from mixpose.runner import Selection, begin, observe, open_sources, run
+from mixpose.sensors import ParallelBeam
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+TWO_CAMERAS = SYNTHETIC / "two_cameras" / "session.toml"
+
+
+def command(*arguments: str | Path | int) -> int:
+    with pytest.raises(SystemExit) as leaving:
+        main([str(argument) for argument in arguments])
+    return int(str(leaving.value.code))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """One frame of two cameras, free to be spoilt."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    shutil.copy(TWO_CAMERAS, folder)
+    for side in ("left", "right"):
+        shutil.copy(SYNTHETIC / "two_cameras" / f"{side}0006.png", folder)
+    return folder
+
+
+def with_options(recording: Path, lines: str) -> Path:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    assert 'method = "blobs"\n' in text
+    session.write_text(text.replace('method = "blobs"\n', lines + "\n"), encoding="utf-8")
+    return session
+
+
+def advice_for(session_file: Path, frame: int, truth: NDArray[np.float64] | None) -> str:
+    """What is said about the first sensor of a frame with a known pose."""
+    session = mixpose.load_session(session_file)
+    frame_set = next(pair(open_sources(session, {}), frame, frame + 1))
+    status = "lost" if truth is None else "ok"
+    estimate = Estimate(frame, None, "tracker", status, truth, None, 1.0, {})  # type: ignore[arg-type]
+    views = observe(session, frame_set)
+    findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
+    return "\n".join(describe(findings[0], session.body, session.unit))
+
+
+@pytest.fixture(scope="module")
+def pose_of_frame_6() -> NDArray[np.float64]:
+    session = mixpose.load_session(TWO_CAMERAS)
+    (estimate,) = run(session, selection=Selection(6, 7))
+    assert estimate.T_world_object is not None
+    return estimate.T_world_object
+
+
+def test_cameras_get_a_picture_per_stage_and_a_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "seen"
+    folder.mkdir()
+    write_png(folder / "left_pose.png", np.zeros((4, 4, 3), np.uint8))  # of an earlier time
+    assert command("inspect", TWO_CAMERAS, "--frame", 5, "-o", folder) == 0
+    stages = ("features", "threshold", "density", "pose")
+    expected = {f"{side}_{stage}.png" for side in ("left", "right") for stage in stages}
+    assert {path.name for path in folder.iterdir()} == expected | {"sheet.png", "objective.png"}
+    for path in folder.iterdir():
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        assert picture.std() > 3, path.name  # something is on it
+    out = capsys.readouterr().out
+    # marker 1 is hidden in the left view of this frame, and a false spot is lit
+    assert "left: 7 features found; the pose has 7 of 7 in view, 6 of them met" in out
+    assert "not met and dark there: feature 1; hidden" in out
+    assert "1 found belong to no feature" in out
+    assert "right: 7 features found; the pose has 7 of 7 in view, 7 of them met" in out
+
+
+def test_grey_values_have_pictures_too(tmp_path: Path) -> None:
+    session = SYNTHETIC / "parallel_beams" / "session.toml"
+    assert command("inspect", session, "--frame", 3, "-o", tmp_path) == 0
+    shown = cv2.imread(str(tmp_path / "angle0_threshold.png"))
+    assert shown is not None
+    # in place of a mask, grey values: zero where no feature is, which is most of the frame
+    assert 0.9 < (shown.max(axis=-1) == 0).mean() < 0.995
+
+
+def test_ranges_have_plots_and_the_pose_may_come_from_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, poses, folder = (
+        SYNTHETIC / "range_profiles" / "session.toml",
+        tmp_path / "poses.jsonl",
+        tmp_path / "seen",
+    )
+    assert command("run", session, "-o", poses, "--stop", 2) == 0
+    arguments = ("inspect", session, "-o", folder, "--poses", poses, "--frame")
+    assert command(*arguments, 1) == 0
+    assert f"ok (pose of {poses})" in capsys.readouterr().out
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"sheet.png", "objective.png", "ranges.png"}
+    assert command(*arguments, 9) == 2
+    assert "has no pose of it, found frames 0 to 1" in capsys.readouterr().err
+
+
+def test_poses_of_another_object_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = SYNTHETIC / "one_camera_video" / "truth.jsonl"
+    status = command("inspect", TWO_CAMERAS, "-o", tmp_path, "--frame", 1, "--poses", other)
+    assert status == 2
+    assert "found poses of wand, the session's object is tracker" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("frame", [40, -1])
+def test_a_frame_that_is_not_there_names_those_that_are(
+    frame: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("inspect", TWO_CAMERAS, f"--frame={frame}", "-o", tmp_path / "seen") == 2
+    error = capsys.readouterr().err
+    assert f"--frame {frame}: the recording has no such frame" in error
+    assert "frames 0-39" in error
+    assert not (tmp_path / "seen").exists()
+
+
+def test_other_peoples_files_are_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sheet.png").write_bytes(b"holiday")
+    assert command("inspect", TWO_CAMERAS, "--frame", 5, "-o", tmp_path) == 2
+    assert "sheet.png holds something that mixpose did not write" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
+    assert (tmp_path / "sheet.png").read_bytes() == b"holiday"
+
+
+def test_without_matplotlib_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    assert command("inspect", TWO_CAMERAS, "--frame", 5, "-o", tmp_path / "seen") == 2
+    assert "pip install 'mixpose[plots]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('method = "blobs"\nmin_area = 60', "not met, too small: features 0, 1, 2, 3, 4, 5 and 1"),
+        ('method = "blobs"\nmin_area = 60', "lower min_area = 60 to 40"),
+        ('method = "blobs"\nmax_area = 30', "raise max_area = 30 to"),
+        ('method = "blobs"\nthreshold = 150', "lower it: threshold = 72"),
+        ('method = "blobs"\npolarity = "dark"', "not met"),
+    ],
+)
+def test_expected_features_that_are_not_found_name_the_key_and_the_direction(
+    lines: str, words: str, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    assert words in advice_for(with_options(recording, lines), 6, pose_of_frame_6)
+
+
+def test_following_the_advice_finds_the_features(
+    recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    session = with_options(recording, 'method = "blobs"\nthreshold = 72')
+    text = advice_for(session, 6, pose_of_frame_6)
+    assert "7 of 7 in view, 7 of them met" in text
+    assert "not met" not in text
+
+
+def test_for_dark_features_the_threshold_goes_the_other_way(
+    recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    for path in recording.glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path), 255 - image)
+    session = with_options(recording, 'method = "blobs"\npolarity = "dark"\nthreshold = 105')
+    assert "raise it: threshold = 184" in advice_for(session, 6, pose_of_frame_6)
+
+
+def test_small_clutter_is_told_by_its_area(
+    recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    path = recording / "left0006.png"
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    for u in range(30, 600, 60):
+        image[30:33, u : u + 3] = 150
+    cv2.imwrite(str(path), image)
+    text = advice_for(recording / "session.toml", 6, pose_of_frame_6)
+    # specks of 9 px and markers of about 40: their geometric mean lies between
+    assert "10 found belong to no feature, all smaller" in text
+    assert re.search("raise min_area to 1[0-9]$", text, re.MULTILINE)
+
+
+def test_without_a_pose_the_number_of_features_tells(recording: Path) -> None:
+    text = advice_for(with_options(recording, 'method = "blobs"\nmin_area = 60'), 6, None)
+    assert "0 features found; without a pose up to 7 are expected" in text
+    assert "7 pieces above the threshold are too small" in text
+
+
+def test_the_objective_peaks_at_the_pose_in_every_slice_and_map(
+    paper_body: Body, parallel_cameras: list[ParallelBeam]
+) -> None:
+    views = []
+    for k, camera in enumerate(parallel_cameras):
+        y, _ = camera.project(paper_body.means)
+        views.append(View(str(k), camera, Observation(PointPattern(y, np.ones(len(y))), 1.5)))
+    levels = [(6.0, 6.0), (1.5, 1.5)]
+    slices, maps = objective_around(views, paper_body, np.eye(4), None, EstimatorOptions(), levels)
+    assert [one.direction for one in slices] == list(range(6))
+    for one in slices:
+        assert one.values.shape == (2, len(one.offsets))
+        # densities are looked up on grids of a quarter of a blur; a slice ends at 8 of the finest
+        coarse, fine = np.abs(one.offsets[one.values.argmax(axis=1)] / one.offsets[-1])
+        assert coarse < 0.25 * 4 / 8
+        assert fine < 0.25 / 8
+        # the coarser level reaches farther
+        assert one.values[0].mean() > one.values[1].mean()
+    for surface in maps:
+        row, column = np.unravel_index(surface.values.argmax(), surface.values.shape)
+        assert abs(row - 20) <= 1  # of 41, half a blur apart at most
+        assert abs(column - 20) <= 1
+
+
+def test_directions_that_are_held_have_no_slice(
+    paper_body: Body, parallel_cameras: list[ParallelBeam]
+) -> None:
+    camera = parallel_cameras[0]
+    y, _ = camera.project(paper_body.means)
+    view = View("one", camera, Observation(PointPattern(y, np.ones(len(y))), 1.5))
+    options = EstimatorOptions(free=("x", "rz"))
+    slices, maps = objective_around([view], paper_body, np.eye(4), None, options, [(1.5,)])
+    assert [one.direction for one in slices] == [0, 5]
+    assert [surface.directions for surface in maps] == [(0, 5)]
+
+
+def test_a_sensor_without_a_frame_is_said_to_have_none() -> None:
+    session = mixpose.load_session(TWO_CAMERAS)
+    finding = Finding(session.sensors[0], None, None, None, 0.0, None)
+    assert describe(finding, session.body, session.unit) == ["left: no frame of this number"]
+
+
+def test_real_frames_have_every_marker_met(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = recordings / "stereo_chessboard" / "session.toml"
+    assert command("inspect", session, "--frame", 3, "-o", tmp_path) == 0
+    assert capsys.readouterr().out.count("54 of 54 in view, 54 of them met") == 2
+    tracker, _ = begin(mixpose.load_session(session))
+    assert len(tracker.body) == 54

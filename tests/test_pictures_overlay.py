@@ -1,0 +1,283 @@
+"""Poses drawn on frames: what is drawn where, and what becomes of a run that is drawn."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mixpose
+from mixpose.body import Body
+from mixpose.cli import main
+from mixpose.errors import SessionError
+from mixpose.objective import View
+from mixpose.pictures import Part, displayable, draw_pose
+from mixpose.pictures.movie import Overlay
+from mixpose.pictures.overlay import (
+    CHI2_95,
+    STATUS_COLOURS,
+    ellipse_95,
+    projected_covariances,
+    projected_features,
+)
+from mixpose.pictures.scene import draw_scene
+from mixpose.pictures.signature import is_ours
+from mixpose.records import Estimate, FrameSet, SensorReport
+from mixpose.rigid import perturb, transform
+from mixpose.runner import Selection, run
+from mixpose.sensors import PinholeCamera
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+BLACK = np.zeros((1024, 1280, 3), np.uint8)
+WHITE = np.full((1024, 1280, 3), 255, np.uint8)
+
+
+def command(*arguments: str | Path | int) -> int:
+    with pytest.raises(SystemExit) as leaving:
+        main([str(argument) for argument in arguments])
+    return int(str(leaving.value.code))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """Four frames of two cameras, free to be spoilt."""
+    folder = tmp_path / "recording"
+    folder.mkdir()
+    shutil.copy(SYNTHETIC / "two_cameras" / "session.toml", folder)
+    for n in range(4):
+        for side in ("left", "right"):
+            shutil.copy(SYNTHETIC / "two_cameras" / f"{side}{n:04d}.png", folder)
+    return folder
+
+
+@pytest.mark.parametrize("ground", [BLACK, WHITE], ids=["dark", "bright"])
+def test_rings_lie_around_the_projected_features_and_stand_out(
+    ground: NDArray[np.uint8], paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    camera = pinhole_cameras[0]
+    picture = draw_pose(ground, camera, paper_body, np.eye(4), status="ok")
+    y, _, seen = projected_features(camera, paper_body, np.eye(4))
+    assert seen.all()
+    colour = np.array(STATUS_COLOURS["ok"])
+    for u, v in np.round(y).astype(int):
+        patch = picture[v - 20 : v + 21, u - 20 : u + 21].astype(int)
+        # the ring in its own colour, its rim black: one of the two is seen on any ground
+        assert (np.abs(patch - colour).max(axis=-1) < 60).sum() > 20
+        assert (patch.max(axis=-1) < 60).any()
+    assert not np.array_equal(picture, ground)
+
+
+def test_the_frame_that_is_drawn_on_stays_as_it_is(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    ground = BLACK.copy()
+    draw_pose(ground, pinhole_cameras[0], paper_body, np.eye(4), np.eye(6), "ok", 3)
+    assert not ground.any()
+
+
+def test_a_lost_frame_gets_its_status_and_no_features(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    picture = draw_pose(BLACK, pinhole_cameras[0], paper_body, None, status="lost", frame=7)
+    rows, columns = np.nonzero(picture.any(axis=-1))
+    assert len(rows) > 50
+    assert rows.max() < 60
+    assert columns.max() < 400
+
+
+def test_a_resized_part_of_the_frame_has_its_marks_where_the_features_went(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    # the middle of the pixel (10, 20), three times as large, is three pixels wide
+    assert Part(3.0, (10.0, 20.0)).places(np.array([10.0, 20.0])).tolist() == [1.0, 1.0]
+    assert Part(0.5).places(np.array([0.5, 0.5])).tolist() == [0.0, 0.0]
+
+
+def test_projected_covariances_are_those_of_drawn_poses(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    camera, T = pinhole_cameras[0], np.eye(4)
+    generator = np.random.default_rng(0)
+    root = generator.normal(size=(6, 6)) * np.repeat([0.05, 5e-4], 3)[:, None]
+    covariance = root @ root.T
+    twists = generator.multivariate_normal(np.zeros(6), covariance, size=20_000)
+    drawn, _ = camera.project(transform(perturb(T, twists), paper_body.means))
+    sampled = np.array([np.cov(drawn[:, i].T) for i in range(len(paper_body))])
+    propagated = projected_covariances(camera, paper_body, T, covariance)
+    # 20 000 samples leave 1 % per entry
+    assert np.abs(propagated - sampled).max() < 0.05 * np.abs(sampled).max()
+
+
+def test_the_ellipse_holds_95_percent() -> None:
+    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
+    outline = ellipse_95(covariance)
+    squared = np.einsum("ni,ij,nj->n", outline, np.linalg.inv(covariance), outline)
+    np.testing.assert_allclose(squared, CHI2_95[2])
+    samples = np.random.default_rng(1).multivariate_normal([0, 0], covariance, 50_000)
+    inside = np.einsum("ni,ij,nj->n", samples, np.linalg.inv(covariance), samples) < CHI2_95[2]
+    assert inside.mean() == pytest.approx(0.95, abs=0.005)
+
+
+def test_large_ellipses_are_drawn_and_infinite_ones_are_not(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    camera = pinhole_cameras[0]
+    plain = draw_pose(BLACK, camera, paper_body, np.eye(4), None, "ok")
+    sharp = draw_pose(BLACK, camera, paper_body, np.eye(4), 1e-8 * np.eye(6), "ok")
+    vague = draw_pose(BLACK, camera, paper_body, np.eye(4), np.diag([100.0] * 3 + [0.0] * 3), "ok")
+    unknown = draw_pose(BLACK, camera, paper_body, np.eye(4), np.diag([np.inf] * 6), "ok")
+    assert np.array_equal(plain, sharp)
+    assert np.array_equal(plain, unknown)
+    assert (vague != plain).any(axis=-1).sum() > 1000
+
+
+def test_a_few_small_spots_in_a_dark_frame_are_white_and_the_rest_is_not_black() -> None:
+    frame = np.full((1200, 1600), 6, np.uint8)
+    frame[::2] = 9
+    frame[600:605, 800:805] = 70
+    frame[100:105, 300:305] = 60
+    picture = displayable(frame)
+    assert picture[602, 802].tolist() == [255, 255, 255]
+    assert picture[102, 302, 0] > 220
+    assert 20 < picture[700:720, 100:120].mean() < 120
+
+
+def test_dark_spots_on_a_bright_frame_stay_dark() -> None:
+    frame = np.full((480, 640), 250, np.uint8)
+    frame[100:106, 100:106] = 120
+    picture = displayable(frame)
+    assert picture[103, 103, 0] == 0
+    assert picture[300, 300, 0] == 255
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+def test_an_even_frame_of_any_type_is_shown_without_a_fault(kind: type) -> None:
+    assert displayable(np.full((40, 50), 3, kind)).shape == (40, 50, 3)
+
+
+def test_a_run_is_watched_frame_by_frame_and_finds_the_same_poses(recording: Path) -> None:
+    session = mixpose.load_session(recording / "session.toml")
+    watched: list[tuple[int, list[str], list[str], int]] = []
+
+    def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        names = [view.name for view in views]
+        watched.append((frame_set.number, list(frame_set.frames), names, estimate.frame))
+
+    plain = list(run(session))
+    seen: list[Estimate] = []
+    for estimate in run(session, watch=watch):
+        assert len(watched) == len(seen) + 1  # before the estimate is handed out
+        seen.append(estimate)
+    assert watched == [(n, ["left", "right"], ["left", "right"], n) for n in range(4)]
+    for one, other in zip(plain, seen, strict=True):
+        assert np.array_equal(one.T_world_object, other.T_world_object)  # type: ignore[arg-type]
+
+
+def test_a_folder_gets_a_picture_per_frame_and_resume_goes_on(recording: Path) -> None:
+    session, poses, folder = recording / "session.toml", recording / "p.jsonl", recording / "seen"
+    assert command("run", session, "-o", poses, "--overlay", folder, "--stop", 2) == 0
+    first = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert sorted(first) == ["overlay_000000.png", "overlay_000001.png"]
+    assert command("run", session, "-o", poses, "--overlay", folder, "--resume") == 0
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"overlay_{n:06d}.png" for n in range(4)
+    ]
+    assert (folder / "overlay_000000.png").stat().st_mtime_ns == first["overlay_000000.png"]
+    picture = cv2.imread(str(folder / "overlay_000003.png"))
+    assert picture is not None
+    assert picture.shape == (512, 2 * 640 + 4, 3)
+
+
+def test_a_new_run_replaces_the_pictures_of_the_last(recording: Path) -> None:
+    session, folder = recording / "session.toml", recording / "seen"
+    assert command("run", session, "-o", recording / "p.jsonl", "--overlay", folder) == 0
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    arguments = ("-o", recording / "p.jsonl", "--overlay", folder, "--start", 3)
+    assert command("run", session, *arguments) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["notes.txt", "overlay_000003.png"]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".avi", ".mkv"])
+def test_a_video_has_every_frame_at_the_recordings_rate_and_may_be_rewritten(
+    suffix: str, recording: Path
+) -> None:
+    video = recording / f"seen{suffix}"
+    for _ in range(2):  # the second time over its own
+        arguments = ("-o", recording / "p.jsonl", "--overlay", video)
+        assert command("run", recording / "session.toml", *arguments) == 0
+    assert is_ours(video)
+    capture = cv2.VideoCapture(str(video))
+    assert capture.get(cv2.CAP_PROP_FPS) == pytest.approx(25, abs=0.1)
+    count = 0
+    while capture.read()[0]:
+        count += 1
+    assert count == 4
+
+
+@pytest.mark.parametrize(
+    ("overlay", "options", "words"),
+    [
+        ("seen.mp4", ["--resume"], "cannot go on in a video; name a folder"),
+        ("seen.gif", [], "found the extension .gif, allowed are .mp4, .mkv, .avi"),
+        ("nowhere/seen.mp4", [], "there is no folder"),
+        ("film.mp4", [], "holds something that mixpose did not write"),
+        (".", [], "holds left0000.png, which mixpose did not write"),
+    ],
+)
+def test_a_place_for_the_overlay_that_will_not_do_is_one_line(
+    overlay: str,
+    options: list[str],
+    words: str,
+    recording: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (recording / "film.mp4").write_bytes(b"somebody's film")
+    poses = recording / "p.jsonl"
+    session = recording / "session.toml"
+    assert command("run", session, "-o", poses, "--overlay", recording / overlay, *options) == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
+    assert words in error
+    assert not poses.exists()
+    assert (recording / "film.mp4").read_bytes() == b"somebody's film"
+
+
+def test_ranges_are_drawn_as_strips_of_one_size(tmp_path: Path) -> None:
+    session = mixpose.load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    with Overlay(session, tmp_path / "seen") as overlay:
+        estimates = list(run(session, selection=Selection(0, 2), watch=overlay.watch))
+    pictures = [cv2.imread(str(path)) for path in sorted((tmp_path / "seen").iterdir())]
+    assert len(pictures) == len(estimates) == 2
+    shapes = {picture.shape for picture in pictures if picture is not None}
+    assert shapes == {(36 + 3 * (130 + 4), 960, 3)}
+
+
+def test_a_sensor_without_a_frame_keeps_its_place_in_the_picture(recording: Path) -> None:
+    session = mixpose.load_session(recording / "session.toml")
+    scenes: list[NDArray[np.uint8]] = []
+
+    def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        alone = replace(frame_set, frames={"left": frame_set.frames["left"]})
+        scenes.extend(draw_scene(session, one, estimate) for one in (frame_set, alone))
+
+    list(run(session, selection=Selection(0, 1), watch=watch))
+    whole, half = scenes
+    assert whole.shape == half.shape
+    assert np.array_equal(whole[:, :640], half[:, :640])
+    assert not np.array_equal(whole[:, 644:], half[:, 644:])
+
+
+def test_a_folder_that_cannot_be_written_is_an_error_of_one_line(tmp_path: Path) -> None:
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    overlay = Overlay(session, tmp_path / "seen")
+    (tmp_path / "seen").write_text("in the way", encoding="utf-8")
+    lost = Estimate(0, None, "tracker", "lost", None, None, 0.0, {"left": SensorReport(False)})
+    with pytest.raises(SessionError, match=re.escape("seen: cannot be written")):
+        overlay.watch(FrameSet(0, None, {}), [], lost)
