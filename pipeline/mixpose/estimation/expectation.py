@@ -70,7 +70,7 @@ class Expectation:
             Directions that are estimated.
         """
         self.names = tuple(cameras)
-        self._gaze = Gaze(list(cameras.values()), body)
+        self._gaze = Gaze(list(cameras.values()), body) if cameras else None
         self._free = free
         points = body.nodes.points
         # A feature's image reaches less than half way to that of its neighbour.
@@ -85,7 +85,7 @@ class Expectation:
         and the features' images, but at least 40 px, around them.  Cameras that will not see the
         body have none; a body of one feature, whose size in the image nothing tells, neither.
         """
-        if not (self.names and np.isfinite(self._feature_reach)):
+        if self._gaze is None or not np.isfinite(self._feature_reach):
             return {}
         boxes: dict[str, Box] = {}
         for prediction in predictions:
@@ -108,7 +108,7 @@ class Expectation:
         """How much of the body at a pose the cameras' detections meet."""
         met: dict[str, int] = {}
         missed: dict[str, int] = {}
-        if not self.names:
+        if self._gaze is None:
             return Encounter(met, missed)
         at = self._gaze.project(T_world_object)
         for view in views:

@@ -9,13 +9,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.extraction.threshold import Foreground, above, bands
+from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
 Contour: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
 
 # Upright box about a contour: first column, first row, width, height.
 Box: TypeAlias = Sequence[int]
+
+# Rows are left out where that leaves at most this share of them.
+MOST_ROWS_SHARE = 0.5
 
 # Parts of a broken rim are apart by at most this share of their length, and 2 px.
 GAP_SHARE = 0.1
@@ -26,16 +29,25 @@ CONTOUR_SAMPLES = 64
 def outlines(scene: Foreground) -> list[Contour]:
     """Outermost contours of what is above the detection level.
 
-    They are followed band by band of rows that have something above it: of a frame with few
-    features, little is looked at twice, and no second frame is ever written.
+    Rows with nothing above it are left out, but for one where others follow: of a frame with few
+    features, little is looked at twice.
     """
-    contours: list[Contour] = []
-    for rows in bands(scene):
-        mask = above(scene.grey[rows], scene.zero + scene.level)
-        contours += cv2.findContours(
-            mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(0, rows.start)
-        )[0]
-    return contours
+    level = scene.zero + scene.level
+    wanted = above(scene.tops, level)
+    wanted[1:] |= wanted[:-1]
+    rows = np.flatnonzero(wanted)
+    if rows.size > MOST_ROWS_SHARE * len(wanted):
+        rows = np.arange(len(wanted))
+        mask = above(scene.grey, level)
+    else:
+        mask = above(scene.grey[rows], level)
+    contours = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    if rows.size < len(wanted):
+        # Between a contour's rows none was left out, so that all of it moves alike.
+        left_out = (rows - np.arange(rows.size)).tolist()
+        for contour in contours:
+            contour[:, 0, 1] += left_out[contour[0, 0, 1]]
+    return list(contours)
 
 
 def pieces(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:

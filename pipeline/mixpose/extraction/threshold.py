@@ -128,20 +128,10 @@ def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDA
         grey, zero = _without_background(bright, inner, found.noise, local=False)
     values = np.zeros(grey.shape, np.float32)
     # Rows without features are left alone: most of a frame has none.
-    for rows in bands(found):
-        signal = grey[rows].astype(np.float32) - np.float32(zero)
-        values[rows] = np.maximum(signal, 0) * above(found.grey[rows], found.zero + found.level)
+    rows = np.flatnonzero(above(found.tops, found.zero + found.level))
+    signal = grey[rows].astype(np.float32) - np.float32(zero)
+    values[rows] = np.maximum(signal, 0) * above(found.grey[rows], found.zero + found.level)
     return values
-
-
-def bands(scene: Foreground) -> list[slice]:
-    """Rows with something above the detection level, neighbouring ones together."""
-    rows = np.flatnonzero(above(scene.tops, scene.zero + scene.level))
-    if rows.size == 0:
-        return []
-    breaks = np.flatnonzero(np.diff(rows) > 1)
-    firsts, lasts = rows[[0, *(breaks + 1)]], rows[[*breaks, -1]]
-    return [slice(first, last + 1) for first, last in zip(firsts.tolist(), lasts.tolist())]
 
 
 def _bright(
