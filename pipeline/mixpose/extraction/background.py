@@ -84,8 +84,7 @@ def noise_of(image: Grey) -> float:
     if image.shape[1] <= 2 * NOISE_SPACING_PX:
         return 0.0 if image.dtype == np.float32 else 1.0
     tile = tile_side(image)
-    # Half of the rows: thousands of pixels are plenty for a single number.
-    v = _sample_places(image.shape[0], tile)[1][::2]
+    _, v = _sample_places(image.shape[0], tile)
     _, u = _sample_places(image.shape[1] - 2 * NOISE_SPACING_PX, tile)
     places = np.concatenate([u + shift * NOISE_SPACING_PX for shift in range(3)])
     rows = image[v][:, places].reshape(v.size, 3, u.size)

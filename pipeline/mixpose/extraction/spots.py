@@ -92,11 +92,11 @@ def find_spots(
 
 def _moments(weights: NDArray[np.float32] | NDArray[np.uint8]) -> list[float]:
     """Sum of weights, and of weights by u and by v."""
-    return cast("list[float]", (_monomials(*weights.shape) @ weights.ravel()).tolist())
+    return cast("list[float]", (monomials(*weights.shape) @ weights.ravel()).tolist())
 
 
 @lru_cache(maxsize=SHAPES)
-def _monomials(rows: int, columns: int) -> Floats:
+def monomials(rows: int, columns: int) -> Floats:
     """1, u and v of every pixel of a patch (3, rows * columns)."""
     v, u = np.indices((rows, columns), dtype=np.float64).reshape(2, -1)
     return np.array([np.ones(u.size), u, v])
@@ -136,7 +136,7 @@ def come_apart(
         (h, w) uint8 mask of each part, and the level that sets them apart; none if none does,
         or if what is above the level is all that is asked for.
     """
-    if not (scene.judged and _long(contour)):
+    if not (scene.judged and is_long(contour)):
         return []
     signal = patch if inside is None else patch * inside
     least_rise = PROMINENCE_NOISE_FACTOR * scene.noise
@@ -157,6 +157,7 @@ def come_apart(
     return []
 
 
-def _long(contour: Contour) -> bool:
+def is_long(contour: Contour) -> bool:
+    """Whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
     return bool(max(a, b) + 1 > LONG * (min(a, b) + 1))
