@@ -7,6 +7,7 @@ again as a whole (`mixpose.runner`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -29,6 +30,8 @@ Box: TypeAlias = tuple[int, int, int, int]
 
 REACH = 4.0  # standard deviations of the prediction, and of features that have a spread
 LEAST_MARGIN_PX = 40.0
+
+_REACH_OF_MEETING = -4 * math.log(LEAST_SHARE)  # in σ_ε², as `mixpose.estimation.meeting` has it
 
 
 @dataclass(frozen=True)
@@ -91,15 +94,18 @@ class Expectation:
         for prediction in predictions:
             at = self._gaze.project(prediction.T_world_object)
             variances = (prediction.uncertainty * self._free) ** 2
+            by_shift = at.J[..., :3]
+            scales = np.sqrt(np.einsum("lnij,lnij->ln", by_shift, by_shift).max(axis=1))
             margins = REACH * np.sqrt(at.J**2 @ variances)
-            scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(2, 3)).max(axis=1))
             margins += np.maximum(scales * self._feature_reach, LEAST_MARGIN_PX)[:, None, None]
-            lower = np.where(at.seen[..., None], at.y - margins, np.inf).min(axis=1)
-            upper = np.where(at.seen[..., None], at.y + margins, -np.inf).max(axis=1)
-            for k in np.flatnonzero(at.seen.any(axis=1)).tolist():
-                name = self.names[k]
-                u0, v0 = np.floor(lower[k]).astype(int).tolist()
-                u1, v1 = np.ceil(upper[k] + 1).astype(int).tolist()
+            seen = at.seen[..., None]
+            lower = np.where(seen, at.y - margins, np.inf).min(axis=1).tolist()
+            upper = np.where(seen, at.y + margins, -np.inf).max(axis=1).tolist()
+            for name, low, high in zip(self.names, lower, upper, strict=True):
+                if low[0] > high[0]:
+                    continue
+                u0, v0 = (math.floor(end) for end in low)
+                u1, v1 = (math.ceil(end) + 1 for end in high)
                 a, b, c, d = boxes.get(name, (u0, v0, u1, v1))
                 boxes[name] = (min(a, u0), min(b, v0), max(c, u1), max(d, v1))
         return boxes
@@ -117,11 +123,12 @@ class Expectation:
                 continue
             k = self.names.index(view.name)
             y = at.y[k][at.seen[k]]
-            reach = -4 * view.observation.sigma**2 * np.log(LEAST_SHARE)
+            near = _REACH_OF_MEETING * view.observation.sigma**2
             if len(pattern.points):
                 away = pattern.points[:, None] - y
-                count = int(((away * away).sum(axis=-1) <= reach).any(axis=0).sum())
+                nearest = np.einsum("ijk,ijk->ij", away, away).min(axis=0)
+                met[view.name] = int(np.count_nonzero(nearest <= near))
             else:
-                count = 0
-            met[view.name], missed[view.name] = count, len(y) - count
+                met[view.name] = 0
+            missed[view.name] = len(y) - met[view.name]
         return Encounter(met, missed)

@@ -8,6 +8,7 @@ so many pixels.  Features up to half the shorter side are taken out by medians o
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import cv2
@@ -20,6 +21,9 @@ Grey: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
 TILES_PER_SHORT_SIDE = 5
 LEAST_TILE_PX = 16
 SAMPLES_PER_TILE_SIDE = 16
+
+# Sides of images and windows for which the places of samples are kept.
+PLACES = 64
 
 # Noise is measured between pixels so far apart: interpolated or compressed pixels are more
 # alike than noise would make them.
@@ -87,11 +91,12 @@ def noise_of(image: Grey) -> float:
     _, v = _sample_places(image.shape[0], tile)
     _, u = _sample_places(image.shape[1] - 2 * NOISE_SPACING_PX, tile)
     places = np.concatenate([u + shift * NOISE_SPACING_PX for shift in range(3)])
-    rows = image[v][:, places].reshape(v.size, 3, u.size)
+    exact = np.int16 if image.dtype == np.uint8 else np.float32
+    rows: NDArray[Any] = image[v][:, places].astype(exact).reshape(v.size, 3, u.size)
     # A straight slope of light has no second difference, whose variance is 6 times a pixel's.
-    differences = np.zeros((v.size, u.size), np.int16 if image.dtype == np.uint8 else np.float32)
-    for part, factor in enumerate((-1, 2, -1)):
-        differences += factor * rows[:, part].astype(differences.dtype)
+    differences = rows[:, 1] + rows[:, 1]
+    differences -= rows[:, 0]
+    differences -= rows[:, 2]
     deviations = np.abs(differences).ravel()
     # Whole grey values hide a noise that is smaller than themselves.
     least = 0.0 if image.dtype == np.float32 else 1.0
@@ -119,6 +124,7 @@ def tile_side(image: Grey) -> int:
     return max(int(min(height, width)) // TILES_PER_SHORT_SIDE, LEAST_TILE_PX)
 
 
+@lru_cache(maxsize=PLACES)
 def _sample_places(side: int, about: int) -> tuple[int, NDArray[np.intp]]:
     """Number of tiles along a side, and the pixels of each that are looked at, in a row."""
     tiles = max(round(side / about), 1)
