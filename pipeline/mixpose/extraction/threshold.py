@@ -26,6 +26,7 @@ LEAST_MARGIN_PX = 64
 
 # Rows that are searched for the peak first: it is in one of the brightest, as a rule.
 PEAK_ROWS = 4
+BLOCK_ROWS = 64
 
 # Detection level of "auto" and "local": above the noise, and above what is faint beside the
 # brightest thing in view (reflections, lens flare, dimly lit surroundings).
@@ -194,7 +195,9 @@ def _peak(grey: Grey, tops: Grey) -> float:
     few = min(PEAK_ROWS, len(tops))
     peak = _shared(grey[np.argpartition(tops, -few)[-few:]])
     rest = np.flatnonzero(tops > peak)
-    return float(max(peak, _shared(grey[rest])) if rest.size else peak)
+    # In blocks that stay in the cache: of a bright frame it is most rows.
+    blocks = (rest[first : first + BLOCK_ROWS] for first in range(0, rest.size, BLOCK_ROWS))
+    return float(max([peak, *(_shared(grey[block]) for block in blocks)]))
 
 
 def _shared(rows: Grey) -> np.number[Any]:
