@@ -35,7 +35,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
     | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
-    "runner": GROUND | {"density", "extraction", "objective", "estimation", "frames", "session"},
+    "runner": GROUND
+    | {"sensors", "density", "extraction", "objective", "estimation", "frames", "session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {

@@ -7,15 +7,15 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density import Observation
 from mixpose.errors import SessionError
-from mixpose.estimation import Track, Tracker
-from mixpose.extraction import extract
+from mixpose.estimation import Encounter, Expectation, Track, Tracker, predict
+from mixpose.extraction import Window, extract
 from mixpose.frames import Source, SourceSpec, open_source, pair
 from mixpose.objective import View
 from mixpose.records import (
@@ -29,6 +29,7 @@ from mixpose.records import (
 )
 
 if TYPE_CHECKING:
+    from mixpose.sensors import Sensor
     from mixpose.session import SensorSetup, Session
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -72,7 +73,8 @@ def run(
         Pose to begin at in place of the session's ``[start]``.
     watch : callable or None
         Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
-        raw frames and the features found in them; its time is not in the latency.
+        raw frames and the features found in them, while tracking around the body only; its time
+        is not in the latency.
 
     Yields
     ------
@@ -155,25 +157,94 @@ def _estimates(
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
 ) -> Generator[Estimate, None, None]:
+    expectation = Expectation(tracker.body, _windowed(session), tracker.free)
+    met: Encounter | None = None
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            views = observe(session, frame_set)
-            track, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
-            estimate = _with_silent_sensors(estimate, session.sensors)
+            step = _advance(session, tracker, expectation, track, frame_set, met)
+            track, met = step.track, step.met
+            estimate = _with_silent_sensors(step.estimate, session.sensors)
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
             if watch is not None:
-                watch(frame_set, views, estimate)
+                watch(frame_set, step.views, estimate)
             yield estimate
 
 
-def observe(session: Session, frame_set: FrameSet) -> list[View]:
-    """Extract the features of every sensor that has a frame."""
+def _windowed(session: Session) -> dict[str, Sensor]:
+    """Cameras whose features in a part of the frame are those of the whole frame."""
+    return {
+        setup.name: setup.sensor
+        for setup in session.sensors
+        if setup.model != "lateration"
+        and setup.extract.method == "blobs"
+        and setup.extract.threshold not in ("otsu", "local")
+    }
+
+
+class _Step(NamedTuple):
+    """A frame's estimate, what it was made from, and how the body was met if that convinces."""
+
+    track: Track
+    estimate: Estimate
+    views: list[View]
+    met: Encounter | None
+
+
+def _advance(
+    session: Session,
+    tracker: Tracker,
+    expectation: Expectation,
+    track: Track,
+    frame_set: FrameSet,
+    before: Encounter | None,
+) -> _Step:
+    """Estimate a frame: around the prediction if that convinces, else from all that is there.
+
+    `before` tells how the body was met in the frame before, None if that did not convince.
+    """
+
+    def estimated(views: list[View]) -> _Step:
+        after, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
+        met = None
+        if estimate.status == "ok" and estimate.T_world_object is not None:
+            met = expectation.encounter(views, estimate.T_world_object)
+        return _Step(after, estimate, views, met if met is not None and met.convincing else None)
+
+    if before is not None:
+        predictions = predict(track, tracker.body, frame_set.number, frame_set.time_s)
+        images = {
+            name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)
+        }
+        windows = expectation.windows(predictions)
+        windows = {name: window for name, window in windows.items() if name in images}
+        if windows:
+            views = observe(session, frame_set, windows)
+            if not _fewer(views, before):
+                step = estimated(views)
+                if step.met is not None and step.met.as_good_as(before):
+                    return step
+    return estimated(observe(session, frame_set))
+
+
+def _fewer(views: Sequence[View], before: Encounter) -> bool:
+    """Whether a camera has fewer detections than it met features in the frame before."""
+    patterns = {view.name: view.observation.pattern for view in views}
+    return any(
+        isinstance(pattern, PointPattern) and len(pattern.points) < before.met.get(name, 0)
+        for name, pattern in patterns.items()
+    )
+
+
+def observe(
+    session: Session, frame_set: FrameSet, windows: Mapping[str, Window] | None = None
+) -> list[View]:
+    """Extract the features of every sensor that has a frame, of some in a window only."""
     views = []
     for setup in session.sensors:
         frame = frame_set.frames.get(setup.name)
         if frame is not None:
-            observation = observation_of(session, setup, frame)
+            observation = observation_of(session, setup, frame, (windows or {}).get(setup.name))
             views.append(View(setup.name, setup.sensor, observation, _delay(frame_set, frame)))
     return views
 
@@ -186,7 +257,9 @@ def _delay(frame_set: FrameSet, frame: RawFrame) -> float:
     return delay if abs(delay) > LEAST_DELAY_S else 0.0
 
 
-def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Observation:
+def observation_of(
+    session: Session, setup: SensorSetup, frame: RawFrame, window: Window | None = None
+) -> Observation:
     """The feature pattern of one sensor's frame, with the width of its features."""
     options = setup.extract
     pattern: Pattern
@@ -196,7 +269,7 @@ def observation_of(session: Session, setup: SensorSetup, frame: RawFrame) -> Obs
         # noise may take a profile below zero; cutting that off would leave a floor of noise
         pattern = frame.data
     else:
-        pattern = extract(frame.data, options, base=session.folder)
+        pattern = extract(frame.data, options, window=window, base=session.folder)
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))

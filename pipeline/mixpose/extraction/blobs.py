@@ -33,7 +33,8 @@ from mixpose.extraction.contours import (
 )
 from mixpose.extraction.ellipse import Ellipse, distances, find_rim, is_waisted
 from mixpose.extraction.options import ExtractOptions
-from mixpose.extraction.spots import LEAST_STEP_SHARE, come_apart, find_spots
+from mixpose.extraction.single_spots import all_spots
+from mixpose.extraction.spots import LEAST_STEP_SHARE, come_apart
 from mixpose.extraction.threshold import Foreground, Window, above, foreground
 from mixpose.records import Image, PointPattern
 
@@ -92,7 +93,7 @@ def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
     options : ExtractOptions
         `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
     """
-    contours = outlines(scene.grey, scene.zero + scene.level)
+    contours = outlines(scene)
     blobs = _search(scene, contours, scene.level, options.min_area, islands=True)
     largest = math.inf if options.max_area is None else options.max_area
     return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
@@ -112,17 +113,21 @@ def _search(
     """
     blobs: list[Blob] = []
     shapeless: list[Contour] = []
+    small: list[Contour] = []
+    small_areas: list[float] = []
     for contour in contours:
         # A contour of n pixels encloses less than n² of them: noise is soon done with.
         if len(contour) ** 2 < min_area or (area := filled_area(contour)) < min_area:
             continue
         if area <= SMALL_AREA_PX:
-            spots = find_spots(scene, contour, level)
-            blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
+            small.append(contour)
+            small_areas.append(area)
         elif (disk := _disk(scene, contour, level)) is not None:
             blobs.append(disk)
         else:
             shapeless.append(contour)
+    for area, spots in zip(small_areas, all_spots(scene, small, small_areas, level), strict=True):
+        blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
     for group in neighbours(shapeless):
         whole = _disk(scene, np.concatenate(group), level) if len(group) > 1 else None
         if whole is not None:

@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.extraction.background import Grey
 from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
@@ -18,7 +17,8 @@ Contour: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
 # Upright box about a contour: first column, first row, width, height.
 Box: TypeAlias = Sequence[int]
 
-STRIP_ROWS = 128
+# Rows are left out where that leaves at most this share of them.
+MOST_ROWS_SHARE = 0.5
 
 # Parts of a broken rim are apart by at most this share of their length, and 2 px.
 GAP_SHARE = 0.1
@@ -26,32 +26,28 @@ GAP_PX = 2
 CONTOUR_SAMPLES = 64
 
 
-def outlines(grey: Grey, level: float) -> list[Contour]:
-    """Outermost contours of what is above a level in an image (H, W).
+def outlines(scene: Foreground) -> list[Contour]:
+    """Outermost contours of what is above the detection level.
 
-    The mask is made strip by strip, and contours are followed where nothing crosses from one
-    strip to the next: on a frame with few features no second frame is ever written.
+    Rows with nothing above it are left out, but for one where others follow: of a frame with few
+    features, little is looked at twice.
     """
-    contours: list[Contour] = []
-    strips: list[NDArray[np.uint8]] = []
-    top = 0
-    for row in range(0, len(grey), STRIP_ROWS):
-        strip = above(grey[row : row + STRIP_ROWS], level)
-        if strips and not (strips[-1][-1].any() and strip[0].any()):
-            contours += _follow(strips, top)
-            strips = []
-        if not strips:
-            top = row
-        strips.append(strip)
-    contours += _follow(strips, top)
-    return contours
-
-
-def _follow(strips: list[NDArray[np.uint8]], top: int) -> Sequence[Contour]:
-    if not any(strip.any() for strip in strips):
-        return []
-    mask = np.vstack(strips) if len(strips) > 1 else strips[0]
-    return cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(0, top))[0]
+    level = scene.zero + scene.level
+    wanted = above(scene.tops, level)
+    wanted[1:] |= wanted[:-1]
+    rows = np.flatnonzero(wanted)
+    if rows.size > MOST_ROWS_SHARE * len(wanted):
+        rows = np.arange(len(wanted))
+        mask = above(scene.grey, level)
+    else:
+        mask = above(scene.grey[rows], level)
+    contours = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    if rows.size < len(wanted):
+        # Between a contour's rows none was left out, so that all of it moves alike.
+        left_out = (rows - np.arange(rows.size)).tolist()
+        for contour in contours:
+            contour[:, 0, 1] += left_out[contour[0, 0, 1]]
+    return list(contours)
 
 
 def pieces(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:
@@ -97,13 +93,26 @@ def cut_out(
     corner : (u, v)
         Where the first pixel of the patch is.
     """
+    patch, corner = signal_about(scene, box, margin)
+    return patch, filled(contour, patch.shape, corner), corner
+
+
+def signal_about(
+    scene: Foreground, box: Box, margin: int
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """Signal in a box and its margin as far as the window goes, and where its first pixel is."""
     u, v, width, height = box
     u0, v0 = max(u - margin, 0), max(v - margin, 0)
     grey = scene.grey[v0 : v + height + margin, u0 : u + width + margin]
-    patch = grey.astype(np.float32) - np.float32(scene.zero)
-    inside = np.zeros(patch.shape, np.uint8)
-    cv2.drawContours(inside, [contour], 0, 1, cv2.FILLED, offset=(-u0, -v0))
-    return patch, inside, (u0, v0)
+    return grey.astype(np.float32) - np.float32(scene.zero), (u0, v0)
+
+
+def filled(contour: Contour, shape: tuple[int, ...], corner: tuple[int, int]) -> NDArray[np.uint8]:
+    """Mask of a shape, its first pixel at a corner (u, v): 1 where a contour encloses it."""
+    inside = np.zeros(shape, np.uint8)
+    offset = (-corner[0], -corner[1])
+    cv2.drawContours(inside, [contour], 0, 1, cv2.FILLED, offset=offset)
+    return inside
 
 
 def on_border(scene: Foreground, box: Box) -> bool:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import cast
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.extraction.contours import Contour, cut_out, on_border
-from mixpose.extraction.threshold import Foreground
+from mixpose.extraction.contours import Contour, filled, on_border, signal_about
+from mixpose.extraction.threshold import Foreground, above
+from mixpose.records import Floats
 
 # The background of a spot is looked for this far around it.
 MARGIN_PX = 3
@@ -27,8 +31,13 @@ MOST_PARTS = 8
 PROMINENCE_SHARE = 0.3
 PROMINENCE_NOISE_FACTOR = 4.0
 
+# Patches of so many shapes are prepared for.
+SHAPES = 256
 
-def find_spots(scene: Foreground, contour: Contour, level: float) -> list[tuple[float, float]]:
+
+def find_spots(
+    scene: Foreground, contour: Contour, area: float, level: float
+) -> list[tuple[float, float]]:
     """Centre of a small blob, or the centres of the blobs that touch in it.
 
     Parameters
@@ -36,6 +45,8 @@ def find_spots(scene: Foreground, contour: Contour, level: float) -> list[tuple[
     scene : Foreground
     contour : (n, 1, 2) int32
         What is above the level.
+    area : float
+        Number of pixels that it encloses.
     level : float
 
     Returns
@@ -49,10 +60,13 @@ def find_spots(scene: Foreground, contour: Contour, level: float) -> list[tuple[
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1] - scene.zero
     if highest < scene.least_peak or on_border(scene, box):
         return []
-    patch, inside, (u0, v0) = cut_out(scene, contour, box, MARGIN_PX)
-    frame = np.concatenate([patch[0], patch[-1], patch[:, 0], patch[:, -1]])
+    patch, corner = signal_about(scene, box, MARGIN_PX)
+    frame = patch.take(_border(*patch.shape))
     frame.partition(frame.size // 2)
     base = float(frame[frame.size // 2])
+    # The usual blob has the patch for itself, and nothing else there needs to be masked.
+    alone = np.count_nonzero(patch > level) == area
+    inside = None if alone else filled(contour, patch.shape, corner)
     peak = cv2.minMaxLoc(patch, inside)[1]
     if scene.judged and peak - base < LEAST_STEP_SHARE * peak:
         return []
@@ -61,27 +75,45 @@ def find_spots(scene: Foreground, contour: Contour, level: float) -> list[tuple[
     base = min(base, level)
     parts = come_apart(scene, contour, patch, inside, level)
     centres = []
-    for part, valley in parts or [(inside, level)]:
+    whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
+    for part, valley in parts or whole:
         top = cv2.minMaxLoc(patch, part)[1] if parts else peak
         cut = max(valley, base + CENTROID_SHARE * (top - base))
-        mean_u, mean_v = _centroid(np.maximum(patch - np.float32(cut), 0) * part, part)
-        centres.append((u0 + mean_u, v0 + mean_v))
+        weights = np.maximum(patch - np.float32(cut), 0)
+        if part is not None:
+            weights *= part
+        if not (moments := _moments(weights))[0] > 0:
+            # Nothing but rounding above the cut: all of its pixels alike.
+            moments = _moments(above(patch, level) if part is None else part)
+        total, by_u, by_v = moments
+        centres.append((corner[0] + by_u / total, corner[1] + by_v / total))
     return centres
 
 
-def _centroid(weights: NDArray[np.float32], part: NDArray[np.uint8]) -> tuple[float, float]:
-    moments = cv2.moments(weights)
-    if moments["m00"] <= 0:
-        # Nothing but rounding above the cut: all of its pixels alike.
-        moments = cv2.moments(part)
-    return moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
+def _moments(weights: NDArray[np.float32] | NDArray[np.uint8]) -> list[float]:
+    """Sum of weights, and of weights by u and by v."""
+    return cast("list[float]", (monomials(*weights.shape) @ weights.ravel()).tolist())
+
+
+@lru_cache(maxsize=SHAPES)
+def monomials(rows: int, columns: int) -> Floats:
+    """1, u and v of every pixel of a patch (3, rows * columns)."""
+    v, u = np.indices((rows, columns), dtype=np.float64).reshape(2, -1)
+    return np.array([np.ones(u.size), u, v])
+
+
+@lru_cache(maxsize=SHAPES)
+def _border(rows: int, columns: int) -> NDArray[np.intp]:
+    """Places of the outermost pixels of a patch, corners twice."""
+    places = np.arange(rows * columns).reshape(rows, columns)
+    return np.concatenate([places[0], places[-1], places[:, 0], places[:, -1]])
 
 
 def come_apart(
     scene: Foreground,
     contour: Contour,
     patch: NDArray[np.float32],
-    inside: NDArray[np.uint8],
+    inside: NDArray[np.uint8] | None,
     level: float,
 ) -> list[tuple[NDArray[np.uint8], float]]:
     """Parts of a long blob that come apart at a higher level.
@@ -93,8 +125,8 @@ def come_apart(
         Outline of the blob.
     patch : (h, w) float32
         Signal in a box about the blob.
-    inside : (h, w) uint8
-        1 inside of the blob, else 0.
+    inside : (h, w) uint8 or None
+        1 inside of the blob, else 0; None where nothing else is above the level.
     level : float
         Level of the contour.
 
@@ -104,9 +136,9 @@ def come_apart(
         (h, w) uint8 mask of each part, and the level that sets them apart; none if none does,
         or if what is above the level is all that is asked for.
     """
-    if not (scene.judged and _long(contour)):
+    if not (scene.judged and is_long(contour)):
         return []
-    signal = patch * inside
+    signal = patch if inside is None else patch * inside
     least_rise = PROMINENCE_NOISE_FACTOR * scene.noise
     highest = (1 - PROMINENCE_SHARE) * float(signal.max())
     while (level := level * LEVEL_RATIO) < highest:
@@ -125,6 +157,7 @@ def come_apart(
     return []
 
 
-def _long(contour: Contour) -> bool:
+def is_long(contour: Contour) -> bool:
+    """Whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
     return bool(max(a, b) + 1 > LONG * (min(a, b) + 1))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias, cast
 
 import cv2
 import numpy as np
@@ -24,8 +24,9 @@ RULES = ("auto", "otsu", "local")
 # How much is looked at around a window to know its background.
 LEAST_MARGIN_PX = 64
 
-# Rows that are worked on at once, where a second whole frame would only cost memory.
-STRIP_ROWS = 64
+# Rows that are searched for the peak first: it is in one of the brightest, as a rule.
+PEAK_ROWS = 4
+BLOCK_ROWS = 64
 
 # Detection level of "auto" and "local": above the noise, and above what is faint beside the
 # brightest thing in view (reflections, lens flare, dimly lit surroundings).
@@ -62,6 +63,8 @@ class Foreground:
     judged : bool
         Whether features must stand out to count.  False where the level is the user's (or
         Otsu's): then all that is above it counts.
+    tops : (H,) array of the type of `grey`
+        Highest grey value of each row: most rows of a frame have nothing to look for.
     """
 
     grey: Grey
@@ -70,6 +73,7 @@ class Foreground:
     noise: float
     least_peak: float
     judged: bool
+    tops: Grey
 
 
 def above(signal: Grey, level: float) -> NDArray[np.uint8]:
@@ -98,14 +102,15 @@ def foreground(image: Image, options: ExtractOptions, window: Window) -> Foregro
     bright, inner, threshold = _bright(image, options, window)
     noise = noise_of(bright)
     if threshold in ("auto", "local"):
-        grey, zero = _without_background(bright, noise, local=threshold == "local")
-        grey = grey[inner]
-        peak = _peak(grey) - zero
+        grey, zero = _without_background(bright, inner, noise, local=threshold == "local")
+        tops = grey.max(axis=1)
+        peak = _peak(grey, tops) - zero
         level = max(NOISE_FACTOR * noise, FAINT_SHARE * peak)
         least_peak = max(PEAK_NOISE_FACTOR * noise, PEAK_SHARE * peak)
-        return Foreground(grey, zero, level, noise, least_peak, judged=True)
-    level = _otsu(bright[inner]) if isinstance(threshold, str) else threshold
-    return Foreground(bright[inner], 0.0, level, noise, 0.0, judged=False)
+        return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
+    grey = bright[inner]
+    level = _otsu(grey) if isinstance(threshold, str) else threshold
+    return Foreground(grey, 0.0, level, noise, 0.0, judged=False, tops=grey.max(axis=1))
 
 
 def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDArray[np.float32]:
@@ -121,15 +126,12 @@ def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDA
     grey, zero = found.grey, found.zero
     if not found.judged:
         bright, inner, _ = _bright(image, options, window)
-        grey, zero = _without_background(bright, found.noise, local=False)
-        grey = grey[inner]
+        grey, zero = _without_background(bright, inner, found.noise, local=False)
     values = np.zeros(grey.shape, np.float32)
-    # Strips without features are left alone: most of a frame has none.
-    for rows in (slice(row, row + STRIP_ROWS) for row in range(0, len(grey), STRIP_ROWS)):
-        mask = above(found.grey[rows], found.zero + found.level)
-        if mask.any():
-            signal = grey[rows].astype(np.float32) - np.float32(zero)
-            values[rows] = np.maximum(signal, 0) * mask
+    # Rows without features are left alone: most of a frame has none.
+    rows = np.flatnonzero(above(found.tops, found.zero + found.level))
+    signal = grey[rows].astype(np.float32) - np.float32(zero)
+    values[rows] = np.maximum(signal, 0) * above(found.grey[rows], found.zero + found.level)
     return values
 
 
@@ -165,25 +167,41 @@ def _highest(grey: Grey) -> int | float:
     return 255 if grey.dtype == np.uint8 else 65535
 
 
-def _without_background(bright: Grey, noise: float, *, local: bool) -> tuple[Grey, float]:
-    """Grey values with an even background, and the grey value of that."""
+def _without_background(
+    bright: Grey, inner: tuple[slice, slice], noise: float, *, local: bool
+) -> tuple[Grey, float]:
+    """Grey values of the inner part with an even background, and the grey value of that."""
     if local:
         side = max(round(min(bright.shape) * LOCAL_BOX_SHARE), 3) // 2 * 2 + 1
-        return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side))), 0.0
+        return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side)))[inner], 0.0
     tiles = background_tiles(bright)
-    if float(tiles.max()) - float(tiles.min()) <= 2 * noise:
+    ascending = np.sort(tiles, axis=None)
+    low, high = float(ascending[0]), float(ascending[-1])
+    if high - low <= 2 * noise:
         # Even already, the common case of dark frames: work on the whole frame is spared.
-        return bright, float(np.median(tiles))
-    background = spread_out(tiles, bright)
-    return cv2.subtract(bright, background, dst=background), 0.0
+        halves = ascending[(tiles.size - 1) // 2], ascending[tiles.size // 2]
+        return bright[inner], (float(halves[0]) + float(halves[1])) / 2
+    background = spread_out(tiles, bright, inner)
+    return cv2.subtract(bright[inner], background, dst=background), 0.0
 
 
-def _peak(grey: Grey) -> float:
-    """Highest grey value that a pixel shares with its neighbour: a hot pixel is no peak."""
+def _peak(grey: Grey, tops: Grey) -> float:
+    """Highest grey value that a pixel shares with its neighbour: a hot pixel is no peak.
+
+    Only rows are looked at whose highest value `tops` is above what the brightest have.
+    """
     if grey.shape[1] < 2:
-        return float(grey.max())
-    strips = (grey[row : row + STRIP_ROWS] for row in range(0, len(grey), STRIP_ROWS))
-    return max(float(cv2.min(strip[:, :-1], strip[:, 1:]).max()) for strip in strips)
+        return float(tops.max())
+    few = min(PEAK_ROWS, len(tops))
+    peak = _shared(grey[np.argpartition(tops, -few)[-few:]])
+    rest = np.flatnonzero(tops > peak)
+    # In blocks that stay in the cache: of a bright frame it is most rows.
+    blocks = (rest[first : first + BLOCK_ROWS] for first in range(0, rest.size, BLOCK_ROWS))
+    return float(max([peak, *(_shared(grey[block]) for block in blocks)]))
+
+
+def _shared(rows: Grey) -> np.number[Any]:
+    return cast("np.number[Any]", cv2.min(rows[:, :-1], rows[:, 1:]).max())
 
 
 def _otsu(bright: Grey) -> float:
