@@ -7,6 +7,7 @@ there are many, every expected feature sums those in its neighbourhood.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -69,12 +70,19 @@ class Mixture:
         away = self.points - y[..., None, :]
         squares = away * away
         exponents = squares[..., 0] if y.shape[-1] == 1 else squares[..., 0] + squares[..., 1]
-        exponents *= -0.5 / self.variance
+        exponents *= self._scale
         bells = np.exp(exponents, out=exponents)
         bells *= self.heights
         weighted = away * bells[..., None]
-        ones = np.ones(bells.shape[-1])
-        return bells @ ones, ones @ weighted, weighted.swapaxes(-1, -2) @ away
+        return bells @ self._ones, self._ones @ weighted, weighted.swapaxes(-1, -2) @ away
+
+    @cached_property
+    def _scale(self) -> Floats:
+        return np.asarray(-0.5 / self.variance)
+
+    @cached_property
+    def _ones(self) -> Floats:
+        return np.ones(self.points.shape[-2])
 
 
 def mixture(pattern: PointPattern, sigma: float, centres: Floats | None, reach: float) -> Mixture:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mixpose.density.atlas import Atlas, render_atlas
 from mixpose.density.blur import TRUNCATE, odd_factor, render
 from mixpose.density.grid import Density, Window
-from mixpose.density.mixture import Mixture, mixture
+from mixpose.density.mixture import FEW, Mixture, mixture
 from mixpose.density.overlap import self_overlap, squared_distances
 from mixpose.records import Pattern, PointPattern
 
@@ -99,6 +99,8 @@ class Observation:
         """
         blur = float(np.sqrt(2 * sigma**2 - self.intrinsic**2))
         if isinstance(self.pattern, PointPattern):
+            if sigma == self.sigma and len(self.pattern.points) <= FEW:
+                return self._finest
             return mixture(self.pattern, blur, centres, reach * blur)
         if centres is None or blur < self.pattern.step:
             return None
@@ -110,12 +112,27 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(pattern, PointPattern):
+            if sigma == self.sigma:
+                return self._finest_energy
             return self_overlap(pattern.points, self._shares, 2 * sigma**2, self._apart)
         lower, upper = self.extent
         margin = TRUNCATE * sigma
         g = self.density(sigma, (lower - margin, upper + margin))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
+
+    # what is made of detections at σ_ε serves the estimate, its rivals and their judgement
+
+    @cached_property
+    def _finest(self) -> Mixture:
+        assert isinstance(self.pattern, PointPattern)
+        blur = float(np.sqrt(2 * self.sigma**2 - self.intrinsic**2))
+        return mixture(self.pattern, blur, None, 0.0)
+
+    @cached_property
+    def _finest_energy(self) -> float:
+        assert isinstance(self.pattern, PointPattern)
+        return self_overlap(self.pattern.points, self._shares, 2 * self.sigma**2, self._apart)
 
     @cached_property
     def _shares(self) -> Floats:

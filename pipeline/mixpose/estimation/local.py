@@ -25,7 +25,7 @@ Floats: TypeAlias = NDArray[np.float64]
 # bilinear values at n grid points per σ are up to 1/(8 n²) low along each of two axes, and squared
 _VALUE_ERROR = 4.0 / (8 * STEPS_PER_SIGMA**2)
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_VALUE_ERROR)
-_NEAR = 0.25  # value per sensor that says so: features have half their peak on average
+_NEAR = 0.1  # value per sensor that says so: features have a third of their peak on average
 # tiles have four times as many
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_VALUE_ERROR / 16)
 

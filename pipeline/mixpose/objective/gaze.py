@@ -53,6 +53,7 @@ class Gaze:
         self.sensors = tuple(sensors)
         self.points = body.nodes.points
         self.weights = body.nodes.weights
+        self.ones = np.ones(len(self.points))
         self.is_even = bool((self.weights == 1.0).all())
         self.normals = body.node_normals
         self._bank = bank(self.sensors)
@@ -65,10 +66,11 @@ class Gaze:
         arms = self.points @ T_world_object[:3, :3].T
         points_world = arms + T_world_object[:3, 3]
         y, by_world, seen = self._bank.linearise(points_world)
-        faced = np.array(
-            [facing(sensor, T_world_object, points_world, self.normals) for sensor in self.sensors]
-        )
-        seen &= faced
+        faced = self._everything
+        if self.normals is not None:
+            each = [facing(one, T_world_object, points_world, self.normals) for one in self.sensors]
+            faced = np.array(each)
+            seen &= faced
         by_twist = self._by_twist.copy()
         by_twist[:, :, 3:] = (arms @ _LIFT.T).reshape(-1, 3, 3)
         return Projected(y, by_world @ by_twist, seen, faced, self.weights * seen)

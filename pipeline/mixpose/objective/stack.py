@@ -88,7 +88,7 @@ class Stack:
         if self._mixtures is not None and at.y.shape[1] <= _FEW:
             squares = at.weights * at.weights
             if are_apart(at.y, at.weights, self._apart):
-                return Overlap(self._tops * (squares @ np.ones(squares.shape[1])), apart=True)
+                return Overlap(self._tops * (squares @ self.gaze.ones), apart=True)
         if at.y.shape[1] <= _FEW:
             return overlaps_of_few(at.y, at.J, at.weights, self.variances)
         each = [
@@ -125,10 +125,11 @@ class Stack:
         L, v = len(self.terms), self.variances
         J = at.J.reshape(-1, 6)
         overlap = self.overlaps(at)
-        product = C @ np.ones(C.shape[1])
+        product = C @ self.gaze.ones
         rest = (pull.reshape(L, 1, -1) @ at.J.reshape(L, -1, 6))[:, 0] / v[:, None]
-        # a sensor that sees no feature has neither product nor norm
-        norm = np.where(overlap.norm > 0, overlap.norm, 1.0)
+        norm = overlap.norm
+        if np.count_nonzero(norm) < L:  # a sensor that sees no feature has no product either
+            norm = np.where(norm > 0, norm, 1.0)
         amplitude = product / norm
         strength = 2 * self._scales * amplitude
         drawn = ((strength / v)[:, None] * C)[..., None, None] * at.J

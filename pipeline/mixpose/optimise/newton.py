@@ -147,9 +147,9 @@ def _step(here: Model, inner: _Inner | None, damping: float) -> tuple[Floats, fl
         C = hessian
     diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
-    floor = max(float(diagonal.max(initial=0.0)) * 1e-12, _TINY)
+    floor = max(diagonal.tolist(), default=0.0) * 1e-12 * damping + _TINY
     A = C.copy()
-    A.flat[:: len(g) + 1] += (damping + 1e-12) * np.maximum(diagonal, floor)
+    A.flat[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
     partial = _solved(A, g)
     gain = float(partial @ (g - 0.5 * (C @ partial)))
     if inner is None:
