@@ -33,9 +33,10 @@ class Meeting:
     shares : (n,) float64
         How far each feature in view was met, 0 to its weight.
     offsets : (n, m) float64
-        Observed minus predicted place of each, sensor units; 0 where it was not met.
+        Observed minus predicted place of each, sensor units; 0 where it was not met.  Two that
+        were detected as one have those of their middle.
     J : (n, m, 6) float64
-        Jacobian of the predicted places by the pose.
+        Jacobian of the predicted places by the pose, likewise.
     expected : float
         Sum of the weights of the features in view.
     unseen : float
@@ -46,6 +47,8 @@ class Meeting:
         Observed features per unit of the sensor's coordinates, around the prediction.
     count : float
         Number of observed features.
+    pairs : int
+        Features that were detected as one with another.
     """
 
     explained: float
@@ -57,6 +60,7 @@ class Meeting:
     sigma: float
     crowd: float
     count: float
+    pairs: int = 0
 
     @cached_property
     def met(self) -> float:
@@ -128,12 +132,16 @@ def _meeting(
     if np.count_nonzero(seen) < seen.size:
         unseen = float(stack.gaze.weights[at.faced[k] & ~seen].sum())
         y, weights, J, sampled = y[seen], weights[seen], J[seen], sampled[seen]
-    shares, offsets, explained = np.zeros(len(y)), np.zeros(y.shape), 0.0
+    shares, offsets, explained, pairs = np.zeros(len(y)), np.zeros(y.shape), 0.0, 0
     product = float(weights @ sampled[:, 0])
     if product > 0:
         explained = min(product**2 / (term.energy * norm), 1.0)
         if isinstance(observation.pattern, PointPattern):
             shares, offsets = _nearest(observation.pattern, y, weights, term.variance)
+            if np.count_nonzero(shares) < len(shares):
+                alone = np.count_nonzero(shares)
+                shares, offsets, J = _run_together(shares, offsets, y, J, weights, term.variance)
+                pairs = np.count_nonzero(shares) - alone
         else:
             shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
     sigma = math.sqrt(term.variance / 2)
@@ -148,6 +156,7 @@ def _meeting(
         sigma=sigma,
         crowd=_crowd(observation, y, sigma, count),
         count=_count(observation, count),
+        pairs=pairs,
     )
 
 
@@ -165,7 +174,7 @@ def _nearest(
     shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
     away = pattern.points - y[:, None]
     squared = (away * away).sum(axis=-1)
-    near_i, near_j = np.nonzero(squared <= -2 * variance * np.log(LEAST_SHARE))
+    near_i, near_j = np.nonzero(squared <= _reach_squared(variance))
     order = np.argsort(squared[near_i, near_j], kind="stable")
     met: set[int] = set()
     taken: set[int] = set()
@@ -176,6 +185,45 @@ def _nearest(
             shares[i] = weights[i]
             offsets[i] = away[i, j]
     return shares, offsets
+
+
+def _reach_squared(variance: float) -> float:
+    """Squared distance from a detection within which a feature is met."""
+    return -2 * variance * math.log(LEAST_SHARE)
+
+
+def _run_together(
+    shares: Floats, offsets: Floats, y: Floats, J: Floats, weights: Floats, variance: float
+) -> tuple[Floats, Floats, Floats]:
+    """Let two features share a detection that lies nearer to their middle than to either.
+
+    Images that overlap are detected as one, in the middle.  The two count as one feature that was
+    met there: half of each, with the offset and the Jacobian of their middle.
+
+    Returns
+    -------
+    shares, offsets, J
+        The same, with pairs that run together replaced.
+    """
+    shares, offsets, J = shares.copy(), offsets.copy(), J.copy()
+    single = shares > 0
+    for i in np.flatnonzero(shares == 0).tolist():
+        seen = np.flatnonzero(single)
+        if not len(seen):
+            break
+        found = y[seen] + offsets[seen]
+        near = ((found - y[i]) ** 2).sum(axis=1) <= _reach_squared(variance)
+        middle = found - (y[seen] + y[i]) / 2
+        closer = (middle**2).sum(axis=1) - (offsets[seen] ** 2).sum(axis=1)
+        k = int(np.argmin(np.where(near, closer, np.inf)))
+        if not near[k] or closer[k] >= 0:
+            continue
+        pair = [i, int(seen[k])]
+        shares[pair] = weights[pair] / 2
+        offsets[pair] = middle[k]
+        J[pair] = J[pair].mean(axis=0)
+        single[pair[1]] = False
+    return shares, offsets, J
 
 
 def _residuals(

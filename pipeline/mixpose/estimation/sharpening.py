@@ -2,7 +2,9 @@
 
 A false detection within reach of a hidden feature passes for it.  At σ_ε it bends the pose of all
 the others; at a narrower blur, which detections that are more exact than σ_ε allow, it is too far
-away to pull.  Whether the pose found there is the better one, its evidence tells.
+away to pull.  Where two features run into each other, one detection in their middle pulls at
+both: the pose is then the one that puts their middle there.  Whether a pose found so is the
+better one, its evidence tells.
 """
 
 from __future__ import annotations
@@ -31,28 +33,25 @@ _NOTICEABLE = 0.35
 
 
 def bent(meetings: Sequence[Meeting]) -> bool:
-    """Whether some feature is met so loosely that it may be another's detection."""
-    return any(meeting.squared.max(initial=0.0) > _NOTICEABLE for meeting in meetings)
+    """Whether some feature is met so loosely that it may be another's detection, or two by one."""
+    return any(one.pairs or one.squared.max(initial=0.0) > _NOTICEABLE for one in meetings)
 
 
 def sharpened(
     views: Sequence[View],
     body: Body,
     T_world_object: Floats,
-    meetings: Sequence[Meeting],
     free: NDArray[np.bool_],
     newton: NewtonOptions,
 ) -> Floats | None:
-    """The pose climbed to at a narrower blur, from where the features agree without the loosest.
+    """The pose climbed to at a narrower blur.
 
     Parameters
     ----------
     views : sequence of View
     body : Body
     T_world_object : (4, 4) array
-        Climbed to at σ_ε.
-    meetings : sequence of Meeting
-        Of the sensors with that pose.
+        Where the features agree without the loosest.
     free : (6,) bool
     newton : NewtonOptions
 
@@ -64,12 +63,23 @@ def sharpened(
     if not all(isinstance(view.observation.pattern, PointPattern) for view in views):
         return None
     sigmas = [NARROW * view.observation.sigma for view in views]
-    T_begin = perturb(T_world_object, _agreed(meetings, free))
-    objective = matched_objective(views, body, sigmas, T_begin, fine=True)
-    return ascend(objective.linearise, perturb, T_begin, free, newton).state
+    objective = matched_objective(views, body, sigmas, T_world_object, fine=True)
+    return ascend(objective.linearise, perturb, T_world_object, free, newton).state
 
 
-def _agreed(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> Floats:
+def settling_step(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> Floats:
+    """The least-squares step (6,) to where the features were met, pairs in their middle."""
+    rows = [(np.sqrt(m.shares) / m.sigma)[:, None] for m in meetings]
+    J = np.concatenate(
+        [(r[..., None] * m.J).reshape(-1, 6) for r, m in zip(rows, meetings, strict=True)]
+    )
+    offsets = np.concatenate([(r * m.offsets).ravel() for r, m in zip(rows, meetings, strict=True)])
+    step = np.zeros(len(free))
+    step[free] = np.linalg.lstsq(J[:, free], offsets, rcond=None)[0]
+    return step
+
+
+def agreed(meetings: Sequence[Meeting], free: NDArray[np.bool_]) -> Floats:
     """The step (6,) to where the met features agree, leaving out those that agree least.
 
     One feature after the other is left out, each time the one without which the rest agree best,

@@ -7,7 +7,7 @@ everywhere else, and invents nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -23,7 +23,7 @@ from mixpose.estimation.local import FINE, fit_near, free_mask
 from mixpose.estimation.multistart import NARROWING, starts_around
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.ranging import fit_ranges, judge_ranges, noise_ratio
-from mixpose.estimation.sharpening import bent, sharpened
+from mixpose.estimation.sharpening import agreed, bent, settling_step, sharpened
 from mixpose.estimation.track import (
     Branch,
     Found,
@@ -36,7 +36,7 @@ from mixpose.estimation.track import (
 )
 from mixpose.objective import Gaze, View, gazes_of
 from mixpose.records import Estimate, Hypothesis, SensorReport
-from mixpose.rigid import rotation_angle_deg, twist_between
+from mixpose.rigid import perturb, rotation_angle_deg, twist_between
 from mixpose.search import search
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -64,6 +64,7 @@ CONVINCING = 0.75
 
 _LISTED = 0.001
 _OUTDONE = 10.0  # log odds by which a candidate of the search may be behind to be refined
+_SETTLING_STEPS = 2
 _SAME_ROTATION_DEG = 1.0
 _SAME_PEAK = 9.0  # squared distance in standard deviations of uncertain poses
 _SAME_DISTANCE_SHARE = 0.02  # of the body's radius
@@ -210,10 +211,8 @@ class Tracker:
             new = judge(T)
             self._insert(rated, new)
             if self.options.objective == "matched" and bent(new.assessment.meetings):
-                meetings = new.assessment.meetings
-                T_sharp = sharpened(views, self.body, T, meetings, self.free, FINE)
-                if T_sharp is not None:
-                    self._insert(rated, judge(T_sharp))
+                for closer in self._looked_closer(views, new, judge):
+                    self._insert(rated, closer)
 
         for prediction in predictions:
             T = prediction.T_world_object
@@ -227,6 +226,22 @@ class Tracker:
         for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
             consider(self._fit(views, mirrored, self.start_uncertainty / NARROWING))
         return rated
+
+    def _looked_closer(
+        self, views: Sequence[View], bent_pose: Rated, judge: Callable[[Floats], Rated]
+    ) -> list[Rated]:
+        """Rivals of a pose that some detection may have pulled aside."""
+        T = perturb(bent_pose.T_world_object, agreed(bent_pose.assessment.meetings, self.free))
+        T_sharp = sharpened(views, self.body, T, self.free, FINE)
+        found = [] if T_sharp is None else [judge(T_sharp)]
+        for one in (bent_pose, judge(T)):
+            if not any(meeting.pairs for meeting in one.assessment.meetings):
+                continue
+            for _ in range(_SETTLING_STEPS):
+                step = settling_step(one.assessment.meetings, self.free)
+                one = judge(perturb(one.T_world_object, step))
+            found.append(one)
+        return found
 
     def _ranged(
         self,
