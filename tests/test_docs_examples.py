@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,13 @@ from typing import Any
 import pytest
 
 from mixpose.cli import main
+from mixpose.cli.app import app
+from mixpose.session.schema import SessionTable
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"`([\w./]+)`:\s*$")
+LINK = re.compile(r"\]\((?!https?:)([^)#]+)\)")
+TO_COME = ROOT / "docs" / "performance.md"
 DELETE = re.compile(r"Delete the line `(.+?)` from\s+`(.+?)`")
 
 
@@ -88,3 +93,42 @@ def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
     (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
     follow("docs/python.md", capfd)
     assert {"left_0.png", "right_0.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_first_two_minutes_print_what_the_readme_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
+    shown = list(blocks("README.md"))[:4]
+    assert [kind for _, kind, _ in shown] == ["sh", "text", "sh", "text"]
+    for (_, _, commands), (_, _, text) in zip(shown[::2], shown[1::2]):
+        lines = commands.replace(" && ", "\n").splitlines()
+        # the tutorial has reports
+        lines = [line for line in lines if "pip install" not in line and " report " not in line]
+        printed = [output_of(line, capfd) for line in lines]
+        assert_shown(text, "\n".join(printed))
+    for written in ("seen.mp4", "seen/sheet.png"):
+        assert (tmp_path / written).stat().st_size > 0
+
+
+def test_the_session_in_the_readme_is_one() -> None:
+    (text,) = (text for _, kind, text in blocks("README.md") if kind == "toml")
+    assert SessionTable.model_validate(tomllib.loads(text)).unit == "mm"
+
+
+def test_every_command_is_in_the_table_of_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = readme.partition("| `mixpose ...` |")[2].partition("\n\n")[0]
+    for command in app.registered_commands:
+        assert command.callback is not None
+        assert f"| `{command.name or command.callback.__name__}" in table
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+)
+def test_links_lead_to_files(page: Path) -> None:
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        target = (page.parent / link).resolve()
+        assert target.exists() or target == TO_COME, link
