@@ -193,17 +193,20 @@ def command_reference() -> str:
         function = command.callback
         assert function is not None
         hints = get_type_hints(function, include_extras=True)
-        usage, entries = [f"mixpose {command.name or function.__name__}"], []
+        usage, entries, options = [f"mixpose {command.name or function.__name__}"], [], []
         for name, parameter in inspect.signature(function).parameters.items():
             kind, info = get_args(hints[name])
             if isinstance(info, typer.models.ArgumentInfo):
-                usage.append(str(info.metavar))
-                entries.append(f"- `{info.metavar}`: {info.help}")
+                needed = parameter.default is inspect.Parameter.empty
+                usage.append(f"{info.metavar}" if needed else f"[{info.metavar}]")
+                entries.append(f"- `{info.metavar}`: {info.help}" + " Optional." * (not needed))
             else:
-                entries.append(_option(name, kind, info, parameter.default))
+                options.append(_option(name, kind, info, parameter.default))
         text = _prose(inspect.getdoc(function) or "")
-        usage.append("[OPTIONS]")
-        parts.append(f"## `{' '.join(usage)}`\n\n{text}\n\n" + "\n".join(entries) + "\n")
+        usage += ["[OPTIONS]"] * bool(options)
+        parts.append(f"## `{' '.join(usage)}`\n\n{text}\n")
+        if entries or options:
+            parts.append("\n".join(entries + options) + "\n")
     return "\n".join(parts)
 
 

@@ -151,7 +151,10 @@ def simulate(
     output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the recording.")],
     frames: Annotated[int, typer.Option(min=1, help="Number of frames.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same recording.")] = 0,
-    fps: Annotated[float | None, typer.Option(help="Frames per second.")] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option(help="Frames per second; for poses with times put fps into the session."),
+    ] = None,
     noise: Annotated[float, typer.Option(help="Camera noise, grey levels.")] = 2.0,
     clutter: Annotated[float, typer.Option(help="False features per frame and sensor.")] = 0.0,
     hidden: Annotated[float, typer.Option(help="Chance that a feature is hidden.")] = 0.0,

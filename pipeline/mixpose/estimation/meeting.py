@@ -141,7 +141,7 @@ def _meeting(
             if np.count_nonzero(shares) < len(shares):
                 alone = np.count_nonzero(shares)
                 shares, offsets, J = _run_together(shares, offsets, y, J, weights, term.variance)
-                pairs = np.count_nonzero(shares) - alone
+                pairs = int(np.count_nonzero(shares) - alone)
         else:
             shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
     sigma = math.sqrt(term.variance / 2)

@@ -234,13 +234,15 @@ class Tracker:
         T = perturb(bent_pose.T_world_object, agreed(bent_pose.assessment.meetings, self.free))
         T_sharp = sharpened(views, self.body, T, self.free, FINE)
         found = [] if T_sharp is None else [judge(T_sharp)]
-        for one in (bent_pose, judge(T)):
-            if not any(meeting.pairs for meeting in one.assessment.meetings):
-                continue
+        for begin in (bent_pose, judge(T)):
+            settled = begin
             for _ in range(_SETTLING_STEPS):
-                step = settling_step(one.assessment.meetings, self.free)
-                one = judge(perturb(one.T_world_object, step))
-            found.append(one)
+                meetings = settled.assessment.meetings
+                if any(meeting.pairs for meeting in meetings):
+                    step = settling_step(meetings, self.free)
+                    settled = judge(perturb(settled.T_world_object, step))
+            if settled is not begin:
+                found.append(settled)
         return found
 
     def _ranged(

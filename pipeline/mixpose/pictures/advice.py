@@ -143,8 +143,9 @@ def _about_missing(
         )
     if found := missing["other"]:
         lines.append(
-            f"not met though bright there: {_some(found)}; they run into something "
-            f"else, are partly hidden, or have no clear shape; {_direction(options, lower=False)}"
+            f"not met though bright there: {_some(found)}; they run into something else, are "
+            "partly hidden, have no clear shape, or are not where the object says; "
+            f"{_direction(options, lower=False)}"
         )
     return lines
 
@@ -349,7 +350,7 @@ def _direction(options: ExtractOptions, *, lower: bool) -> str:
     down = lower == (options.polarity == "bright" or options.method == "corners")
     now = options.threshold
     if isinstance(now, str):
-        return f'{"lower" if down else "raise"} threshold = "{now}" by giving a grey level'
+        return f'set threshold to a grey level {"below" if down else "above"} that of "{now}"'
     return f"{'lower' if down else 'raise'} threshold = {now:g}"
 
 

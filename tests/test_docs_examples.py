@@ -1,0 +1,133 @@
+"""The examples of README.md, docs/tutorial.md and docs/python.md, run as a reader would."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mixpose.cli import main
+from mixpose.cli.app import app
+from mixpose.session.schema import SessionTable
+
+ROOT = Path(__file__).parents[1]
+FILE = re.compile(r"`([\w./]+)`:\s*$")
+LINK = re.compile(r"\]\((?!https?:)([^)#]+)\)")
+TO_COME = ROOT / "docs" / "performance.md"
+DELETE = re.compile(r"Delete the line `(.+?)` from\s+`(.+?)`")
+
+
+def blocks(page: str) -> Iterator[tuple[str, str, str]]:
+    """The text before each block of a page, its kind, and what is in it."""
+    parts = (ROOT / page).read_text(encoding="utf-8").split("```")
+    for before, block in zip(parts[::2], parts[1::2]):
+        kind, _, text = block.partition("\n")
+        yield before, kind, text
+
+
+def words(text: str) -> list[str]:
+    """Words of an output; decimals, which differ by machine in their last digits, are one word."""
+    return re.sub(r"-?\d+\.\d*(e-?\d+)?", "#", text).split()
+
+
+def assert_shown(shown: str, printed: str) -> None:
+    """What a page shows is part of what was printed, apart from decimals."""
+    assert " ".join(words(shown)) in " ".join(words(printed))
+
+
+def output_of(line: str, capfd: pytest.CaptureFixture[str]) -> str:
+    """What a line of shell prints."""
+    program, *arguments = shlex.split(line)
+    if program == "python":
+        subprocess.run([sys.executable, *arguments], check=True)
+    else:
+        assert program == "mixpose", line
+        with pytest.raises(SystemExit) as leaving:
+            main(arguments)
+        assert not leaving.value.code, line
+    printed = capfd.readouterr()
+    return printed.out + printed.err
+
+
+def follow(page: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """Do what a page says, in the working folder."""
+    printed = ""
+    names: dict[str, Any] = {}
+    for before, kind, text in blocks(page):
+        for line, file in DELETE.findall(before):
+            content = Path(file).read_text(encoding="utf-8")
+            assert f"{line}\n" in content
+            Path(file).write_text(content.replace(f"{line}\n", ""), encoding="utf-8")
+        named = FILE.search(before)
+        if named and kind in ("csv", "toml", "python"):
+            Path(named[1]).write_text(text, encoding="utf-8")
+        elif kind == "sh":
+            printed = "".join(output_of(line, capfd) for line in text.splitlines())
+        elif kind == "python":
+            exec(compile(text, page, "exec"), names)
+            printed = capfd.readouterr().out
+        elif kind == "text":
+            assert_shown(text, printed)
+
+
+def test_the_tutorial_can_be_followed_in_an_empty_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    follow("docs/tutorial.md", capfd)
+    for written in ("overlay.mp4", "seen/sheet.png", "report.html", "poses.tum", "poses.yaml"):
+        assert (tmp_path / written).stat().st_size > 0
+
+
+def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
+    follow("docs/python.md", capfd)
+    assert {"left_0.png", "right_0.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_first_two_minutes_print_what_the_readme_shows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
+    shown = list(blocks("README.md"))[:4]
+    assert [kind for _, kind, _ in shown] == ["sh", "text", "sh", "text"]
+    for (_, _, commands), (_, _, text) in zip(shown[::2], shown[1::2]):
+        lines = commands.replace(" && ", "\n").splitlines()
+        # the tutorial has overlays and reports
+        beyond = re.compile("pip install|--overlay| report ")
+        printed = [output_of(line, capfd) for line in lines if not beyond.search(line)]
+        assert_shown(text, "\n".join(printed))
+    assert (tmp_path / "seen" / "sheet.png").stat().st_size > 0
+
+
+def test_the_session_in_the_readme_is_one() -> None:
+    (text,) = (text for _, kind, text in blocks("README.md") if kind == "toml")
+    assert SessionTable.model_validate(tomllib.loads(text)).unit == "mm"
+
+
+def test_every_command_is_in_the_table_of_the_readme() -> None:
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    table = readme.partition("| `mixpose ...` |")[2].partition("\n\n")[0]
+    for command in app.registered_commands:
+        assert command.callback is not None
+        assert f"| `{command.name or command.callback.__name__}" in table
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name
+)
+def test_links_lead_to_files(page: Path) -> None:
+    for link in LINK.findall(page.read_text(encoding="utf-8")):
+        target = (page.parent / link).resolve()
+        assert target.exists() or target == TO_COME, link
