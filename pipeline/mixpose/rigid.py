@@ -132,7 +132,8 @@ def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
 
 def quaternion_xyzw(T_a_b: Floats) -> Floats:
     """Unit quaternion (4,), (x, y, z, w) with w >= 0, of one motion."""
-    return np.asarray(Rotation.from_matrix(T_a_b[:3, :3]).as_quat(canonical=True), dtype=np.float64)
+    vector = cv2.Rodrigues(T_a_b[:3, :3])[0]
+    return np.asarray(Rotation.from_rotvec(vector[:, 0]).as_quat(canonical=True), dtype=np.float64)
 
 
 def is_rigid(T: Floats, tolerance: float = 1e-4) -> bool:

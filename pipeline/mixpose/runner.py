@@ -157,7 +157,9 @@ def _estimates(
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
 ) -> Generator[Estimate, None, None]:
-    expectation = Expectation(tracker.body, _windowed(session), tracker.free)
+    cameras = _windowed(session)
+    gaze = next(iter(tracker.gazes_of(list(cameras.values()))), None)
+    expectation = Expectation(tracker.body, cameras, tracker.free, gaze)
     met: Encounter | None = None
     with closing(frames):
         for frame_set in frames:

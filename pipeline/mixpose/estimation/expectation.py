@@ -61,7 +61,13 @@ class Encounter:
 class Expectation:
     """A body in front of cameras."""
 
-    def __init__(self, body: Body, cameras: Mapping[str, Sensor], free: NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        body: Body,
+        cameras: Mapping[str, Sensor],
+        free: NDArray[np.bool_],
+        gaze: Gaze | None = None,
+    ) -> None:
         """Prepare for a body.
 
         Parameters
@@ -71,9 +77,11 @@ class Expectation:
             Sensors with two coordinates, in px.
         free : (6,) bool
             Directions that are estimated.
+        gaze : Gaze or None
+            Of the cameras at the body, where it is at hand.
         """
         self.names = tuple(cameras)
-        self._gaze = Gaze(list(cameras.values()), body) if cameras else None
+        self._gaze = gaze or (Gaze(list(cameras.values()), body) if cameras else None)
         self._free = free
         points = body.nodes.points
         # A feature's image reaches less than half way to that of its neighbour.

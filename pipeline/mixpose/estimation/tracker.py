@@ -38,6 +38,7 @@ from mixpose.objective import Gaze, View, gazes_of
 from mixpose.records import Estimate, Hypothesis, SensorReport
 from mixpose.rigid import perturb, rotation_angle_deg, twist_between
 from mixpose.search import search
+from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -294,10 +295,14 @@ class Tracker:
         return fit.T_world_object
 
     def _gazes_of(self, views: Sequence[View]) -> list[Gaze]:
-        """The views' sensors side by side, kept from frame to frame."""
+        """The views' sensors side by side."""
         sensors = [view.sensor for view in views]
         if any(view.delay for view in views):  # they are others in every frame
             return gazes_of(sensors, self.body)
+        return self.gazes_of(sensors)
+
+    def gazes_of(self, sensors: Sequence[Sensor]) -> list[Gaze]:
+        """Sensors side by side, those of each dimension together; made once for the same ones."""
         # a gaze holds its sensors, so that no other can come to the same place in memory
         key = tuple(map(id, sensors))
         if key not in self._gazes:

@@ -90,7 +90,7 @@ def _together(
     frame[~np.concatenate([in_row, in_row, in_column, in_column], axis=1)] = np.inf
     frame.sort(axis=1)
     base = frame[each, width + height].astype(np.float64)
-    alone = np.count_nonzero(signal > level, axis=(1, 2)) == areas
+    alone = (signal > level).reshape(len(boxes), -1).sum(axis=1) == areas
     peak = signal.max(axis=(1, 2)).astype(np.float64)
     bright = np.ones(len(boxes), dtype=np.bool_)
     if scene.judged:

@@ -60,9 +60,19 @@ class Gaze:
         self._everything = np.ones((len(self.sensors), len(self.points)), dtype=np.bool_)
         self._by_twist = np.zeros((len(self.points), 3, 6))
         self._by_twist[:, :, :3] = np.eye(3)
+        self._last: tuple[bytes, Projected] | None = None
 
     def project(self, T_world_object: Floats) -> Projected:
-        """Where the sensors see the body at a pose (4, 4)."""
+        """Where the sensors see the body at a pose (4, 4); not to be written to.
+
+        The last answer is kept: what one step ends with, the next begins with.
+        """
+        key = T_world_object.tobytes()
+        if self._last is None or self._last[0] != key:
+            self._last = key, self._project(T_world_object)
+        return self._last[1]
+
+    def _project(self, T_world_object: Floats) -> Projected:
         arms = self.points @ T_world_object[:3, :3].T
         points_world = arms + T_world_object[:3, 3]
         y, by_world, seen = self._bank.linearise(points_world)
