@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks.recordings import session_text, simulated, write_mjpeg, write_session
 from benchmarks.timing import medians, show
 from mixpose.cli.output import Output
-from mixpose.cli.run import header_of
+from mixpose.cli.run import header_of, prompt_switching
 from mixpose.frames import pair
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import begin, observe, open_sources
@@ -21,7 +21,7 @@ from mixpose.runner import run as run_session
 from mixpose.session import Session
 from mixpose.simulation import SimulationOptions
 
-FRAMES = 100
+FRAMES = 200
 RESOLUTION = (1280, 1024)
 FOCAL = 900.0
 FPS = 50.0
@@ -73,6 +73,7 @@ def whole_run(session: Session) -> list[Estimate]:
     """What `mixpose run` does, with a file that keeps nothing."""
     estimates = []
     with (
+        prompt_switching(),
         closing(run_session(session)) as frames,
         Output(Path(os.devnull), "jsonl", header_of(session), append=False) as output,
     ):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Generator, Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,9 @@ from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
 from mixpose.runner import Selection, Watch, open_sources, run
 from mixpose.session import Session, load_session
+
+SWITCH_S = 1e-4
+"""After so long a thread that has decoded a frame is let on; Python's own 5 ms is a whole frame."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     warn_of_sources(opened)
     summary = Summary()
     with ExitStack() as stack:
+        stack.enter_context(prompt_switching())
         watch = _overlay(stack, session, request)
         estimates = run(session, opened=opened, selection=selection, T_start=T_start, watch=watch)
         stack.enter_context(closing(estimates))
@@ -64,6 +68,17 @@ def run_session(path: Path, request: RunRequest) -> None:
             output.write(estimate)
             summary.add(estimate)
     summary.say("" if request.output is None else f" -> {request.output}")
+
+
+@contextmanager
+def prompt_switching() -> Iterator[None]:
+    """Let the threads that decode wait less for the one that estimates."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
 
 
 def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:
