@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import queue
 import threading
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
+from queue import SimpleQueue
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -36,40 +36,48 @@ def prefetch(items: Iterator[T], depth: int = 3) -> Generator[T, None, None]:
     depth : int
         Most items that wait; one more may be on its way.
     """
-    waiting: queue.Queue[_Item[T] | _End] = queue.Queue(maxsize=max(depth, 1))
+    waiting: SimpleQueue[_Item[T] | _End] = SimpleQueue()
+    room: SimpleQueue[None] = SimpleQueue()
+    for _ in range(max(depth, 1)):
+        room.put(None)
     stop = threading.Event()
     worker = threading.Thread(
-        target=_fetch, args=(items, waiting, stop), name="mixpose-prefetch", daemon=True
+        target=_fetch, args=(items, waiting, room, stop), name="mixpose-prefetch", daemon=True
     )
     worker.start()
     try:
         while isinstance(entry := waiting.get(), _Item):
+            room.put(None)
             yield entry.value
         if entry.error is not None:
             raise entry.error
     finally:
         stop.set()
-        # A worker that waits to put its item gets room here; it puts no more after that one.
-        with contextlib.suppress(queue.Empty):
-            while True:
-                waiting.get_nowait()
+        room.put(None)  # a worker that waits for room goes on, and stops
         # The garbage collector may close this generator in the worker's own thread.
         if worker is not threading.current_thread():
             worker.join()
 
 
 def _fetch(
-    items: Iterator[T], waiting: queue.Queue[_Item[T] | _End], stop: threading.Event
+    items: Iterator[T],
+    waiting: SimpleQueue[_Item[T] | _End],
+    room: SimpleQueue[None],
+    stop: threading.Event,
 ) -> None:
-    """Move items to the queue until they end, fail or `stop` is set."""
+    """Move items to the queue, one for each piece of room, until they end, fail or `stop` is set.
+
+    Two plain queues cost less than one that is bounded: their locks are not Python's.
+    """
     error: BaseException | None = None
     try:
         with contextlib.ExitStack() as closing:
             closing.callback(getattr(items, "close", lambda: None))
             for item in items:
-                waiting.put(_Item(item))
+                room.get()
                 if stop.is_set():
                     break
+                waiting.put(_Item(item))
     except BaseException as caught:  # whatever it is, it belongs to the consumer
         error = caught
     if not stop.is_set():
