@@ -205,6 +205,27 @@ def test_a_moving_body_is_followed_and_found_again_after_an_occlusion(
     assert statuses[10:] == ["ok"] * 10
 
 
+def test_a_grid_that_moves_by_a_step_between_frames_is_not_followed_a_step_aside(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    step = 20.0
+    places = [(step * i, step * j, 0.0) for i in range(7) for j in range(5)]
+    grid = Body("grid", tuple(PointFeature(np.array(place)) for place in places))
+    T_next = TRUTH.copy()
+    T_next[:3, 3] += step * TRUTH[:3, 0]
+    tracker = Tracker.create(grid, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for frame, T in enumerate([TRUTH, T_next]):
+        views = detect(pinhole_cameras, grid, T, noise=0.1, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status == "ok"
+        assert estimate.T_world_object is not None
+        # a slip would be off by the whole step, with 28 of 35 features met
+        nearest = grid.symmetries[..., :3, :3] @ np.zeros(3) + grid.symmetries[..., :3, 3]
+        centres = transform(estimate.T_world_object, nearest)
+        assert np.linalg.norm(centres - T[:3, 3], axis=1).min() < 0.5
+
+
 def test_after_thirty_frames_of_occlusion_the_first_visible_frame_gives_the_pose(
     body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:

@@ -114,6 +114,23 @@ def test_bodies_are_found_without_a_start(
         assert shift < distance
 
 
+def test_a_chessboard_carried_about_is_followed_without_slipping_by_a_square(
+    recordings: Path,
+) -> None:
+    folder = recordings / "stereo_chessboard"
+    session = replace(mixpose.load_session(folder / "session.toml"), start=None)
+    truth = truth_of(folder / "truth.jsonl")
+    estimates = list(mixpose.run(session))
+    assert [one.status for one in estimates] == ["ok"] * 12
+    for one in estimates:
+        assert one.T_world_object is not None
+        answers = truth[one.frame] @ session.body.symmetries
+        angle, shift = nearest_error(one.T_world_object, answers)
+        # a square is 24 mm; worst seen 0.30° and 0.56 mm
+        assert angle < 0.5
+        assert shift < 2.0
+
+
 def test_a_flat_body_in_one_view_is_ambiguous_with_the_right_pose_listed(recordings: Path) -> None:
     folder = recordings / "led_tee"
     session = mixpose.load_session(folder / "session.toml")

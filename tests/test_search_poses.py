@@ -14,6 +14,7 @@ from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.runner import observe, open_sources
 from mixpose.search import Candidate, search
+from mixpose.search.alignment import align_triples
 from mixpose.sensors import ParallelBeam
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -171,3 +172,11 @@ def test_a_chessboard_is_not_found_a_square_off(recordings: Path) -> None:
         off = np.abs(images - transform(best, session.body.means)).max(axis=(1, 2)).min()
         # squares are 24 mm wide; the reference itself is good to about a millimetre
         assert off < 3.0
+
+
+def test_three_places_in_a_row_still_give_a_rotation() -> None:
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0.3, 0.8, 0]])
+    in_a_row = np.array([[0.0, 0, 5], [1, 0, 5], [0.4, 0, 5]])
+    (T,) = align_triples(triangle[..., None], in_a_row[..., None])
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
+    assert T[:3, :3] @ T[:3, :3].T == pytest.approx(np.eye(3), abs=1e-12)

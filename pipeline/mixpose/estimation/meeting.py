@@ -19,6 +19,7 @@ from mixpose.records import PointPattern
 Floats: TypeAlias = NDArray[np.float64]
 
 LEAST_SHARE = 0.3  # of a full feature's density: below it a feature was not met
+_SLIP = 0.25  # of the body's size in the image: steps of a grid are smaller
 _SMALLEST_REGION = 20.0  # in σ: features crowd at least over so wide a region
 
 
@@ -28,6 +29,8 @@ class Meeting:
 
     Attributes
     ----------
+    name : str
+        Of the sensor.
     explained : float
         Share of the sensor's density that the pose accounts for.
     shares : (n,) float64
@@ -49,8 +52,11 @@ class Meeting:
         Number of observed features.
     pairs : int
         Features that were detected as one with another.
+    surplus : float
+        Where features are missed in an image: detections around the body that belong to none.
     """
 
+    name: str
     explained: float
     shares: Floats
     offsets: Floats
@@ -61,11 +67,17 @@ class Meeting:
     crowd: float
     count: float
     pairs: int = 0
+    surplus: float = 0.0
 
     @cached_property
     def met(self) -> float:
         """Sum of the shares."""
         return float(self.shares.sum())
+
+    @property
+    def missed(self) -> float:
+        """Sum of the weights of the features in view that were not met."""
+        return self.expected - self.met
 
     @property
     def coverage(self) -> float:
@@ -146,7 +158,12 @@ def _meeting(
             shares, offsets = _residuals(term, y, weights, sampled, amplitude=product / norm)
     sigma = math.sqrt(term.variance / 2)
     count = peak(term.variance, y.shape[1]) / term.energy
+    surplus = 0.0
+    some_missed = y.shape[1] == 2 and np.count_nonzero(shares) < len(y)
+    if some_missed and isinstance(observation.pattern, PointPattern):
+        surplus = _surplus(observation.pattern, y, float(shares.sum()))
     return Meeting(
+        name=term.name,
         explained=explained,
         shares=shares,
         offsets=offsets,
@@ -157,6 +174,7 @@ def _meeting(
         crowd=_crowd(observation, y, sigma, count),
         count=_count(observation, count),
         pairs=pairs,
+        surplus=surplus,
     )
 
 
@@ -277,6 +295,14 @@ def _crowd(observation: Observation, y: Floats, sigma: float, count: float) -> f
     middle, half = (near + far) / 2, np.maximum(far - near, smallest) / 2
     inside = (np.abs(found - middle) <= half).all(axis=1)
     return max(overall, np.count_nonzero(inside) / _area(2 * half, smallest))
+
+
+def _surplus(pattern: PointPattern, y: Floats, met: float) -> float:
+    """Detections not met in the box of the body, and as far around it as a grid may slip."""
+    near, far = y.min(axis=0), y.max(axis=0)
+    margin = _SLIP * float((far - near).max())
+    inside = ((pattern.points >= near - margin) & (pattern.points <= far + margin)).all(axis=1)
+    return max(float(np.count_nonzero(inside)) - met, 0.0)
 
 
 def _area(sides: NDArray[np.float64], smallest: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
 
@@ -111,6 +111,9 @@ class Track:
         Residuals so far.
     stride : Stride or None
         None before two uncertain poses.
+    loose : mapping of str to (float, float)
+        By sensor, in the last frame with a pose: features missed, and detections around the body
+        that belonged to none.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -119,6 +122,7 @@ class Track:
     misses: int = 0
     noise: Noise = field(default_factory=Noise)
     stride: Stride | None = None
+    loose: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def missed(self) -> Track:
         """The track after a frame without a pose."""
@@ -210,6 +214,7 @@ def follow(
     frame: int,
     time_s: float | None,
     noise: Noise,
+    loose: Mapping[str, tuple[float, float]],
 ) -> Track:
     """The track after a frame with poses.
 
@@ -224,6 +229,8 @@ def follow(
         Of the frame.
     noise : Noise
         Residuals so far.
+    loose
+        Of the best pose, as `Track` has it.
     """
     elapsed = elapsed_since(track, frame, time_s)
     branches: list[Branch] = []
@@ -244,7 +251,7 @@ def follow(
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), _steady(body))
         branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
-    return Track(tuple(branches), frame, time_s, 0, noise, stride)
+    return Track(tuple(branches), frame, time_s, 0, noise, stride, loose)
 
 
 def _stride_of(track: Track, body: Body, elapsed: float) -> Stride:

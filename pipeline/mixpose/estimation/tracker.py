@@ -66,6 +66,7 @@ CONVINCING = 0.75
 _LISTED = 0.001
 _OUTDONE = 10.0  # log odds by which a candidate of the search may be behind to be refined
 _SETTLING_STEPS = 2
+_HALF = 0.5  # of a feature: less is no difference
 _SAME_ROTATION_DEG = 1.0
 _SAME_PEAK = 9.0  # squared distance in standard deviations of uncertain poses
 _SAME_DISTANCE_SHARE = 0.02  # of the body's radius
@@ -179,7 +180,8 @@ class Tracker:
             hypotheses=() if clear else tuple(Hypothesis(T, w) for T, w, _ in kept),
         )
         noise = best.assessment.noise if clear else track.noise
-        return follow(track, self.body, kept, frame, time_s, noise), estimate
+        loose = {one.name: (one.missed, one.surplus) for one in best.assessment.meetings}
+        return follow(track, self.body, kept, frame, time_s, noise, loose), estimate
 
     def _rated(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
@@ -221,7 +223,7 @@ class Tracker:
                 self._insert(rated, self._ranged(views, T, track, predictions, prediction))
             else:
                 consider(self._fit(views, T, prediction.uncertainty))
-        if not (rated and self._convinces(rated[0])):
+        if not rated or not self._convinces(rated[0]) or has_slipped(rated[0], track):
             for T in self._elsewhere(views, predictions):
                 consider(T)
         for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
@@ -352,6 +354,18 @@ class Tracker:
         apart = float(np.linalg.norm((T_a - T_b) @ centre))
         near = apart < _SAME_DISTANCE_SHARE * self.body.radius
         return near and float(rotation_angle_deg(T_a, T_b)) < _SAME_ROTATION_DEG
+
+
+def has_slipped(rated: Rated, track: Track) -> bool:
+    """Whether a sensor misses more than in the frame before while more is seen beside the body.
+
+    So it is where a body that looks like itself a step aside was followed to there.
+    """
+    for one in rated.assessment.meetings:
+        missed, surplus = track.loose.get(one.name, (np.inf, np.inf))
+        if one.missed > missed + _HALF and one.surplus > surplus + _HALF:
+            return True
+    return False
 
 
 def beliefs(rated: Sequence[Rated]) -> list[float]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 Floats: TypeAlias = NDArray[np.float64]
 
 _TINY = np.finfo(np.float64).tiny
+_FLAT = 1e-9  # sine of the angle at a corner, below which a triangle has no plane
 
 
 def align_triples(body: Floats, world: Floats) -> Floats:
@@ -52,7 +53,13 @@ def align_triples(body: Floats, world: Floats) -> Floats:
 def _frames(triangles: Floats) -> tuple[Floats, Floats, Floats]:
     """Orthonormal axes (3, K each): along the first side, in the plane, across it."""
     x = _unit(triangles[1] - triangles[0])
-    z = _unit(cross(x, triangles[2] - triangles[0]))
+    second = triangles[2] - triangles[0]
+    across = cross(x, second)
+    flat = _dot(across, across) <= _FLAT**2 * _dot(second, second)
+    if flat.any():  # three in a row: any plane through them
+        least = np.eye(3)[:, np.abs(x).argmin(axis=0)]
+        across = np.where(flat, cross(x, least), across)
+    z = _unit(across)
     return x, cross(z, x), z
 
 
