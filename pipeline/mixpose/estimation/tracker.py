@@ -166,7 +166,7 @@ class Tracker:
         kept = [
             Found(one.T_world_object, w, one.spread if self.options.fuse else None)
             for one, w in zip(rated, weights, strict=True)
-            if w >= _LISTED and (one is best or self._possible(one))
+            if one is best or (w >= _LISTED and self._possible(one))
         ]
         estimate = Estimate(
             frame=frame,
