@@ -107,6 +107,17 @@ def test_symmetries_are_found_and_map_the_points_onto_themselves(
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
 
 
+def test_normals_forbid_symmetries_that_turn_them() -> None:
+    points = tuple(PointFeature(np.array([x, y, 0.0])) for x in range(9) for y in range(6))
+    up = np.tile([0.0, 0.0, 2.0], (54, 1))
+    assert len(Body("board", points).symmetries) == 4
+    kept = Body("board", points, up).symmetries
+    # half a turn in its plane is left; over its edges the board would show its back
+    np.testing.assert_allclose(kept[:, :3, :3], [np.eye(3), np.diag([-1.0, -1, 1])], atol=1e-9)
+    two_sided = np.where(np.arange(54)[:, None] % 2, up, -up)
+    assert len(Body("board", points, two_sided).symmetries) < 4
+
+
 def test_a_symmetry_within_the_spread_of_the_features_counts() -> None:
     bent = CUBE + np.random.default_rng(1).normal(0, 0.01, CUBE.shape)
     assert len(symmetries(bent, 1e-3)) == 1

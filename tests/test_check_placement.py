@@ -96,6 +96,18 @@ def test_a_body_beside_the_image_is_told_with_its_place(session: Session) -> Non
     assert "outside of its image of 640x512 px, at u = " in warnings[0]
 
 
+def test_cameras_without_a_common_view_are_told_with_lengths_to_compare(session: Session) -> None:
+    behind = camera_poses(session)[0].copy()
+    behind[:3, :3] = np.diag([-1.0, 1.0, -1.0]) @ behind[:3, :3]  # turned away on the spot
+    behind[:3, 3] = np.diag([-1.0, 1.0, -1.0]) @ behind[:3, 3]
+    behind[2, 3] -= 900.0
+    moved = replace(with_poses(session, camera_poses(session)[0], behind), start=None)
+    (warning,) = placement_warnings(moved)
+    assert "check T_sensor_world, and whether points of [object] and translations are in" in warning
+    # the second stands 900 mm from the first; the body's features are within 107 mm of its centre
+    assert warning.endswith("the body is 210 mm across, the sensors 900 mm apart")
+
+
 def test_an_inverted_start_is_recognised(session: Session) -> None:
     assert session.start is not None
     left, right = camera_poses(session)

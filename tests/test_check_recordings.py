@@ -41,7 +41,24 @@ def with_extract(recording: Path, line: str) -> Path:
 @pytest.mark.parametrize("name", ["two_cameras", "one_camera_video", "range_profiles"])
 def test_a_good_recording_has_no_warnings(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     report = report_on(SYNTHETIC / name / "session.toml", capsys, quick=True)
-    assert "warnings  none" in report
+    assert "warnings  none; whether the geometry fits the recording, mixpose run --stop 3" in report
+
+
+def test_frames_that_would_show_the_geometry_count_from_the_first(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in sorted(recording.glob("*0000.png")) + sorted(recording.glob("*0001.png")):
+        path.unlink()
+    report = report_on(recording / "session.toml", capsys, quick=True)
+    assert report.endswith("mixpose run --stop 5 shows\n")
+
+
+def test_corners_have_no_polarity(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = recording / "session.toml"
+    assert "left: pinhole 640x512, blobs (bright), sigma" in report_on(session, capsys, quick=True)
+    text = session.read_text(encoding="utf-8")
+    session.write_text(text.replace('"blobs"', '"corners"'), encoding="utf-8")
+    assert "left: pinhole 640x512, corners, sigma" in report_on(session, capsys, quick=True)
 
 
 def test_features_are_counted_beside_what_the_body_has(

@@ -97,6 +97,17 @@ def test_cameras_get_a_picture_per_stage_and_a_sheet(
     assert "right: 7 features found; the pose has 7 of 7 in view, 7 of them met" in out
 
 
+def test_without_a_number_the_first_frame_is_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in TWO_CAMERAS.parent.glob("*000[45].png"):  # the recording begins with frame 4
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    session = tmp_path / "session.toml"
+    session.write_bytes(TWO_CAMERAS.read_bytes())
+    assert command("inspect", session, "-o", tmp_path / "seen") == 0
+    assert "session.toml, frame 4: ok (estimated on its own)" in capsys.readouterr().out
+
+
 def test_grey_values_have_pictures_too(tmp_path: Path) -> None:
     session = SYNTHETIC / "parallel_beams" / "session.toml"
     assert command("inspect", session, "--frame", 3, "-o", tmp_path) == 0

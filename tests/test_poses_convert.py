@@ -94,6 +94,16 @@ def test_ambiguous_frames_are_left_out_where_wanted(poses: Path, tmp_path: Path)
         assert [row["frame"] for row in csv.DictReader(stream)] == ["3", "9"]
 
 
+def test_leaving_out_all_poses_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    poses = written(tmp_path / "poses.jsonl", estimate(5, status="ambiguous"))
+    assert convert(poses, "-o", tmp_path / "sure.csv", "--only-ok") == 0
+    warning, last = capfd.readouterr().err.splitlines()
+    assert "no pose is ok, and --only-ok leaves out the others" in warning
+    assert last.startswith("mixpose: 0 poses -> ")
+    assert convert(poses, "-o", tmp_path / "all.csv") == 0
+    assert capfd.readouterr().err == f"mixpose: 1 pose -> {tmp_path / 'all.csv'}\n"
+
+
 def test_ros_messages_are_in_metres_and_radians(poses: Path, tmp_path: Path) -> None:
     assert convert(poses, "-o", tmp_path / "poses.yaml") == 0
     documents = yaml.safe_load_all((tmp_path / "poses.yaml").read_text())
@@ -253,7 +263,7 @@ def test_first_of_several_right_answers_is_written(
     output, errors = capfd.readouterr()
     assert len(output.splitlines()) == 2
     assert "warning" in errors
-    assert "several right answers in 1 frames; the first is written" in errors
+    assert "several right answers in 1 frame; the first is written" in errors
     assert convert(poses, "--format", "jsonl") == 0
     assert len(capfd.readouterr().out.splitlines()) == 4
 

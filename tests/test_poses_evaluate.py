@@ -310,6 +310,15 @@ def test_the_report_holds_the_figures_as_json_and_as_an_aligned_table() -> None:
     assert rotation.split()[-1] == "1"  # the worst frame
 
 
+def test_one_is_told_as_one() -> None:
+    T = a_pose()
+    pose = line(0, turned_about_z(T, 1.5), covariance=np.eye(6))
+    table = as_table(evaluate(file_of(pose, line(7, T)), file_of(line(0, T))))
+    assert table.startswith("1 frame: 1 ok,")
+    assert "1 pose line has no truth and does not count" in table
+    assert "covariance, 1 frame that is ok: " in table
+
+
 @pytest.mark.skipif("MIXPOSE_RECORDINGS" not in os.environ, reason="no recordings on this machine")
 def test_a_chessboard_half_a_turn_off_is_right_and_a_tee_has_two_right_answers() -> None:
     recordings = Path(os.environ["MIXPOSE_RECORDINGS"])

@@ -81,6 +81,19 @@ def test_page_says_what_became_of_the_frames(full: Path) -> None:
     assert full.stat().st_size < 3_000_000
 
 
+def test_a_run_of_one_frame_is_told_as_one(tmp_path: Path) -> None:
+    truth = read_poses(RECORDING / "truth.jsonl").poses[10]
+    assert truth.T_world_object is not None
+    poses = [estimate(10, truth.T_world_object, time_s=0.4)]
+    page = report(tmp_path, write(tmp_path / "poses.jsonl", poses, None))
+    assert "frames 1 10 " in page.text
+    assert "10 to 10" not in page.text
+    true = write(tmp_path / "truth.jsonl", poses, None)
+    page = report(tmp_path, tmp_path / "poses.jsonl", true)
+    assert "1 frame of the truth: 1 ok" in page.text
+    assert "Covariance, 1 frame that is ok" in page.text
+
+
 def test_page_has_the_figures_of_evaluate(full: Path) -> None:
     page = Page(full.read_text(encoding="utf-8"))
     found = evaluate_files(full.with_name("poses.jsonl"), RECORDING / "truth.jsonl")

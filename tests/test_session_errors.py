@@ -254,6 +254,14 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"left_more": "T_sensor_world = " + IDENTITY.replace("0]", "inf]", 1)},
         [LEFT + "T_sensor_world[0][3]: found inf"],
     ),
+    (
+        {"left_more": "T_world_sensor = " + IDENTITY},
+        [
+            LEFT + 'T_world_sensor: unknown key; did you mean "T_sensor_world", the inverse of it, '
+            "which maps world to sensor coordinates?"
+        ],
+    ),
+    ({"left_more": "T_sensor_wrld = " + IDENTITY}, ['did you mean "T_sensor_world"?']),
     ({"left_more": "quaternion_xyzw = [0, 0, 0, 1]"}, [LEFT + "translation: missing"]),
     # cameras
     ({"matrix": ""}, [LEFT + "camera_matrix: missing", "calibration"]),

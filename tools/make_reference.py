@@ -168,6 +168,8 @@ def _default(table: type[Table], key: str, field: FieldInfo) -> str:
         default = getattr(ExtractOptions(), key)
     if default is None or default == () or isinstance(default, Table):
         return "left out"
+    if isinstance(default, bool):
+        return f"`{str(default).lower()}`"
     if isinstance(default, str):
         return f'`"{default}"`'
     if isinstance(default, tuple):

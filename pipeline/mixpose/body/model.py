@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import default_tolerance, symmetries
+from mixpose.body.symmetry import default_tolerance, keeps_normals, symmetries
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -119,9 +119,12 @@ class Body:
 
     @cached_property
     def symmetries(self) -> Floats:
-        """Motions T_object_object (G, 4, 4) that map the feature set onto itself."""
+        """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""
         points = self.nodes.points
-        return symmetries(points, max(default_tolerance(points), self.spread))
+        found = symmetries(points, max(default_tolerance(points), self.spread))
+        if self.node_normals is None:
+            return found
+        return found[[keeps_normals(T, points, self.node_normals) for T in found]]
 
     def sample(
         self,

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.rigid import from_parts
+from mixpose.rigid import from_parts, transform
 
 Floats: TypeAlias = NDArray[np.float64]
+
+_SAME_NORMAL = 0.99  # cosine
 
 
 def symmetries(points: Floats, tolerance: float) -> Floats:
@@ -53,6 +55,13 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
             found.append(R)
     rotations = np.array(found)
     return from_parts(rotations, centre - rotations @ centre)
+
+
+def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
+    """Whether a symmetry of points (N, 3) maps their normals (N, 3) onto each other, within 8°."""
+    _, image = cKDTree(points).query(transform(T, points))
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > _SAME_NORMAL)
 
 
 def default_tolerance(points: Floats) -> float:

@@ -94,7 +94,22 @@ def _no_common_view(session: Session) -> list[str]:
     )
     if not _blind(flipped, list(flipped.sensors)):
         return [f"{text}; with the inverse of each T_sensor_world all would: {_MAPS}"]
-    return [f"{text}: check T_sensor_world"]
+    return [f"{text}: check T_sensor_world{_sizes(session, cameras)}"]
+
+
+def _sizes(session: Session, cameras: list[SensorSetup]) -> str:
+    """Two lengths to compare, lest one of them is in another unit."""
+    places = [
+        _centre(s.sensor) for s in cameras if isinstance(s.sensor, PinholeCamera | FisheyeCamera)
+    ]
+    apart = max((float(np.linalg.norm(a - b)) for a, b in combinations(places, 2)), default=0.0)
+    if apart == 0:
+        return ""
+    across, away = (f"{float(f'{length:.2g}'):g}" for length in (2 * session.body.radius, apart))
+    return (
+        ", and whether points of [object] and translations are in the same unit: the body is "
+        f"{across} {session.unit} across, the sensors {away} {session.unit} apart"
+    )
 
 
 def _blind(session: Session, cameras: list[SensorSetup]) -> list[SensorSetup]:

@@ -92,7 +92,7 @@ def run(
         typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
     ] = None,
 ) -> None:
-    """Print a pose per frame."""
+    """Estimate a pose per frame."""
     from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
     from mixpose.runner import Selection  # noqa: PLC0415
 
@@ -126,8 +126,10 @@ def check(
 @app.command()
 def inspect(
     session: SessionFile,
-    frame: Annotated[int, typer.Option(help="Number of the frame.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
+    frame: Annotated[
+        int | None, typer.Option(help="Number of the frame; else the recording's first.")
+    ] = None,
     poses: Annotated[
         Path | None,
         typer.Option(

@@ -45,6 +45,7 @@ class _Report:
 
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    untested: str = ""
 
     def say(self, title: str, text: str) -> None:
         self.lines.append(f"{title:<10}{text}")
@@ -53,7 +54,7 @@ class _Report:
         for warning in self.warnings:
             self.say("warning", warning)
         if not self.warnings:
-            self.say("warnings", "none")
+            self.say("warnings", f"none; {self.untested}")
         sys.stdout.write("\n".join(self.lines) + "\n")
         self.lines, self.warnings = [], []
 
@@ -90,11 +91,18 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += placement_warnings(sized)
     _say_accuracy(report, sized)
+    report.untested = _untested(surveys)
     report.write()
     damage = [text for each in surveys.values() for text in each.damage]
     if damage:
         more = f" (and {len(damage) - 1} more, see above)" if len(damage) > 1 else ""
         raise RecordingError(f"{damage[0]}{more}")
+
+
+def _untested(surveys: Mapping[str, Survey]) -> str:
+    """What takes estimates of a few frames to know, and how to have them."""
+    first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
+    return f"whether the geometry fits the recording, mixpose run --stop {first + 3} shows"
 
 
 def _say_object(report: _Report, session: Session) -> None:
@@ -201,9 +209,9 @@ def _extraction(setup: SensorSetup) -> str:
     unit = "px" if setup.sensor.unit == "px" else "length units"
     if setup.model == "lateration":
         return f"sigma {setup.extract.sigma:g} {unit}"
-    return (
-        f"{setup.extract.method} ({setup.extract.polarity}), sigma {setup.extract.sigma:g} {unit}"
-    )
+    # corners are where dark and bright meet
+    polarity = "" if setup.extract.method == "corners" else f" ({setup.extract.polarity})"
+    return f"{setup.extract.method}{polarity}, sigma {setup.extract.sigma:g} {unit}"
 
 
 def _say_accuracy(report: _Report, session: Session) -> None:

@@ -63,6 +63,8 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
     _refuse_options_of_other_formats(name, request)
     poses = read_poses(path)
     lines = _selected(poses, name, request)
+    if request.only_ok and not lines:
+        warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
     if request.output is not None and request.output.is_file() | (not request.output.exists()):
         refuse_to_overwrite(request.output, [path])
     if name == "rerun":
@@ -72,7 +74,8 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
     else:
         _write(poses, lines, name, request)
     if request.output is not None:
-        print(f"mixpose: {len(lines)} poses -> {request.output}", file=sys.stderr)
+        count = f"{len(lines)} pose{'s' * (len(lines) != 1)}"
+        print(f"mixpose: {count} -> {request.output}", file=sys.stderr)
 
 
 def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
@@ -167,5 +170,6 @@ def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseL
     answers = Counter((line.frame, line.object) for line in lines)
     several = sum(count > 1 for count in answers.values())
     if several:
-        warn(f"{poses.path}: several right answers in {several} frames; the first is written")
+        count = f"{several} frame{'s' * (several != 1)}"
+        warn(f"{poses.path}: several right answers in {count}; the first is written")
     return first_answers(lines)

@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from mixpose.cli.run import named_sources
-from mixpose.errors import SessionError
+from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
 from mixpose.pictures.advice import describe
 from mixpose.pictures.finding import Finding, find
@@ -22,7 +22,7 @@ from mixpose.session import Session, load_session
 
 
 def inspect_frame(
-    path: Path, number: int, folder: Path, *, poses: Path | None, sources: Sequence[str]
+    path: Path, number: int | None, folder: Path, *, poses: Path | None, sources: Sequence[str]
 ) -> None:
     """Write pictures of one frame into a folder and print what was found in it.
 
@@ -30,8 +30,8 @@ def inspect_frame(
     ----------
     path : Path
         The session file.
-    number : int
-        Of the frame.
+    number : int or None
+        Of the frame; None is the first of the recording.
     folder : Path
         Made if there is none.
     poses : Path or None
@@ -50,6 +50,7 @@ def inspect_frame(
     require_matplotlib()
     _check_folder(folder, session)
     frame_set = _frame(open_sources(session, named_sources(sources)), number)
+    number = frame_set.number
     views = observe(session, frame_set)
     tracker, track = begin(session)
     if poses is None:
@@ -78,14 +79,16 @@ def _check_folder(folder: Path, session: Session) -> None:
         refuse_foreign(folder / name, "-o")
 
 
-def _frame(opened: Mapping[str, Source], number: int) -> FrameSet:
-    """The frames of one number."""
-    if number >= 0:
-        with closing(pair(opened, number, number + 1)) as frames:
+def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
+    """The frames of one number, or of the first."""
+    if number is None or number >= 0:
+        with closing(pair(opened, number, None if number is None else number + 1)) as frames:
             found = next(frames, None)
         if found is not None:
             return found
     recordings = "; ".join(f"{name}: {source.describe()}" for name, source in opened.items())
+    if number is None:
+        raise RecordingError(f"the recording has no frame; it has {recordings}")
     raise SessionError(f"--frame {number}: the recording has no such frame; it has {recordings}")
 
 

@@ -5,11 +5,19 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from collections.abc import Mapping
+from statistics import median
 
 from mixpose.frames import Source
 from mixpose.records import Estimate, Status
+from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
+_WELL = 0.1  # above it a sensor is explained, even beside 60 false features
+_MOST = 0.8  # of the frames: a sensor that takes no part in so many never does
+_OFTEN = 0.2  # of the frames: sensors that take turns do so by no accident
+# of sigma: 0.2 is the most in recordings whose geometry is right, 0.8 with a chessboard whose
+# squares are given as 25 in place of 24 mm
+_FAR_OFF = 0.5
 
 
 def warn(message: str) -> None:
@@ -28,20 +36,39 @@ def warn_of_sources(sources: Mapping[str, Source]) -> None:
 class Summary:
     """Counts frames as they pass, and says in the end what became of them."""
 
-    def __init__(self) -> None:
+    def __init__(self, session: Session) -> None:
+        self.sigmas = {
+            setup.name: setup.extract.sigma
+            for setup in session.sensors
+            # ranges err as the place has it, and features of a soft body are off theirs
+            if setup.sensor.unit == "px" and not session.body.spread
+        }
         self.statuses: Counter[Status] = Counter()
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
+        self.shared = 0  # frames with a pose in which two sensors or more had features
+        self.split: Counter[str] = Counter()  # sensors not explained where another one is
+        self.split_frames = 0
+        self.residuals: dict[str, list[float]] = {name: [] for name in self.sigmas}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
         self.statuses[estimate.status] += 1
         if estimate.status == "lost":
             return
-        for name, report in estimate.sensors.items():
-            if report.used:
-                self.posed[name] += 1
-                self.idle[name] += (report.explained or 0.0) < _NOTHING
+        shares = {n: one.explained or 0.0 for n, one in estimate.sensors.items() if one.used}
+        idle = [name for name, share in shares.items() if share < _NOTHING]
+        self.posed.update(shares.keys())
+        self.idle.update(idle)
+        self.shared += len(shares) > 1
+        if idle and max(shares.values()) > _WELL:
+            self.split_frames += 1
+            self.split.update(idle)
+        if estimate.status == "ok":
+            for name, residuals in self.residuals.items():
+                rms = estimate.sensors[name].rms
+                if rms is not None:
+                    residuals.append(rms)
 
     def text(self) -> str:
         """One line: how many frames came to which status."""
@@ -51,16 +78,52 @@ class Summary:
         return f"{count} frame{'s' * (count != 1)}: {', '.join(parts)}"
 
     def say(self, where: str) -> None:
-        """Print the line, and warn of sensors that took no part."""
+        """Print the line, and warn of sensors that took no part or fit badly."""
         if not sum(self.statuses.values()):
             warn("no frame was estimated: the recording has none with the numbers asked for")
             return
-        for name, count in self.idle.items():
-            if count and count >= 0.8 * self.posed[name]:
-                warn(
-                    f"sensor {name!r} explained less than 1 % in {count} of {self.posed[name]} "
-                    "frames with a pose: check its T_sensor_world, calibration and source"
-                )
+        for warning in self.warnings():
+            warn(warning)
         if self.statuses["lost"] == sum(self.statuses.values()):
             warn("every frame is lost: try mixpose check, then [start] and [extract]")
         print(f"mixpose: {self.text()}{where}", file=sys.stderr)
+
+    def warnings(self) -> list[str]:
+        """What is most likely wrong with the geometry, once for each sensor at most."""
+        apart = {n for n, k in self.idle.items() if k >= _MOST * self.posed[n]}
+        found = [
+            f"sensor {name!r} explained less than 1 % in {self.idle[name]} of {self.posed[name]} "
+            "frames with a pose: check its T_sensor_world, calibration and source"
+            for name in self.idle
+            if name in apart
+        ]
+        if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
+            apart = set(self.split)
+            found.append(self._split_text())
+        far = self._far_off(apart)
+        if far:
+            found.append(
+                f"features are met far off, {' and '.join(far)}: the size of [object], its unit, "
+                "the calibration or T_sensor_world is wrong, or frames are out of step"
+            )
+        return found
+
+    def _far_off(self, apart: set[str]) -> list[str]:
+        """By how much, for each camera, leaving out those that took no part."""
+        offs = {n: median(each) for n, each in self.residuals.items() if each and n not in apart}
+        return [
+            f"by {off:.2g} px in {name!r} (median; sigma is {self.sigmas[name]:g})"
+            for name, off in offs.items()
+            if off > _FAR_OFF * self.sigmas[name]
+        ]
+
+    def _split_text(self) -> str:
+        frames = f"in {self.split_frames} of {self.shared} frames with a pose"
+        check = (
+            "check the size of [object], its unit, T_sensor_world and calibration, if the body was "
+            "in view of all"
+        )
+        if len(self.posed) == 2:
+            return f"{frames} only one of 2 sensors is explained: {check}"
+        each = ", ".join(f"{name!r} in {count}" for name, count in self.split.items())
+        return f"{frames} not all of {len(self.posed)} sensors are explained ({each} not): {check}"

@@ -56,7 +56,7 @@ def run_session(path: Path, request: RunRequest) -> None:
         _refuse_live(opened)
         selection, T_start, resumed = _resumed(request, header)
     warn_of_sources(opened)
-    summary = Summary()
+    summary = Summary(session)
     with ExitStack() as stack:
         stack.enter_context(prompt_switching())
         watch = _overlay(stack, session, request)
@@ -67,7 +67,8 @@ def run_session(path: Path, request: RunRequest) -> None:
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
             summary.add(estimate)
-    summary.say("" if request.output is None else f" -> {request.output}")
+    written = [str(path) for path in (request.output, request.overlay) if path is not None]
+    summary.say(f" -> {', '.join(written)}" if written else "")
 
 
 @contextmanager

@@ -36,7 +36,8 @@ def simulate_session(
                 overwrite=overwrite,
                 progress=lambda done: progress.update(task, completed=done),
             )
+    count = f"{options.frames} frame{'s' * (options.frames != 1)}"
     print(
-        f"{options.frames} frames in {folder}; play them with: mixpose run {folder / SESSION_NAME}",
+        f"{count} in {folder}; play them with: mixpose run {folder / SESSION_NAME}",
         file=sys.stderr,
     )

@@ -51,21 +51,26 @@ def as_table(evaluation: Evaluation) -> str:
     """The evaluation as aligned plain text, several lines without a final newline."""
     unit = evaluation.unit or "units"
     lines = [
-        f"{evaluation.frames} frames: {evaluation.ok} ok, {evaluation.ambiguous} ambiguous, "
-        f"{evaluation.lost} lost, {evaluation.missing} missing"
+        f"{evaluation.frames} frame{'s' * (evaluation.frames != 1)}: {evaluation.ok} ok, "
+        f"{evaluation.ambiguous} ambiguous, {evaluation.lost} lost, {evaluation.missing} missing"
     ]
     if evaluation.without_truth:
-        lines.append(f"{evaluation.without_truth} pose lines have no truth and do not count")
+        many = evaluation.without_truth != 1
+        lines.append(
+            f"{evaluation.without_truth} pose line{'s have' if many else ' has'} no truth and "
+            f"{'do' if many else 'does'} not count"
+        )
     lines += ["", *_spread_lines(evaluation, unit), *_axis_lines(evaluation, unit)]
     nees = evaluation.nees
     if nees is None:
         lines += ["", "covariance: no frame that is ok has one"]
     else:
+        counted = f"{nees.frames} frame{'s that are' if nees.frames != 1 else ' that is'} ok"
         lines += [
             "",
-            f"covariance, {nees.frames} frames that are ok: squared error per dimension "
-            f"{nees.nees_per_dimension:.3g} (right: 1), inside the 95 % ellipsoid "
-            f"{100 * nees.inside_95:.3g} %",
+            f"covariance, {counted}: "
+            f"squared error per dimension {nees.nees_per_dimension:.3g} (right: 1), "
+            f"inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %",
         ]
     return "\n".join(lines)
 

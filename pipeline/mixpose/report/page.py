@@ -214,8 +214,9 @@ def _numbers(series: Series, evaluation: Evaluation | None) -> list[Figure]:
 def _span(series: Series) -> str:
     if not series.frames:
         return ""
-    span = f"{series.frames[0]} to {series.frames[-1]}"
-    if series.x_label.startswith("time"):
+    first, last = series.frames[0], series.frames[-1]
+    span = f"{first} to {last}" if last != first else f"{first}"
+    if last != first and series.x_label.startswith("time"):
         span += f", {series.x[-1] - series.x[0]:.4g} s"
     return span
 

@@ -135,9 +135,17 @@ def _unknown_key(root: type[BaseModel], place: _Place) -> str:
     # a key that is right elsewhere is more likely misplaced than misspelt
     close = nearest(key, known, cutoff=0.8) if homes else nearest(key, known)
     if close:
-        return f'unknown key; did you mean "{close}"?'
+        return f'unknown key; did you mean "{close}"{_if_inverse(key, close)}?'
     home = f"; it is a key of {' or '.join(homes)}" if homes else ""
     return f"unknown key{home}; allowed here: {', '.join(known)}"
+
+
+def _if_inverse(key: str, close: str) -> str:
+    """A remark where the right key has the names of a transform the other way round."""
+    _, *names = close.split("_")
+    if len(names) < 2 or key.lower() != "_".join(["t", *reversed(names)]):
+        return ""
+    return f", the inverse of it, which maps {names[1]} to {names[0]} coordinates"
 
 
 def _homes(root: type[BaseModel], key: str) -> list[str]:
