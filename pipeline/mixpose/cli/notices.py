@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from statistics import median
 
@@ -18,6 +18,7 @@ _OFTEN = 0.2  # of the frames: sensors that take turns do so by no accident
 # of sigma: 0.2 is the most in recordings whose geometry is right, 0.8 with a chessboard whose
 # squares are given as 25 in place of 24 mm
 _FAR_OFF = 0.5
+_REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
 
 
 def warn(message: str) -> None:
@@ -49,7 +50,7 @@ class Summary:
         self.shared = 0  # frames with a pose in which two sensors or more had features
         self.split: Counter[str] = Counter()  # sensors not explained where another one is
         self.split_frames = 0
-        self.residuals: dict[str, list[float]] = {name: [] for name in self.sigmas}
+        self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
