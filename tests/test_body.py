@@ -122,3 +122,26 @@ def test_a_symmetry_within_the_spread_of_the_features_counts() -> None:
     bent = CUBE + np.random.default_rng(1).normal(0, 0.01, CUBE.shape)
     assert len(symmetries(bent, 1e-3)) == 1
     assert len(symmetries(bent, 0.1)) == 24
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "expected"),
+    [
+        (1, 1, 0.0),
+        (2, 2, 2 / 4),
+        (3, 3, 6 / 9),
+        (7, 5, 30 / 35),  # a step along the longer side leaves one row of five unmet
+    ],
+)
+def test_a_grid_recurs_but_for_the_row_that_a_step_leaves(
+    rows: int, columns: int, expected: float
+) -> None:
+    places = [(20.0 * i, 20.0 * j, 0.0) for i in range(rows) for j in range(columns)]
+    grid = Body("grid", tuple(PointFeature(np.array(place)) for place in places))
+    assert grid.recurrence == pytest.approx(expected)
+
+
+def test_points_at_random_do_not_recur() -> None:
+    points = np.random.default_rng(3).normal(scale=50.0, size=(9, 3))
+    body = Body("scatter", tuple(PointFeature(point) for point in points))
+    assert body.recurrence == pytest.approx(1 / 9)

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import default_tolerance, keeps_normals, symmetries
+from mixpose.body.symmetry import default_tolerance, keeps_normals, recurrence, symmetries
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -125,6 +125,11 @@ class Body:
         if self.node_normals is None:
             return found
         return found[[keeps_normals(T, points, self.node_normals) for T in found]]
+
+    @cached_property
+    def recurrence(self) -> float:
+        """Share of the features met by features of the same body shifted by a step."""
+        return recurrence(self.means, max(default_tolerance(self.means), self.spread))
 
     def sample(
         self,

@@ -1,4 +1,7 @@
-"""Rotations that map a body onto itself: poses that no sensor can tell apart.
+"""Motions that map a body onto itself, wholly or but for its rim.
+
+Poses that differ by a rotation which maps the body onto itself can't be told apart by any sensor;
+a grid shifted by a step still meets most of itself.
 
 A rotation of the body is fixed by where it sends three features that are not on a line.  All
 images of such a triple with the same distances are tried, and those that map every feature onto
@@ -18,6 +21,7 @@ from mixpose.rigid import from_parts, transform
 Floats: TypeAlias = NDArray[np.float64]
 
 _SAME_NORMAL = 0.99  # cosine
+_NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
 
 
 def symmetries(points: Floats, tolerance: float) -> Floats:
@@ -62,6 +66,31 @@ def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
     _, image = cKDTree(points).query(transform(T, points))
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > _SAME_NORMAL)
+
+
+def recurrence(points: Floats, tolerance: float) -> float:
+    """Find how much of a point set a shift by one step maps onto the set itself.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+        Feature means.
+    tolerance : float
+        Largest distance, in length units, between an image and its feature.
+
+    Returns
+    -------
+    float
+        Largest share over all shifts from a point to one of its neighbours: 1/N for points at
+        random, near 1 for a large grid.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if len(points) < 2:
+        return 0.0
+    _, near = cKDTree(points).query(points, k=min(len(points), 1 + _NEIGHBOURS))
+    steps = (points[near[:, 1:]] - points[:, None]).reshape(-1, 3)
+    alike = cKDTree(steps).query_ball_point(steps, tolerance, return_length=True)
+    return float(np.max(alike)) / len(points)
 
 
 def default_tolerance(points: Floats) -> float:

@@ -67,6 +67,7 @@ _LISTED = 0.001
 _OUTDONE = 10.0  # log odds by which a candidate of the search may be behind to be refined
 _SETTLING_STEPS = 2
 _HALF = 0.5  # of a feature: less is no difference
+_RECURRENT = 0.6  # share of a body met a step aside from which it may be followed there
 _SAME_ROTATION_DEG = 1.0
 _SAME_PEAK = 9.0  # squared distance in standard deviations of uncertain poses
 _SAME_DISTANCE_SHARE = 0.02  # of the body's radius
@@ -223,7 +224,7 @@ class Tracker:
                 self._insert(rated, self._ranged(views, T, track, predictions, prediction))
             else:
                 consider(self._fit(views, T, prediction.uncertainty))
-        if not rated or not self._convinces(rated[0]) or has_slipped(rated[0], track):
+        if not rated or not self._convinces(rated[0]) or self._has_slipped(rated[0], track):
             for T in self._elsewhere(views, predictions):
                 consider(T)
         for mirrored in flipped(rated[0].T_world_object, self.body, views) if rated else ():
@@ -311,6 +312,19 @@ class Tracker:
             self._gazes[key] = gazes_of(sensors, self.body)
         return self._gazes[key]
 
+    def _has_slipped(self, rated: Rated, track: Track) -> bool:
+        """Whether a sensor misses more than in the frame before while more is seen beside the body.
+
+        So it is where a body that looks like itself a step aside was followed to there.
+        """
+        if self.body.recurrence < _RECURRENT:
+            return False
+        for one in rated.assessment.meetings:
+            missed, surplus = track.loose.get(one.name, (np.inf, np.inf))
+            if one.missed > missed + _HALF and one.surplus > surplus + _HALF:
+                return True
+        return False
+
     def _sure(self, rated: Rated) -> bool:
         return self._possible(rated) and rated.assessment.log_evidence > SURE
 
@@ -354,18 +368,6 @@ class Tracker:
         apart = float(np.linalg.norm((T_a - T_b) @ centre))
         near = apart < _SAME_DISTANCE_SHARE * self.body.radius
         return near and float(rotation_angle_deg(T_a, T_b)) < _SAME_ROTATION_DEG
-
-
-def has_slipped(rated: Rated, track: Track) -> bool:
-    """Whether a sensor misses more than in the frame before while more is seen beside the body.
-
-    So it is where a body that looks like itself a step aside was followed to there.
-    """
-    for one in rated.assessment.meetings:
-        missed, surplus = track.loose.get(one.name, (np.inf, np.inf))
-        if one.missed > missed + _HALF and one.surplus > surplus + _HALF:
-            return True
-    return False
 
 
 def beliefs(rated: Sequence[Rated]) -> list[float]:
