@@ -18,6 +18,7 @@ from mixpose.report.overlays import chosen_frames
 from mixpose.report.series import (
     errors_of,
     frame_ranges,
+    jumps_of_turns,
     rotation_vector_jacobian,
     series_of,
 )
@@ -78,7 +79,11 @@ def test_a_line_breaks_where_frames_are_left_out_and_where_a_turn_wraps(tmp_path
     series = series_of(read_poses(poses))
     assert series.breaks.tolist() == [False, False, False, True, False]
     _, axes = blank()
-    TimeAxes(axes, series, wrap=180.0).draw(np.array([170.0, 178.0, -178.0, -170.0, -160.0]))
+    turns = np.zeros((5, 3))  # the axis is tilted, so that no component alone wraps
+    turns[:, 0] = turns[:, 1] = np.array([170.0, 178.0, -178.0, -170.0, -160.0]) / np.sqrt(2)
+    jumps = jumps_of_turns(turns)
+    assert jumps.tolist() == [False, False, True, False, False]
+    TimeAxes(axes, series, jumps).draw(turns[:, 2])
     drawn = np.asarray(axes.lines[-1].get_ydata())
     assert np.flatnonzero(np.isnan(drawn)).tolist() == [2, 4]
     assert frame_ranges(series, "ok") == [(10, 14), (20, 22)]

@@ -96,12 +96,13 @@ class TimeAxes:
     ----------
     axes : Axes
     series : Series
-    wrap : float
-        A step of a value by more than this is no motion: the line breaks there.
+    jumps : (n,) bool, optional
+        Frames before which a value steps by no motion: lines break there.
     """
 
-    def __init__(self, axes: Axes, series: Series, wrap: float = np.inf) -> None:
-        self._axes, self._series, self._wrap = axes, series, wrap
+    def __init__(self, axes: Axes, series: Series, jumps: Flags | None = None) -> None:
+        self._axes, self._series = axes, series
+        self._breaks = series.breaks if jumps is None else series.breaks | jumps
         self._as_pixels = len(series.x) > _MANY
         gaps = np.diff(series.x)
         self._half_step = 0.5 * float(np.median(gaps)) if gaps.size else 0.5
@@ -115,17 +116,11 @@ class TimeAxes:
 
     def draw(self, values: Floats, look: dict[str, Any] = POSE) -> None:
         """Draw a line that breaks where frames are lost or left out."""
-        breaks = self._series.breaks.copy()
-        with np.errstate(invalid="ignore"):
-            breaks[1:] |= np.abs(np.diff(values)) > self._wrap
-        line(self._axes, self._series.x, values, breaks, look)
+        line(self._axes, self._series.x, values, self._breaks, look)
 
     def band(self, values: Floats, half_width: Floats) -> None:
         """Fill the band about values."""
-        breaks = self._series.breaks.copy()
-        with np.errstate(invalid="ignore"):
-            breaks[1:] |= np.abs(np.diff(values)) > self._wrap
-        x, y, width = (_broken(each, breaks) for each in (self._series.x, values, half_width))
+        x, y, width = (_broken(each, self._breaks) for each in (self._series.x, values, half_width))
         self._axes.fill_between(
             x,
             y - width,
@@ -163,10 +158,10 @@ class TimeAxes:
 
 def line(axes: Axes, x: Floats, y: Floats, breaks: Flags, look: dict[str, Any] = POSE) -> None:
     """Draw a line that leaves out breaks and missing values, and dots where it would not show."""
-    many = len(x) > _MANY
+    many, dotted = len(x) > _MANY, len(x) <= _DOTS
     x, y = _broken(x, breaks), _broken(y, breaks)
     look = {"linewidth": 1.3, "marker": "o", "markersize": 2.5, "rasterized": many, **look}
-    if len(x) > _DOTS:
+    if not dotted:
         known = np.isfinite(x + y)
         beside = np.r_[False, known[:-1]] | np.r_[known[1:], False]
         look["markevery"] = np.flatnonzero(known & ~beside).tolist()

@@ -25,7 +25,7 @@ from mixpose.report.drawing import (
     mark_ambiguous,
     stacked,
 )
-from mixpose.report.series import Errors, Series
+from mixpose.report.series import Errors, Flags, Series, jumps_of_turns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -67,13 +67,14 @@ def motion(series: Series, errors: Errors | None) -> list[Chart]:
     )
     charts = []
     for kind, (word, unit, values, right_values) in enumerate(kinds):
+        jumps = np.zeros(len(series.x), dtype=bool)
+        for turns in (values, right_values) if kind else ():
+            jumps |= False if turns is None else jumps_of_turns(turns)
         for k, axis in enumerate(AXES):
             truth = None if right_values is None else right_values[:, k]
             half_width = series.half_width[:, 3 * kind + k]
-            # a rotation vector that passes half a turn comes in again on the other side
-            wrap = 180.0 if kind else np.inf
             title = f"{word.capitalize()} {axis}, {unit}"
-            svg = _values(series, values[:, k], half_width, truth, wrap)
+            svg = _values(series, values[:, k], half_width, truth, jumps)
             charts.append(Chart(title, _spoken(title, values[:, k]), svg))
     return charts
 
@@ -177,11 +178,11 @@ def _plane(series: Series, errors: Errors | None, a: int, b: int) -> Chart:
 
 
 def _values(
-    series: Series, values: Floats, half_width: Floats, truth: Floats | None, wrap: float
+    series: Series, values: Floats, half_width: Floats, truth: Floats | None, jumps: Flags
 ) -> str:
     """Values with their band above, the band's half-width alone below."""
     figure, (upper, lower) = stacked((3.0, 1.2))
-    panel = TimeAxes(upper, series, wrap)
+    panel = TimeAxes(upper, series, jumps)
     panel.mark_lost()
     panel.band(values, half_width)
     if truth is not None:

@@ -24,6 +24,7 @@ Flags: TypeAlias = NDArray[np.bool_]
 SIGMAS_95 = 1.96
 """Standard deviations to either side that hold 95 % of a Gaussian."""
 
+_HALF_TURN_DEG = 180.0
 _DECIMALS_DEG = 7  # an axis that is held turns by rounding errors, and should be seen to stand
 
 
@@ -166,6 +167,16 @@ def turns_deg(T: Floats, T_reference: Floats) -> Floats:
     if known.any():
         turns[known] = np.degrees(rigid.twist_between(T_reference, T[known])[:, 3:])
     return np.round(turns, _DECIMALS_DEG)
+
+
+def jumps_of_turns(turn_deg: Floats) -> Flags:
+    """Before which frames (n,) rotation vectors (n, 3) pass half a turn.
+
+    They come in again on the other side, by a whole turn, in all of their components at once.
+    """
+    with np.errstate(invalid="ignore"):
+        far = np.linalg.norm(np.diff(turn_deg, axis=0), axis=1) > _HALF_TURN_DEG
+    return np.concatenate([np.zeros(min(len(turn_deg), 1), dtype=bool), far])
 
 
 def frame_ranges(series: Series, status: Status) -> list[tuple[int, int]]:
