@@ -87,6 +87,10 @@ def test_a_run_resumes_with_the_same_recording_only(
     assert poses.read_bytes() == before
     said(capsys, 0, *to_file, "3", "--resume", "--source", f"left={other}")
     assert len(poses.read_text(encoding="utf-8").splitlines()) == 4
+    whole = poses.read_bytes()
+    line = said(capsys, 0, *to_file, "3", "--resume", "--source", f"left={other}")
+    assert line == f"mixpose: nothing left to do -> {poses}\n"
+    assert poses.read_bytes() == whole
 
 
 def test_a_run_of_the_sessions_own_recording_names_no_sources(

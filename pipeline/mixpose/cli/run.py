@@ -68,7 +68,7 @@ def run_session(path: Path, request: RunRequest) -> None:
             output.write(estimate)
             summary.add(estimate)
     written = [str(path) for path in (request.output, request.overlay) if path is not None]
-    summary.say(f" -> {', '.join(written)}" if written else "")
+    summary.say(f" -> {', '.join(written)}" if written else "", resumed=resumed)
 
 
 @contextmanager
