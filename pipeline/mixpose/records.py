@@ -29,10 +29,35 @@ class PointPattern:
         Feature positions in sensor coordinates.
     weights : (M,) float64
         Positive weight of each point; 1 for a plain detection.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not match, a value is not finite or a weight is negative.
     """
 
     points: Floats
     weights: Floats
+
+    def __post_init__(self) -> None:
+        points = np.asarray(self.points, dtype=np.float64)
+        weights = np.asarray(self.weights, dtype=np.float64)
+        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "weights", weights)
+        if points.ndim != 2:
+            raise ValueError(
+                f"points: found the shape {points.shape}; allowed: (M, 2) for pixels, (M, 1) for "
+                "ranges"
+            )
+        if weights.shape != points.shape[:1]:
+            raise ValueError(
+                f"weights: found the shape {weights.shape}; allowed: {points.shape[:1]}, one per "
+                "point"
+            )
+        if not (np.isfinite(points).all() and np.isfinite(weights).all()):
+            raise ValueError("points and weights: found NaN or infinity; leave such points out")
+        if (weights < 0).any():
+            raise ValueError(f"weights: found {weights.min():g}; allowed: 0 or more")
 
 
 @dataclass(frozen=True)

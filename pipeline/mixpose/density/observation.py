@@ -47,11 +47,20 @@ class Observation:
     intrinsic : float
         Standard deviation that features have in the pattern already: 0 for detections, σ_ε for
         a simulated measurement that is a density itself.
+
+    Raises
+    ------
+    ValueError
+        If sigma is not greater than 0.
     """
 
     pattern: Pattern
     sigma: float
     intrinsic: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.sigma < np.inf:
+            raise ValueError(f"sigma: found {self.sigma}; allowed: greater than 0")
 
     @property
     def dimension(self) -> int:

@@ -15,6 +15,7 @@ from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.tracker import Tracker
 from mixpose.objective import View
 from mixpose.records import Estimate
+from mixpose.rigid import is_rigid
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -40,8 +41,26 @@ def estimate_pose(
     -------
     Estimate
         Of frame 0.
+
+    Raises
+    ------
+    ValueError
+        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
     """
+    _check(views, start)
     tracker = Tracker.create(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
     _, estimate = tracker.advance(tracker.begin(), 0, None, views)
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def _check(views: Sequence[View], start: Floats | None) -> None:
+    """Refuse arrays that cannot be meant, before they go astray in the search."""
+    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
+        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
+    for view in views:
+        found, allowed = view.observation.dimension, view.sensor.dimension
+        if found != allowed:
+            raise ValueError(
+                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
+            )
