@@ -283,6 +283,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         [LEFT + "camera_matrix", "transpose it"],
     ),
     (
+        {"matrix": "camera_matrix = [[800, 640, 0], [0, 800, 512], [0, 0, 1]]"},
+        [LEFT + "camera_matrix", "cx comes third"],
+    ),
+    (
         {"matrix": "camera_matrix = [[800, 0, 640], [0, 800, 512], [0, 0, 2]]"},
         [LEFT + "camera_matrix", "[0, 0, 1]]"],
     ),

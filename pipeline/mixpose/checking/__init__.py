@@ -1,8 +1,9 @@
 """What can be said of a session before anything is estimated.
 
 `recordings` reads every frame and counts features, `advice` says which key to change where the
-count is off, `placement` looks at where sensors stand and the body starts, `lookalikes` finds
-poses that the sensors could not tell apart, `typical` poses where the session names no start.
+count is off, `sensor_keys` doubts calibrations and widths, `placement` looks at where sensors
+stand and the body starts, `lookalikes` finds poses that the sensors could not tell apart, `typical`
+poses where the session names no start.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from mixpose.checking.advice import advice, judge
 from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.checking.recordings import Survey, image_of, survey
+from mixpose.checking.sensor_keys import key_warnings
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
 __all__ = [
@@ -21,6 +23,7 @@ __all__ = [
     "expected_count",
     "image_of",
     "judge",
+    "key_warnings",
     "look_alikes",
     "noise_of",
     "placement_lines",

@@ -19,6 +19,7 @@ from mixpose.checking import (
     expected_count,
     image_of,
     judge,
+    key_warnings,
     look_alikes,
     noise_of,
     placement_lines,
@@ -37,6 +38,7 @@ from mixpose.session import SensorSetup, Session, load_session
 _TYPICAL_POSES = 3
 _AWAY = (1.0, 2.0, 4.0)  # times the distance at which the body fills half of one camera's image
 _LISTED = 5  # frame numbers that are named
+_ALL_WAYS = np.pi / 2  # a turn that is less certain than this, in radians, is not known at all
 
 
 @dataclass
@@ -89,7 +91,7 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     for setup in session.sensors:
         _say_sensor(report, session, setup, sources[setup.name], surveys)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
-    report.warnings += placement_warnings(sized)
+    report.warnings += key_warnings(sized) + placement_warnings(sized)
     _say_accuracy(report, sized)
     report.untested = _untested(surveys)
     report.write()
@@ -127,7 +129,7 @@ def _say_sensor(
     surveys: Mapping[str, Survey],
 ) -> None:
     found = surveys[setup.name]
-    report.say("sensor", f"{setup.name}: {_geometry(setup)}, {_extraction(setup)}")
+    report.say("sensor", f"{setup.name}: {_geometry(setup)}, {_extraction(setup, session.unit)}")
     for line in placement_lines(setup, session.unit):
         report.say("", line)
     total = len(found.numbers) + len(found.damage)
@@ -205,8 +207,8 @@ def _geometry(setup: SensorSetup) -> str:
     return f"{setup.model} {setup.resolution[0]}x{setup.resolution[1]}"
 
 
-def _extraction(setup: SensorSetup) -> str:
-    unit = "px" if setup.sensor.unit == "px" else "length units"
+def _extraction(setup: SensorSetup, length_unit: str) -> str:
+    unit = "px" if setup.sensor.unit == "px" else length_unit
     if setup.model == "lateration":
         return f"sigma {setup.extract.sigma:g} {unit}"
     # corners are where dark and bright meet
@@ -258,11 +260,18 @@ def _say_accuracy_at(
         )
         report.say("in view", f"{where}: {seen}")
         deviations = np.median([np.sqrt(np.diag(c)) for c, _ in expected], axis=0)
+        deviations[3:][deviations[3:] > _ALL_WAYS] = np.inf
         report.say(
             "accuracy",
             f"one standard deviation {where}, if each feature errs by sigma: "
             f"{_deviations(deviations, session.unit, free)}",
         )
+        unknown = [TWIST_NAMES[k] for k in np.flatnonzero(free & ~np.isfinite(deviations))]
+        if unknown:
+            report.warnings.append(
+                f"{where}, the sensors do not determine {', '.join(unknown)}: hold what is known "
+                "at the pose of [start] with free in [estimator], or add a sensor"
+            )
     others = [
         look_alikes(session.sensors, session.body, T, free)
         for T, (covariance, _) in zip(poses, expected, strict=True)

@@ -53,6 +53,8 @@ def camera_matrix(value: Any) -> Floats:
         turned = np.allclose(K[:, 2], [0, 0, 1], rtol=0, atol=1e-9)
         hint = "; transpose it" if turned and not np.allclose(K[2, :2], 0) else ""
         raise BadKeyError(found(K.tolist(), MATRIX_FORM) + hint)
+    if K[0, 1] != 0 and K[0, 2] == 0:
+        raise BadKeyError(found(K.tolist(), MATRIX_FORM) + "; cx comes third")
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
         if not focal > 0:
             raise BadKeyError(

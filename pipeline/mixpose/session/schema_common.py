@@ -104,7 +104,8 @@ class ExtractTable(Table):
         Field(gt=0, description="greater than 0: px for cameras, a length for lateration"),
     ] = None
     """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
-    a predicted and a found feature draw each other in the final fit.
+    a predicted and a found feature draw each other in the final fit. For ranges set it to what they
+    err by.
 
     Example: `sigma = 2.0`
     """

@@ -1,0 +1,82 @@
+"""Which keys of sensors `mixpose check` doubts, and which directions it calls unknown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.checking import key_warnings
+from mixpose.cli.check import check_session
+from mixpose.sensors import PinholeCamera
+from mixpose.session import Session, load_session
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+TRILATERATION = """
+unit = "m"
+
+[object]
+name = "trolley"
+points = [[0.2, 0.15, 0], [-0.1, 0.14, 0], [-0.07, -0.14, 0]]
+
+[start]
+T_world_object = [[1, 0, 0, 0.2], [0, 1, 0, 0.4], [0, 0, 1, 1.0], [0, 0, 0, 1]]
+
+[extract]
+sigma = 0.08
+"""
+
+
+@pytest.fixture
+def session() -> Session:
+    return load_session(SYNTHETIC / "two_cameras" / "session.toml")
+
+
+def test_recorded_calibrations_and_widths_raise_no_doubt(session: Session) -> None:
+    assert key_warnings(session) == []
+    assert key_warnings(load_session(SYNTHETIC / "range_profiles" / "session.toml")) == []
+
+
+def test_a_calibration_of_images_twice_as_large_is_doubted(session: Session) -> None:
+    left, right = session.sensors
+    assert isinstance(left.sensor, PinholeCamera)
+    twice = left.sensor.camera_matrix * [[2.0], [2.0], [1.0]]
+    sensor = replace(left.sensor, camera_matrix=twice)
+    (warning,) = key_warnings(replace(session, sensors=(replace(left, sensor=sensor), right)))
+    assert warning.startswith("sensor 'left': the principal point cx = ")
+    assert "of 640x512 px: is the calibration of images of another size" in warning
+
+
+def test_ranges_with_the_width_of_pixels_are_doubted() -> None:
+    ranges = load_session(SYNTHETIC / "range_profiles" / "session.toml")
+    wide = [replace(s, extract=replace(s.extract, sigma=500.0)) for s in ranges.sensors]
+    (warning,) = key_warnings(replace(ranges, sensors=tuple(wide)))
+    assert warning.startswith("sensor 'front', 'side', 'top': sigma = 500 mm in [extract] is wider")
+
+
+def test_directions_that_sensors_in_one_plane_do_not_see_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = TRILATERATION
+    for k, place in enumerate([(-3, 3), (3, 3), (3, -3), (-3, -3)]):
+        text += f"""
+[[sensor]]
+name = "anchor{k}"
+model = "lateration"
+position = [{place[0]}, {place[1]}, 1.0]
+source = "anchor{k}.csv"
+"""
+        away = np.hypot(place[0] - 0.2, place[1] - 0.4)
+        rows = "".join(f"0,{away + shift:.3f}\n" for shift in (-0.1, 0.0, 0.1))
+        (tmp_path / f"anchor{k}.csv").write_text(f"frame,range\n{rows}", encoding="utf-8")
+    path = tmp_path / "session.toml"
+    path.write_text(text, encoding="utf-8")
+    check_session(path)
+    printed = capsys.readouterr().out
+    assert "anchor0: lateration, sigma 0.08 m\n" in printed
+    assert "at [start], the sensors do not determine z, rx, ry: hold what is known" in printed
+    path.write_text(text + '\n[estimator]\nfree = ["x", "y", "rz"]\n', encoding="utf-8")
+    check_session(path)
+    assert "do not determine" not in capsys.readouterr().out
