@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mixpose
-from mixpose.body import Body
+from mixpose.body import Body, PointFeature
 from mixpose.cli import main
 from mixpose.errors import SessionError
 from mixpose.objective import View
@@ -22,17 +22,19 @@ from mixpose.pictures import Part, displayable, draw_pose
 from mixpose.pictures.movie import Overlay
 from mixpose.pictures.overlay import (
     CHI2_95,
+    FOUND,
     STATUS_COLOURS,
     ellipse_95,
     projected_covariances,
     projected_features,
 )
+from mixpose.pictures.ranges import draw_ranges
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours
-from mixpose.records import Estimate, FrameSet, SensorReport
+from mixpose.records import Estimate, FrameSet, PointPattern, SensorReport
 from mixpose.rigid import perturb, transform
 from mixpose.runner import Selection, run
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import PinholeCamera, RangeSensor
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 BLACK = np.zeros((1024, 1280, 3), np.uint8)
@@ -257,6 +259,17 @@ def test_ranges_are_drawn_as_strips_of_one_size(tmp_path: Path) -> None:
     assert len(pictures) == len(estimates) == 2
     shapes = {picture.shape for picture in pictures if picture is not None}
     assert shapes == {(36 + 3 * (130 + 4), 960, 3)}
+
+
+def test_ranges_of_a_body_far_away_are_drawn_apart() -> None:
+    points = ((0.2, 0.15, 0.0), (-0.1, 0.14, 0.0), (-0.07, -0.14, 0.0))
+    body = Body("trolley", tuple(PointFeature(np.array(point)) for point in points))
+    ranges = PointPattern(np.array([[63.67], [63.98], [64.06]]), np.ones(3))
+    strip = draw_ranges("anchor", ranges, RangeSensor(np.zeros(3)), body, None)
+    bars = np.flatnonzero((strip[70] == FOUND).all(axis=-1))
+    places = [group.mean() for group in np.split(bars, np.flatnonzero(np.diff(bars) > 1) + 1)]
+    # the body is 0.45 across, so that the scale goes by whole units: 63 to 65 on 928 px
+    assert np.diff(places) == pytest.approx([0.31 * 464, 0.08 * 464], abs=2)
 
 
 def test_a_sensor_without_a_frame_keeps_its_place_in_the_picture(recording: Path) -> None:

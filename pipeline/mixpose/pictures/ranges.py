@@ -61,7 +61,7 @@ def draw_ranges(
     if T_world_object is not None:
         y, _, seen = projected_features(sensor, body, T_world_object)
         expected = np.where(seen, y[:, 0], np.nan)
-    low, high = _span(sensor, pattern, expected)
+    low, high = _span(sensor, pattern, expected, body)
     width = size[0] - 2 * _MARGIN_PX
 
     def across(ranges: Floats) -> Floats:
@@ -93,8 +93,10 @@ def half_widths_95(
     return np.asarray(np.sqrt(CHI2_95[1] * np.maximum(variances, 0)))
 
 
-def _span(sensor: Sensor, pattern: Pattern | None, expected: Floats) -> tuple[float, float]:
-    """The ranges that are shown; steady from frame to frame where the sensor has limits."""
+def _span(
+    sensor: Sensor, pattern: Pattern | None, expected: Floats, body: Body
+) -> tuple[float, float]:
+    """The ranges that are shown: the sensor's limits, or steps of about two bodies around all."""
     if isinstance(pattern, GridPattern):
         low = float(pattern.origin[0])
         return low, low + pattern.step * max(pattern.values.shape[1] - 1, 1)
@@ -104,16 +106,24 @@ def _span(sensor: Sensor, pattern: Pattern | None, expected: Floats) -> tuple[fl
     shown = expected[np.isfinite(expected)]
     if isinstance(pattern, PointPattern):
         shown = np.append(shown, pattern.points[:, 0])
-    largest = float(shown.max(initial=0.0))
-    unit = 10.0 ** np.floor(np.log10(max(largest, 1e-6)))
-    return 0.0, float(unit * np.ceil(1.05 * largest / unit)) if largest > 0 else 1.0
+    # whole steps, so that the scale stands still while the body moves within one
+    step = _round_number(4 * body.radius)
+    if not shown.size:
+        return 0.0, step
+    margin = 0.05 * step
+    first = np.floor((shown.min() - margin) / step)
+    return float(step * first), float(step * np.ceil((shown.max() + margin) / step))
+
+
+def _round_number(least: float) -> float:
+    """1, 2 or 5 times a power of ten, no less than a positive number."""
+    unit = float(10.0 ** np.floor(np.log10(least)))
+    return unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= least)
 
 
 def _ticks(low: float, high: float) -> Floats:
     """Round numbers between two ends."""
-    rough = (high - low) / _TICKS
-    unit = 10.0 ** np.floor(np.log10(rough))
-    step = unit * next(factor for factor in (1, 2, 5, 10) if factor * unit >= rough)
+    step = _round_number((high - low) / _TICKS)
     first = np.ceil(low / step - 1e-9)
     return np.asarray(step * np.arange(int(first), int(np.floor(high / step + 1e-9)) + 1))
 
