@@ -308,6 +308,8 @@ def test_the_report_holds_the_figures_as_json_and_as_an_aligned_table() -> None:
     rotation = next(text for text in table if text.startswith("rotation"))
     assert len(header) == len(rotation)
     assert rotation.split()[-1] == "1"  # the worst frame
+    said = next(text for text in table if text.startswith("rotation and position count"))
+    assert "the ambiguous frame, too" in said
 
 
 def test_one_is_told_as_one() -> None:

@@ -61,6 +61,12 @@ def as_table(evaluation: Evaluation) -> str:
             f"{'do' if many else 'does'} not count"
         )
     lines += ["", *_spread_lines(evaluation, unit), *_axis_lines(evaluation, unit)]
+    if evaluation.best_rotation_deg is not None:
+        lines += [
+            "",
+            f"rotation and position count the ambiguous frame{'s' * (evaluation.ambiguous != 1)}, "
+            "too; best hypothesis: of each of these, the pose nearest to the truth",
+        ]
     nees = evaluation.nees
     if nees is None:
         lines += ["", "covariance: no frame that is ok has one"]
