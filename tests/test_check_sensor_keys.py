@@ -53,7 +53,7 @@ def test_ranges_with_the_width_of_pixels_are_doubted() -> None:
     ranges = load_session(SYNTHETIC / "range_profiles" / "session.toml")
     wide = [replace(s, extract=replace(s.extract, sigma=500.0)) for s in ranges.sensors]
     (warning,) = key_warnings(replace(ranges, sensors=tuple(wide)))
-    assert warning.startswith("sensor 'front', 'side', 'top': sigma = 500 mm in [extract] is wider")
+    assert warning.startswith("sensor 'front' and 2 more: sigma = 500 mm in [extract] is wider")
 
 
 def test_directions_that_sensors_in_one_plane_do_not_see_are_named(

@@ -48,9 +48,10 @@ def _too_wide(session: Session) -> list[str]:
     ]
     if not names:
         return []
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
     sigma = max(s.extract.sigma for s in session.sensors if isinstance(s.sensor, RangeSensor))
     return [
-        f"sensor {', '.join(names)}: sigma = {sigma:g} {session.unit} in [extract] is wider than "
+        f"sensor {names[0]}{more}: sigma = {sigma:g} {session.unit} in [extract] is wider than "
         f"the body, whose features lie within {session.body.radius:.2g} {session.unit}: set it to "
         "about what ranges err by"
     ]
