@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import cv2
@@ -111,6 +112,7 @@ def file_storage(path: Path, **nodes: int | Floats) -> None:
         ("K", "D"),
         ("M", "dist_coeffs"),
         ("cameraMatrix", "distCoeffs"),
+        ("mtx", "dist"),
     ],
 )
 def test_opencv_files_of_every_dialect_and_usual_name(
@@ -318,3 +320,11 @@ def test_a_calibration_that_is_not_text(tmp_path: Path) -> None:
     assert "c.yml: not UTF-8" in message_of(tmp_path, 'calibration = "c.yml"')
     (tmp_path / "folder").mkdir()
     assert "cannot read" in message_of(tmp_path, 'calibration = "folder"')
+
+
+def test_arrays_saved_by_numpy_are_told_where_to_go(tmp_path: Path) -> None:
+    np.savez(tmp_path / "c.npz", mtx=np.eye(3), dist=np.zeros((1, 5)))
+    message = message_of(tmp_path, 'calibration = "c.npz"')
+    assert "c.npz: a NumPy or pickle file; write camera matrix and distortion with" in message
+    (tmp_path / "c.p").write_bytes(pickle.dumps({"mtx": [[1.0]]}))
+    assert "c.p: a NumPy or pickle file" in message_of(tmp_path, 'calibration = "c.p"')

@@ -17,6 +17,9 @@ from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.schema_sensors import CalibrationTable
 from mixpose.session.text_files import as_text, read_bytes
 
+# how a NumPy array, an archive of them, and a pickle of Python begin
+_NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
+
 
 def read_calibration(wanted: CalibrationTable, folder: Path, model: CameraModel) -> Intrinsics:
     """Read the camera that a session names.
@@ -43,6 +46,11 @@ def read_calibration(wanted: CalibrationTable, folder: Path, model: CameraModel)
     """
     content = read_bytes(folder / wanted.file)
     with in_file(wanted.file):
+        if content.startswith(_NO_TEXT):
+            raise BadKeyError(
+                "a NumPy or pickle file; write camera matrix and distortion with cv2.FileStorage, "
+                "or as numbers into camera_matrix and distortion in place of calibration"
+            )
         intrinsics = _read(as_text(content), wanted, model)
         if intrinsics.model not in (None, model):
             raise BadKeyError(

@@ -13,13 +13,14 @@ from mixpose.session.messages import BadKeyError, nearest, under
 from mixpose.session.schema_sensors import CalibrationTable
 
 # What OpenCV's samples and common calibration programs call their nodes, tried in order.
-MATRIX_NODES = ("camera_matrix", "Camera_Matrix", "K", "M", "cameraMatrix")
+MATRIX_NODES = ("camera_matrix", "Camera_Matrix", "K", "M", "cameraMatrix", "mtx")
 DISTORTION_NODES = (
     "distortion_coefficients",
     "Distortion_Coefficients",
     "D",
     "dist_coeffs",
     "distCoeffs",
+    "dist",
 )
 _SIZE_NODES = (("image_width", "image_height"), ("image_Width", "image_Height"))
 
