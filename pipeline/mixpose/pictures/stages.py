@@ -111,7 +111,8 @@ def densities_picture(
         grey = np.round(255 * np.sqrt(share)).astype(np.uint8)
         panel = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
         panels.append(_titled(panel, f"g, σ = {sigma:.3g} px"))
-    return in_grid(panels, columns)
+    rows = -(-len(panels) // columns)
+    return in_grid(panels, -(-len(panels) // rows))  # five are three and two, not four and one
 
 
 def _sampled(density: Density, part: Part, size: Size) -> NDArray[np.float32]:
