@@ -113,3 +113,13 @@ def test_the_shell_completes_commands_and_options() -> None:
     assert "check" in completed("mixpose ch")
     assert "--quick" in completed("mixpose check --")
     assert completed("mixpose run s.toml --format ") == ["jsonl", "csv", "tum", "bop", "ros"]
+
+
+def test_a_finished_run_that_is_resumed_says_that_nothing_was_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ["run", SESSION, "-o", str(tmp_path / "p.jsonl"), "--stop", "2"]
+    said(capsys, 0, *run)
+    written = (tmp_path / "p.jsonl").read_bytes()
+    assert "nothing was left to do" in said(capsys, 0, *run, "--resume")
+    assert (tmp_path / "p.jsonl").read_bytes() == written

@@ -203,3 +203,10 @@ def test_tiles_of_a_grid_pattern_are_sums_over_its_points(m: int) -> None:
     assert sampled[:, 0] == pytest.approx(C, rel=1e-5)
     assert sampled[:, 1:] == pytest.approx(slope, abs=1e-5 * C.max())
     assert second == pytest.approx(bend, abs=1e-5 * C.max())
+
+
+def test_a_profile_that_lies_below_zero_is_empty() -> None:
+    noise = -np.ones((1, 50), dtype=np.float32)
+    assert Observation(GridPattern(noise, np.zeros(1), 1.0), 2.0).is_empty
+    noise[0, 20] = 100.0
+    assert not Observation(GridPattern(noise, np.zeros(1), 1.0), 2.0).is_empty

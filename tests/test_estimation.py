@@ -272,3 +272,17 @@ def test_assessment_tells_hidden_from_met(body: Body, pinhole_cameras: list[Pinh
         # six of eight features met, six of eight detections explained: (6/8)²
         assert report.explained == pytest.approx((6 / 8) ** 2, abs=0.02)
         assert report.rms == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_body_on_one_line_is_never_sure_as_its_turn_about_it_is_open(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    places = ((0.0, 0.0, 0.0), (50.0, 0.0, 0.0), (90.0, 0.0, 0.0))
+    wand = Body("wand", tuple(PointFeature(np.array(place)) for place in places))
+    estimate = estimate_pose(detect(pinhole_cameras, wand, TRUTH), wand, TRUTH)
+    assert estimate.status == "ambiguous"
+    assert estimate.T_world_object is not None
+    # everything else of the pose is right: detections are exact
+    np.testing.assert_allclose(
+        transform(estimate.T_world_object, wand.means), transform(TRUTH, wand.means), atol=1e-3
+    )

@@ -145,3 +145,24 @@ def test_long_table_is_not_held_in_memory(tmp_path: Path) -> None:
     tracemalloc.stop()
     assert count == 5000
     assert peak < 200_000  # 20000 rows held as lists of cells would take 5 MB
+
+
+@pytest.mark.parametrize(
+    ("row", "fault"),
+    [
+        ("0,1e300,2,1", "u: found 1e.300, allowed is at most 1e.12"),
+        ("0,1,2,1e308", "weight: found 1e.308, allowed is at most 1e.12"),
+        ("0,1,2,1e-320", "weight: found 9.99.*e-321, allowed is 0, or at least 1e-12"),
+        ("0,1,2,-1", "weight: found -1, allowed is 0 or more"),
+    ],
+)
+def test_numbers_that_cannot_be_reckoned_with_are_told(
+    tmp_path: Path, row: str, fault: str
+) -> None:
+    with pytest.raises(RecordingError, match=f"line 2: {fault}"):
+        list(table(tmp_path, f"frame,u,v,weight\n{row}\n").frames())
+
+
+def test_frames_may_be_numbered_by_nanoseconds(tmp_path: Path) -> None:
+    (frame,) = table(tmp_path, "frame,u,v\n1700000000000000000,1,2\n").frames()
+    assert frame.number == 1_700_000_000_000_000_000

@@ -232,6 +232,8 @@ def test_decoders_print_nothing_about_broken_files(tmp_path: Path) -> None:
     videos = [write_video(tmp_path / name, codec) for name, codec in CONTAINERS]
     for path in videos:
         truncate(path, 0.6)
+    (tmp_path / "stub.avi").write_bytes(videos[0].read_bytes()[:300])  # within its headers
+    videos.append(tmp_path / "stub.avi")
     images = [tmp_path / "f1.png", tmp_path / "f2.jpg", tmp_path / "f3.bmp"]
     for path in images:
         cv2.imwrite(str(path), np.zeros((90, 90), np.uint8))

@@ -100,6 +100,13 @@ CORRELATED[0, 1] = CORRELATED[1, 0] = 1.5
         ({**MINIMAL, "T_world_object": EYE[:3]}, ":2: T_world_object is .*at least 4 items"),
         ({**MINIMAL, "T_world_object": BAD_MATRIX}, ":2: T_world_object is not a rotation"),
         ({**MINIMAL, "T_world_object": [[1e300] * 4] * 4}, ":2: T_world_object is not a rotation"),
+        (
+            {
+                **MINIMAL,
+                "T_world_object": [[1, 0, 0, 1e300], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+            },
+            ":2: T_world_object holds 1e.300; allowed is at most 1e.100",
+        ),
         ({**MINIMAL, "covariance": NEGATIVE}, ":2: covariance is not symmetric and positive"),
         ({**MINIMAL, "covariance": TINY_NEGATIVE}, ":2: covariance is not symmetric and positive"),
         ({**MINIMAL, "covariance": CORRELATED.tolist()}, ":2: covariance is not symmetric"),

@@ -58,3 +58,12 @@ def test_impossible_triangles_have_no_solution() -> None:
     found, which = depths(lines[:, :, None], np.array([[1.0], [1.0], [100.0]]))
     assert found.shape == (3, 0)
     assert len(which) == 0
+
+
+def test_triangles_of_which_corners_are_at_one_place_are_aligned_by_a_rotation() -> None:
+    corner, other = np.array([3.0, -2.0, 7.0]), np.array([40.0, 5.0, 1.0])
+    for three in ((corner, corner, other), (corner, other, corner), (corner, corner, corner)):
+        triangle = np.stack(three)[:, :, None]
+        (T,) = align_triples(triangle, triangle + 10.0)
+        # no direction of the plane is given, but it must be a rotation all the same
+        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)

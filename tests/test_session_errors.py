@@ -340,6 +340,40 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"sonar_keys": "position = [1, 2, 3]\nresolution = [1, 1]"},
         ['sensor["sonar"].resolution: unknown key', "model pinhole or fisheye"],
     ),
+    # finite, but beyond what can be reckoned with
+    (
+        {"extract": "[extract]\nsigma = 1e-300"},
+        ["extract.sigma: found 1e-300", "greater than 0", "the smallest is 1e-12"],
+    ),
+    (
+        {"extract": "[extract]\nsigma = 1e99"},
+        ["extract.sigma: found 1e+99", "the largest number is 1e+12"],
+    ),
+    ({"extract": "[extract]\nsigma = 5000"}, ["extract.sigma: found 5000", "at most 1000 px"]),
+    (
+        {"extract": "[extract]\nspot_sigma = 5000"},
+        ["extract.spot_sigma: found 5000", "at most 1000 px"],
+    ),
+    (
+        {"sonar_keys": "position = [0, 1e99, 0]"},
+        ['sensor["sonar"].position[1]: found 1e+99', "the largest number is 1e+12"],
+    ),
+    (
+        {"sonar_keys": "position = [1, 2, 3]\nrange_min = 1\nbin_size = 1e-7"},
+        ['sensor["sonar"].extract.sigma: found 1.5', "at most 100000 times bin_size"],
+    ),
+    (
+        {"sonar_keys": "position = [1, 2, 3]\nrange_min = 1\nbin_size = 1e5"},
+        ['sensor["sonar"].extract.sigma: found 1.5 with bin_size = 100000', "a 1000th of bin_size"],
+    ),
+    (
+        {"estimator": "[estimator]\nsamples = 100000000000"},
+        ["estimator.samples: found 100000000000", "at most 1000000"],
+    ),
+    (
+        {"points": "points = [[0, 0, 0], [0, 0, 0], [50, 0, 0], [50, 0, 0]]"},
+        ["object.points: found 4 features at 2 places", "at least three"],
+    ),
 ]
 
 

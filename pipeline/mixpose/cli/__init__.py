@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
 
 WRONG_USAGE = 2
 INTERRUPTED = 130
@@ -13,9 +18,46 @@ INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit status.
 
-    Errors that a user can mend are one line on standard error; ``--debug`` shows the traceback.
+    Errors that a user can mend are one line on standard error; ``--debug`` shows the traceback
+    before it.  A request to end (SIGTERM, SIGHUP) is taken like an interrupt from the keyboard.
     """
-    sys.exit(_status(list(sys.argv[1:] if arguments is None else arguments)))
+    _replace_closed_streams()
+    try:
+        with _ended_like_interrupted():
+            status = _status(list(sys.argv[1:] if arguments is None else arguments))
+    except KeyboardInterrupt:  # while the commands were being imported
+        status = _interrupted()
+    sys.exit(status)
+
+
+def _replace_closed_streams() -> None:
+    """Put something in the place of streams that whoever started this has closed.
+
+    Messages then go nowhere, rather than to standard output; poses cannot be written.
+    """
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115
+
+
+@contextmanager
+def _ended_like_interrupted() -> Iterator[None]:
+    """Let requests to end finish what is open, as an interrupt does; ignored ones stay so."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
+    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
+    taken = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _status(arguments: list[str]) -> int:
@@ -34,30 +76,41 @@ def _status(arguments: list[str]) -> int:
             args=arguments, prog_name="mixpose", standalone_mode=False
         )
     except MixposeError as error:
-        if debug:
-            raise
+        _show_traceback(debug)
         return _fail(str(error), error.exit_status)
     except typer.TyperException as error:
-        if debug:
-            raise
+        _show_traceback(debug)
         from mixpose.cli.usage import usage_message  # noqa: PLC0415
 
         return _fail(usage_message(error, arguments), WRONG_USAGE)
     except (KeyboardInterrupt, typer.Abort):
         outcome = INTERRUPTED
-    except OSError as error:
-        if not isinstance(error, BrokenPipeError):
-            if debug:
-                raise
-            _drop_standard_output()
-            place = f"{error.filename}: " if error.filename else "output: "
-            return _fail(f"{place}cannot be written or read: {error.strerror}", WRONG_USAGE)
+    except SystemExit as error:
+        if not isinstance(error.__context__, BrokenPipeError):
+            raise
         # the reader of a pipe has seen enough; keep Python from complaining when it flushes
         _drop_standard_output()
         return 0
+    except OSError as error:
+        _show_traceback(debug)
+        _drop_standard_output()
+        place = f"{error.filename}: " if error.filename else "output: "
+        reason = error.strerror or str(error)
+        return _fail(f"{place}cannot be written or read: {reason}", WRONG_USAGE)
     if outcome == INTERRUPTED:  # which is also what typer makes of a keyboard interrupt
-        return _fail("interrupted; everything so far is written", INTERRUPTED)
+        return _interrupted()
     return outcome if isinstance(outcome, int) else 0
+
+
+def _interrupted() -> int:
+    return _fail("interrupted; everything so far is written", INTERRUPTED)
+
+
+def _show_traceback(wanted: bool) -> None:
+    if wanted:
+        import traceback  # noqa: PLC0415
+
+        traceback.print_exc()
 
 
 def _drop_standard_output() -> None:
@@ -67,5 +120,6 @@ def _drop_standard_output() -> None:
 
 def _fail(message: str, status: int) -> int:
     line = " ".join(message.split())
-    print(f"mixpose: {line}", file=sys.stderr)
+    with suppress(OSError):  # the status still tells
+        print(f"mixpose: {line}", file=sys.stderr, flush=True)
     return status

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mixpose import __version__
-from mixpose.cli.notices import warn
+from mixpose.cli.notices import say, warn
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
@@ -75,7 +74,7 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
         _write(poses, lines, name, request)
     if request.output is not None:
         count = f"{len(lines)} pose{'s' * (len(lines) != 1)}"
-        print(f"mixpose: {count} -> {request.output}", file=sys.stderr)
+        say(f"{count} -> {request.output}")
 
 
 def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:

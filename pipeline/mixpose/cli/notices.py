@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections import Counter, deque
 from collections.abc import Mapping
+from contextlib import suppress
 from statistics import median
 
 from mixpose.frames import Source
@@ -21,9 +22,15 @@ _FAR_OFF = 0.5
 _REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
 
 
+def say(message: str) -> None:
+    """Say something on standard error; that nobody can be told stops no work."""
+    with suppress(OSError):
+        print(f"mixpose: {message}", file=sys.stderr, flush=True)
+
+
 def warn(message: str) -> None:
     """Say something that does not stop the work but should be looked at."""
-    print(f"mixpose: warning: {' '.join(message.split())}", file=sys.stderr)
+    say(f"warning: {' '.join(message.split())}")
 
 
 def warn_of_sources(sources: Mapping[str, Source]) -> None:
@@ -98,7 +105,7 @@ class Summary:
             warn(warning)
         if self.statuses["lost"] == sum(self.statuses.values()):
             warn("every frame is lost: try mixpose check, then [start] and [extract]")
-        print(f"mixpose: {self.text()}{where}", file=sys.stderr)
+        say(f"{self.text()}{where}")
 
     def warnings(self) -> list[str]:
         """What is most likely wrong with the geometry, once for each sensor at most."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from mixpose import __version__
+from mixpose.cli.notices import say
 from mixpose.cli.output import open_text, refuse_to_overwrite_but
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
@@ -34,4 +34,4 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
     except OSError as error:
         raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
     count = len(poses.poses)
-    print(f"mixpose: {count} frame{'s' * (count != 1)} -> {output}", file=sys.stderr)
+    say(f"{count} frame{'s' * (count != 1)} -> {output}")

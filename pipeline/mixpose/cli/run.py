@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.notices import Summary, warn_of_sources
+from mixpose.cli.notices import Summary, say, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -67,6 +67,9 @@ def run_session(path: Path, request: RunRequest) -> None:
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
             summary.add(estimate)
+    if resumed and not summary.statuses:
+        say(f"--resume: {request.output} has all frames asked for already, nothing was left to do")
+        return
     written = [str(path) for path in (request.output, request.overlay) if path is not None]
     summary.say(f" -> {', '.join(written)}" if written else "", resumed=resumed)
 

@@ -11,11 +11,9 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 
 from mixpose.cli.run import RunRequest
 from mixpose.errors import SessionError
@@ -62,7 +60,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
         for session, output in zip(sessions, outputs, strict=True)
     ]
     running = _Processes(_threads_each(workers))
-    with _terminated_like_interrupted(), ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         try:
             return max(pool.map(running.run, sessions, commands))
         except KeyboardInterrupt:
@@ -171,17 +169,3 @@ class _Processes:
             for process in self._running:
                 if sys.platform != "win32":  # there the keyboard reaches all by itself
                     process.send_signal(signal.SIGINT)
-
-
-@contextmanager
-def _terminated_like_interrupted() -> Iterator[None]:
-    """See to it that a request to end stops the processes as well."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -69,12 +69,13 @@ class Observation:
             return int(self.pattern.points.shape[1])
         return len(self.pattern.origin)
 
-    @property
+    @cached_property
     def is_empty(self) -> bool:
         """Whether the sensor saw no feature at all."""
         if isinstance(self.pattern, PointPattern):
             return len(self.pattern.points) == 0 or not self.pattern.weights.sum() > 0
-        return not self.pattern.values.any()
+        # a profile of noise may lie below zero as a whole: it has no density
+        return not self.pattern.values.sum(dtype=np.float64) > 0
 
     @cached_property
     def extent(self) -> tuple[Floats, Floats]:

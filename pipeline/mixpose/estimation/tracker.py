@@ -60,6 +60,8 @@ RIVAL = 0.01
 WIDEST_TURN_DEG = 15.0
 """95 % bound on the turn about any axis, above which ranges leave a frame ambiguous."""
 
+_OPEN_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of a turn of which nothing is known
+
 CONVINCING = 0.75
 """Share of the body that must be met for the prediction to be taken without looking elsewhere."""
 
@@ -163,7 +165,7 @@ class Tracker:
         # what is not possible by itself still casts doubt on the others
         rivals = [weight for one, weight in zip(rated, weights, strict=True) if one is not best]
         clear = self._sure(best) and max(rivals, default=0.0) < RIVAL
-        clear = clear and self._is_turned_surely(best)
+        clear = clear and self._is_turned_surely(best) and _is_determined(best)
         kept = [
             Found(one.T_world_object, w, one.spread if self.options.fuse else None)
             for one, w in zip(rated, weights, strict=True)
@@ -368,6 +370,12 @@ class Tracker:
         apart = float(np.linalg.norm((T_a - T_b) @ centre))
         near = apart < _SAME_DISTANCE_SHARE * self.body.radius
         return near and float(rotation_angle_deg(T_a, T_b)) < _SAME_ROTATION_DEG
+
+
+def _is_determined(rated: Rated) -> bool:
+    """Whether no turn is left open, as about the line that all features met lie on."""
+    turns = np.linalg.eigvalsh(rated.assessment.covariance[3:, 3:])
+    return bool(turns.max() < _OPEN_TURN**2)
 
 
 def beliefs(rated: Sequence[Rated]) -> list[float]:

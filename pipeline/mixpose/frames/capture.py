@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from mixpose.errors import RecordingError
+from mixpose.frames.containers import container_of
 from mixpose.frames.quiet import quieten_opencv
 from mixpose.records import Image
 
@@ -84,11 +85,20 @@ def _capture(address: str | int, stack: contextlib.ExitStack) -> cv2.VideoCaptur
     if is_pipe(address):
         address = f"pipe:{_reading_end(address, stack)}"
     elif "://" not in address:
-        return cv2.VideoCapture(address)
+        return cv2.VideoCapture(address, _backend_for(address))
     patience_ms = int(1000 * PATIENCE_S)
     limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, patience_ms]
     limits += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, patience_ms]
     return cv2.VideoCapture(address, cv2.CAP_FFMPEG, limits)
+
+
+def _backend_for(address: str) -> int:
+    """What reads a file: FFmpeg alone for AVI, as OpenCV's own reader of these prints faults."""
+    has_ffmpeg = cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG)
+    with contextlib.suppress(OSError):
+        if has_ffmpeg and Path(address).is_file() and container_of(Path(address)) == "avi":
+            return int(cv2.CAP_FFMPEG)
+    return int(cv2.CAP_ANY)
 
 
 def _reading_end(path: str, stack: contextlib.ExitStack) -> int:

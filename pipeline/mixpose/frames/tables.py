@@ -22,6 +22,10 @@ from mixpose.records import Floats, PointPattern, RawFrame
 
 _COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
 
+# Squares of larger numbers, and shares of smaller weights, can't be reckoned with.
+_LARGEST = 1e12
+_SMALLEST_WEIGHT = 1e-12
+
 # Frame number or time, line in the file, cells.
 _Row: TypeAlias = tuple[float, int, list[str]]
 
@@ -120,9 +124,11 @@ class DetectionTable:
             self._complain(group)
         points = values[:, [self.columns.index(name) for name in self.coordinates]]
         weights = self._column("weight", values)
+        if max(np.abs(points).max(), 0 if weights is None else weights.max()) > _LARGEST:
+            self._complain(group)
         if weights is None:
             pattern = PointPattern(points, np.ones(len(points)))
-        elif (weights < 0).any():
+        elif ((weights != 0) & (weights < _SMALLEST_WEIGHT)).any():
             self._complain(group)
         else:
             pattern = PointPattern(points[weights > 0], weights[weights > 0])
@@ -140,9 +146,14 @@ class DetectionTable:
         for _, line, cells in rows:
             for name, cell in zip(self.columns, cells, strict=True):
                 value = finite(cell, self.path, line, name)
-                if name == "weight" and value < 0:
+                fault = None
+                if abs(value) > _LARGEST and name in (*self.coordinates, "weight"):
+                    fault = f"at most {_LARGEST:g}"
+                elif name == "weight" and value != 0 and value < _SMALLEST_WEIGHT:
+                    fault = "0 or more" if value < 0 else f"0, or at least {_SMALLEST_WEIGHT:g}"
+                if fault:
                     raise RecordingError(
-                        f"{self.path}, line {line}: weight: found {value:g}, allowed is 0 or more"
+                        f"{self.path}, line {line}: {name}: found {value:g}, allowed is {fault}"
                     )
         raise AssertionError("complained about rows that are as they should be")
 

@@ -16,6 +16,7 @@ from mixpose.records import Floats, Hypothesis, SensorReport, Status
 
 # Files by other people round their rotations to a few digits.
 RIGID_TOLERANCE = 1e-3
+_LARGEST = 1e100  # squares of larger lengths would overflow
 
 
 @dataclass(frozen=True)
@@ -177,6 +178,8 @@ def _motion(matrix: list[list[float]], what: str) -> Floats:
         is_motion = rigid.is_rigid(T, RIGID_TOLERANCE)
     if not is_motion:
         raise RecordingError(f"{what} is not a rotation and a translation within {RIGID_TOLERANCE}")
+    if np.abs(T).max() > _LARGEST:
+        raise RecordingError(f"{what} holds {np.abs(T).max():g}; allowed is at most {_LARGEST:g}")
     return T
 
 

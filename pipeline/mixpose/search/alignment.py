@@ -36,7 +36,9 @@ def align_triples(body: Floats, world: Floats) -> Floats:
         ax, ay, bx, by = _dot(a, x_body), _dot(a, y_body), _dot(b, x_world), _dot(b, y_world)
         sine += ax * by - ay * bx
         cosine += ax * bx + ay * by
-    length = np.maximum(np.hypot(sine, cosine), _TINY)
+    length = np.hypot(sine, cosine)
+    undirected = length < _TINY
+    cosine[undirected], length[undirected] = 1.0, 1.0  # all at one place: no turn is better
     c, s = cosine / length, sine / length
     turned_x, turned_y = c * x_body - s * y_body, s * x_body + c * y_body
     T = np.zeros((body.shape[2], 4, 4))
@@ -53,6 +55,9 @@ def align_triples(body: Floats, world: Floats) -> Floats:
 def _frames(triangles: Floats) -> tuple[Floats, Floats, Floats]:
     """Orthonormal axes (3, K each): along the first side, in the plane, across it."""
     x = _unit(triangles[1] - triangles[0])
+    empty = ~x.any(axis=0)
+    if empty.any():  # two at one place: any direction
+        x = np.where(empty, np.array([[1.0], [0.0], [0.0]]), x)
     second = triangles[2] - triangles[0]
     across = cross(x, second)
     flat = _dot(across, across) <= _FLAT**2 * _dot(second, second)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -11,7 +12,8 @@ from mixpose.session.messages import BadKeyError, found
 
 RESOLUTION_FORM = "[width, height], two positive integers"
 
-LARGEST = 1e100  # squares and products of larger numbers would overflow to infinity unseen
+LARGEST = 1e12  # powers of larger numbers would overflow to infinity unseen
+SMALLEST = 1e-12  # of what must be greater than 0; powers of smaller ones would come to 0
 _WIDEST = 1_000_000  # px; more than any image library reads
 
 
@@ -20,6 +22,16 @@ def is_number(value: object) -> TypeGuard[int | float]:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64
+
+
+def limits(value: object) -> str:
+    """What to say where a number is beyond the limits that all numbers have; else nothing."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if LARGEST < abs(value) < math.inf:
+            return f"; the largest number is {LARGEST:g}"
+        if 0 < value < SMALLEST:
+            return f"; the smallest is {SMALLEST:g}"
+    return ""
 
 
 def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
@@ -45,7 +57,9 @@ def numbers(value: Any, shape: tuple[int | None, ...], allowed: str) -> Floats:
     """
     if not shape:
         if not is_number(value):
-            raise BadKeyError(found(value, f"a finite number, as part of {allowed}"))
+            raise BadKeyError(
+                found(value, f"a finite number, as part of {allowed}") + limits(value)
+            )
         return np.float64(value)  # type: ignore[return-value]
     length, inner = shape[0], shape[1:]
     if not isinstance(value, list) or not value or (length is not None and len(value) != length):

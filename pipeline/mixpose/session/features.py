@@ -52,6 +52,13 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
             raise BadKeyError(
                 "found a segment without length; allowed: two different ends", "segments", i
             )
+    places = len(np.unique(np.concatenate([points, segments.mean(axis=1)]), axis=0))
+    if places < FEWEST_FEATURES:
+        raise BadKeyError(
+            f"found {count} features at {places} place{'s' * (places != 1)}; allowed: at least "
+            "three features at places of their own",
+            "file" if table.file is not None else "points",
+        )
     spreads = _spreads(table, markers, count)
     kind = table.spread
     features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]

@@ -15,7 +15,7 @@ from mixpose.body import Spread
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.session.messages import one_of
-from mixpose.session.schema_common import ExtractTable, Number, Placement, Table, Text
+from mixpose.session.schema_common import ExtractTable, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
 from mixpose.session.values import FREE_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
@@ -29,7 +29,7 @@ class GravityTable(Table):
 
     Example: `direction = [0, 0, -1]`
     """
-    sigma: Annotated[Number, Field(gt=0, description="a length greater than 0")]
+    sigma: Annotated[Positive, Field(description="a length greater than 0")]
     """Standard deviation of the displacement along it, in `unit`.
 
     Example: `sigma = 2.0`
@@ -114,15 +114,15 @@ class StartTable(Placement):
     Example: `euler_xyz_deg = [0, 0, 45]`
     """
     rotation_deg: Annotated[
-        Number | None,
-        Field(gt=0, le=180, description="half-width in degrees, greater than 0, at most 180"),
+        Positive | None,
+        Field(le=180, description="half-width in degrees, greater than 0, at most 180"),
     ] = None
     """How far the orientation may be off; where it is left out, 5 degrees.
 
     Example: `rotation_deg = 10`
     """
     distance: Annotated[
-        Number | None, Field(gt=0, description="half-width, a length greater than 0")
+        Positive | None, Field(description="half-width, a length greater than 0")
     ] = None
     """How far the position may be off, in `unit`; where it is left out, a tenth of the body's
     radius.
@@ -149,7 +149,9 @@ class EstimatorTable(Table):
 
     Example: `free = ["x", "y", "rz"]`
     """
-    samples: Annotated[int, Field(ge=2, description="an integer of at least 2")] = 1000
+    samples: Annotated[
+        int, Field(ge=2, le=1_000_000, description="an integer of at least 2, at most 1000000")
+    ] = 1000
     """Samples per feature where its density is integrated by sampling; an exact body needs none.
 
     Example: `samples = 4000`

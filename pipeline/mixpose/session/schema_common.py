@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
 from mixpose.rigid import Floats
-from mixpose.session.arrays import LARGEST
+from mixpose.session.arrays import LARGEST, SMALLEST
 from mixpose.session.values import (
     METHOD_ALLOWED,
     THRESHOLD_ALLOWED,
@@ -21,6 +21,7 @@ from mixpose.session.values import (
 
 Text: TypeAlias = Annotated[str, Field(min_length=1, description="text that is not empty")]
 Number: TypeAlias = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Positive: TypeAlias = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 
 class Table(BaseModel):
@@ -93,15 +94,15 @@ class ExtractTable(Table):
     Example: `min_area = 20`
     """
     max_area: Annotated[
-        Number | None, Field(gt=0, description="an area in px, greater than min_area")
+        Positive | None, Field(description="an area in px, greater than min_area")
     ] = None
     """Blobs larger than this, in px, are no features; left out: there is no limit.
 
     Example: `max_area = 500`
     """
     sigma: Annotated[
-        Number | None,
-        Field(gt=0, description="greater than 0: px for cameras, a length for lateration"),
+        Positive | None,
+        Field(description="greater than 0: px for cameras, a length for lateration"),
     ] = None
     """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
     a predicted and a found feature draw each other in the final fit. For ranges set it to what they

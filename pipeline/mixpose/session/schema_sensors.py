@@ -13,7 +13,7 @@ from mixpose.rigid import Floats
 from mixpose.session.arrays import RESOLUTION_FORM
 from mixpose.session.arrays import resolution as resolution_of
 from mixpose.session.intrinsics import MATRIX_FORM
-from mixpose.session.schema_common import ExtractTable, Number, Placement, Table, Text
+from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
 from mixpose.session.values import (
     SOURCE_ALLOWED,
     ArrayOf,
@@ -82,9 +82,7 @@ class SensorTable(Table):
 
     Example: `times = "times.csv"`
     """
-    fps: Annotated[Number | None, Field(gt=0, description="frames per second, greater than 0")] = (
-        None
-    )
+    fps: Annotated[Positive | None, Field(description="frames per second, greater than 0")] = None
     """Frames per second, in place of `times`: frame n is taken at n / fps seconds.
 
     Example: `fps = 25`
@@ -156,7 +154,7 @@ class ParallelTable(PlacedTable):
 
     Example: `model = "parallel"`
     """
-    pixel_size: Annotated[Number, Field(gt=0, description="length per px, a number greater than 0")]
+    pixel_size: Annotated[Positive, Field(description="length per px, a number greater than 0")]
     """Length in the world, in `unit`, that one px shows.
 
     Example: `pixel_size = 0.5`
@@ -196,7 +194,7 @@ class LaterationTable(SensorTable):
     Example: `range_min = 700`
     """
     bin_size: Annotated[
-        Number | None, Field(gt=0, description="a length greater than 0: from bin to bin")
+        Positive | None, Field(description="a length greater than 0: from bin to bin")
     ] = None
     """For range profiles: length from one bin to the next, in `unit`.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,10 @@ from mixpose.session.schema_sensors import (
     PlacedTable,
 )
 from mixpose.session.setup import SensorSetup
+
+_WIDEST_PX = 1000
+_WIDEST_BINS = 100_000
+_NARROWEST = 1000  # of a bin
 
 
 def build_sensors(
@@ -111,6 +116,7 @@ def _build_sensor(table: AnySensorTable, defaults: ExtractTable, folder: Path) -
             sensor = RangeSensor(table.position, table.range_bias)
     with under("extract"):
         extract = merge_extract(defaults, table.extract)
+        _check_widths(extract, table)
         if not isinstance(table, LaterationTable):
             _check_extraction(extract)
     return SensorSetup(
@@ -153,6 +159,26 @@ def _intrinsics(table: CameraTable, folder: Path) -> Intrinsics:
         K = camera_matrix(table.camera_matrix.tolist())
     with under("distortion"):
         return Intrinsics(K, distortion(table.distortion, table.model))
+
+
+def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
+    """A density is as wide as its widths: without limits it would outgrow all memory."""
+    if not isinstance(table, LaterationTable):
+        most, text = float(_WIDEST_PX), f"at most {_WIDEST_PX} px"
+    elif table.bin_size is not None:
+        most, text = _WIDEST_BINS * table.bin_size, f"at most {_WIDEST_BINS} times bin_size"
+        width = math.hypot(extract.sigma, extract.spot_sigma)
+        if width < table.bin_size / _NARROWEST:
+            raise BadKeyError(
+                f"found {extract.sigma:g} with bin_size = {table.bin_size:g}; allowed: at least a "
+                f"{_NARROWEST}th of bin_size",
+                "sigma",
+            )
+    else:
+        return
+    for key in ("sigma", "spot_sigma"):
+        if getattr(extract, key) > most:
+            raise BadKeyError(f"found {getattr(extract, key):g}; allowed: {text}", key)
 
 
 def _T_sensor_world(table: PlacedTable) -> Floats:

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from mixpose.session.arrays import limits
 from mixpose.session.messages import BadKeyError, Key, did_you_mean, found, nearest, one_of
 
 _TAG = "model"  # the key that tells the kinds of sensor apart
@@ -59,6 +60,8 @@ def _problem(root: type[BaseModel], finding: ErrorDetails) -> BadKeyError:
         if isinstance(reason, BadKeyError):
             return BadKeyError(reason.text, *place.key, *reason.key)
     hint = did_you_mean(value, _literals(place.field)) if kind == "literal_error" else ""
+    if kind in ("greater_than_equal", "less_than_equal"):
+        hint = limits(value)
     return BadKeyError(found(value, allowed or finding["msg"]) + hint, *place.key)
 
 

@@ -1,0 +1,111 @@
+"""How a command ends when it is asked to, or when nobody reads what it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mixpose.cli import main
+
+SESSION = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
+MIXPOSE = f"{sys.executable} -m mixpose"
+
+needs_posix = pytest.mark.skipif(os.name == "nt", reason="signals and shells are POSIX's")
+
+
+def in_shell(command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["sh", "-c", command], capture_output=True, text=True, check=False)
+
+
+@needs_posix
+@pytest.mark.parametrize("request_to_end", [signal.SIGTERM, signal.SIGHUP])
+def test_a_request_to_end_finishes_the_video_as_an_interrupt_does(
+    tmp_path: Path, request_to_end: signal.Signals
+) -> None:
+    import cv2
+
+    poses, video = tmp_path / "poses.jsonl", tmp_path / "seen.mp4"
+    command = [sys.executable, "-m", "mixpose", "run", str(SESSION), "-o", str(poses)]
+    process = subprocess.Popen(
+        [*command, "--overlay", str(video)], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and not (poses.exists() and poses.stat().st_size > 3000):
+        time.sleep(0.02)
+    process.send_signal(request_to_end)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert stderr == "mixpose: interrupted; everything so far is written\n"
+    count = len(poses.read_text(encoding="utf-8").splitlines()) - 1
+    assert 0 < count < 40  # of 40: it was interrupted
+    # an MP4 that is not finished has no frame; the frame being written may be in one of the two
+    assert abs(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) - count) <= 1
+
+
+@needs_posix
+def test_a_run_that_ignores_hangups_goes_on_after_one(tmp_path: Path) -> None:
+    poses = tmp_path / "poses.jsonl"
+    command = f"trap '' HUP; exec {MIXPOSE} run {SESSION} -o {poses}"
+    process = subprocess.Popen(["sh", "-c", command], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline and not poses.exists():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGHUP)
+    process.communicate(timeout=30)
+    assert process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [(["run", "no.toml"], 2), (["run", "no.toml", "--foo"], 2), (["evaluate", "no", "no"], 3)],
+)
+def test_debug_adds_the_traceback_and_keeps_the_line_and_the_status(
+    arguments: list[str], status: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as plain:
+        main(arguments)
+    line = capsys.readouterr().err
+    with pytest.raises(SystemExit) as debugged:
+        main([*arguments, "--debug"])
+    said = capsys.readouterr().err
+    assert plain.value.code == debugged.value.code == status
+    assert said.startswith("Traceback")
+    assert said.endswith(line)
+
+
+@needs_posix
+def test_a_reader_that_has_seen_enough_gives_status_0() -> None:
+    result = in_shell(f"({MIXPOSE} run {SESSION}; echo $? >&2) | head -n 1")
+    assert json.loads(result.stdout)["type"] == "header"
+    assert result.stderr == "0\n"
+
+
+@needs_posix
+def test_messages_never_go_among_the_poses_where_standard_error_is_closed() -> None:
+    result = in_shell(f"{MIXPOSE} run {SESSION} --stop 1 2>&-")
+    assert result.returncode == 0
+    types = [json.loads(line)["type"] for line in result.stdout.splitlines()]
+    assert types == ["header", "pose"]
+
+
+@needs_posix
+@pytest.mark.parametrize("command", [f"run {SESSION} --stop 1", "schema"])
+def test_a_closed_standard_output_is_one_line(command: str) -> None:
+    result = in_shell(f"{MIXPOSE} {command} >&-")
+    assert result.returncode == 2
+    assert result.stderr == "mixpose: output: cannot be written or read: not writable\n"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_run_that_cannot_tell_how_it_went_still_writes_its_poses(tmp_path: Path) -> None:
+    poses = tmp_path / "poses.jsonl"
+    result = in_shell(f"{MIXPOSE} run {SESSION} --stop 2 -o {poses} 2>/dev/full")
+    assert result.returncode == 0
+    assert len(poses.read_text(encoding="utf-8").splitlines()) == 3
