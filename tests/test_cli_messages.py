@@ -89,7 +89,7 @@ def test_a_run_resumes_with_the_same_recording_only(
     assert len(poses.read_text(encoding="utf-8").splitlines()) == 4
     whole = poses.read_bytes()
     line = said(capsys, 0, *to_file, "3", "--resume", "--source", f"left={other}")
-    assert line == f"mixpose: nothing left to do -> {poses}\n"
+    assert line == f"mixpose: nothing left to do: {poses} has all frames asked for already\n"
     assert poses.read_bytes() == whole
 
 
@@ -121,5 +121,5 @@ def test_a_finished_run_that_is_resumed_says_that_nothing_was_left(
     run = ["run", SESSION, "-o", str(tmp_path / "p.jsonl"), "--stop", "2"]
     said(capsys, 0, *run)
     written = (tmp_path / "p.jsonl").read_bytes()
-    assert "nothing was left to do" in said(capsys, 0, *run, "--resume")
+    assert "nothing left to do" in said(capsys, 0, *run, "--resume")
     assert (tmp_path / "p.jsonl").read_bytes() == written

@@ -85,21 +85,10 @@ class Summary:
         parts = [f"{self.statuses[word]} {word}" for word in words if self.statuses[word]]
         return f"{count} frame{'s' * (count != 1)}: {', '.join(parts)}"
 
-    def say(self, where: str, *, resumed: bool = False) -> None:
-        """Print the line, and warn of sensors that took no part or fit badly.
-
-        Parameters
-        ----------
-        where : str
-            What was written, at the end of the line.
-        resumed : bool
-            Whether earlier frames stand in the output already.
-        """
+    def say(self, where: str) -> None:
+        """Print the line, and warn of sensors that took no part or fit badly."""
         if not sum(self.statuses.values()):
-            if resumed:
-                print(f"mixpose: nothing left to do{where}", file=sys.stderr)
-            else:
-                warn("no frame was estimated: the recording has none with the numbers asked for")
+            warn("no frame was estimated: the recording has none with the numbers asked for")
             return
         for warning in self.warnings():
             warn(warning)

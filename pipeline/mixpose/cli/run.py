@@ -68,10 +68,10 @@ def run_session(path: Path, request: RunRequest) -> None:
             output.write(estimate)
             summary.add(estimate)
     if resumed and not summary.statuses:
-        say(f"--resume: {request.output} has all frames asked for already, nothing was left to do")
+        say(f"nothing left to do: {request.output} has all frames asked for already")
         return
     written = [str(path) for path in (request.output, request.overlay) if path is not None]
-    summary.say(f" -> {', '.join(written)}" if written else "", resumed=resumed)
+    summary.say(f" -> {', '.join(written)}" if written else "")
 
 
 @contextmanager

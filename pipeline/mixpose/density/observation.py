@@ -74,8 +74,8 @@ class Observation:
         """Whether the sensor saw no feature at all."""
         if isinstance(self.pattern, PointPattern):
             return len(self.pattern.points) == 0 or not self.pattern.weights.sum() > 0
-        # a profile of noise may lie below zero as a whole: it has no density
-        return not self.pattern.values.sum(dtype=np.float64) > 0
+        # a profile that lies below zero as a whole has no density anywhere
+        return not self.pattern.values.max() > 0
 
     @cached_property
     def extent(self) -> tuple[Floats, Floats]:
