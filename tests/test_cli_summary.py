@@ -11,9 +11,10 @@ import pytest
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.cli.notices import Summary
-from mixpose.cli.run import RunRequest, run_session
+from mixpose.cli.request import RunRequest
+from mixpose.cli.run import run_session
 from mixpose.records import Estimate, SensorReport, Status
-from mixpose.runner import Selection
+from mixpose.selection import Selection
 from mixpose.session import Session, load_session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"

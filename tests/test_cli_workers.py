@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from mixpose.cli.run import RunRequest
+from mixpose.cli.request import RunRequest
 from mixpose.cli.several import run_sessions
 from mixpose.errors import SessionError
-from mixpose.runner import Selection
+from mixpose.selection import Selection
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 RANGES = SYNTHETIC / "range_profiles" / "session.toml"

@@ -24,7 +24,8 @@ from mixpose.pictures.finding import Finding, find
 from mixpose.pictures.signature import write_png
 from mixpose.pictures.slices import objective_around
 from mixpose.records import Estimate, PointPattern
-from mixpose.runner import Selection, begin, observe, open_sources, run
+from mixpose.runner import begin, observe, open_sources, run
+from mixpose.selection import Selection
 from mixpose.sensors import ParallelBeam
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"

@@ -33,7 +33,8 @@ from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours
 from mixpose.records import Estimate, FrameSet, PointPattern, SensorReport
 from mixpose.rigid import perturb, transform
-from mixpose.runner import Selection, run
+from mixpose.runner import run
+from mixpose.selection import Selection
 from mixpose.sensors import PinholeCamera, RangeSensor
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose.poses.jsonl import read_poses
 from mixpose.rigid import perturb, rotation_angle_deg
-from mixpose.runner import Selection
+from mixpose.selection import Selection
 
 Floats = NDArray[np.float64]
 

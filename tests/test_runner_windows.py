@@ -20,6 +20,7 @@ from mixpose.extraction import ExtractOptions, extract
 from mixpose.frames import Source
 from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
+from mixpose.selection import Selection
 from mixpose.session import Session
 
 Floats = NDArray[np.float64]
@@ -221,6 +222,6 @@ def test_windows_hold_the_features_however_the_body_may_have_moved(session: Sess
 
 def test_recordings_without_images_have_no_windows(windows: list[Any]) -> None:
     session = mixpose.load_session(SYNTHETIC / "range_profiles" / "session.toml")
-    selection = runner.Selection(0, 3)
+    selection = Selection(0, 3)
     assert [one.status for one in mixpose.run(session, selection=selection)] == ["ok"] * 3
     assert windows == []

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from mixpose.objective import View
     from mixpose.records import Estimate
     from mixpose.runner import run
+    from mixpose.selection import Selection
     from mixpose.session import Session, load_session
 
 _HOMES = {
@@ -31,6 +32,7 @@ _HOMES = {
     "PointFeature": "mixpose.body",
     "RecordingError": "mixpose.errors",
     "SegmentFeature": "mixpose.body",
+    "Selection": "mixpose.selection",
     "Session": "mixpose.session",
     "SessionError": "mixpose.errors",
     "View": "mixpose.objective",
@@ -47,6 +49,7 @@ __all__ = [
     "PointFeature",
     "RecordingError",
     "SegmentFeature",
+    "Selection",
     "Session",
     "SessionError",
     "View",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -27,6 +27,7 @@ from mixpose.records import (
     RawFrame,
     SensorReport,
 )
+from mixpose.selection import ALL_FRAMES, Selection
 
 if TYPE_CHECKING:
     from mixpose.sensors import Sensor
@@ -40,21 +41,12 @@ LEAST_DELAY_S = 1e-6
 """Sensors that differ by less count as in step."""
 
 
-@dataclass(frozen=True)
-class Selection:
-    """Which frames of a recording are estimated, as by `range`: numbers, `stop` excluded."""
-
-    start: int | None = None
-    stop: int | None = None
-    step: int = 1
-
-
 def run(
     session: Session,
     *,
     sources: Mapping[str, str] | None = None,
     opened: Mapping[str, Source] | None = None,
-    selection: Selection = Selection(),
+    selection: Selection = ALL_FRAMES,
     T_start: Floats | None = None,
     watch: Watch | None = None,
 ) -> Generator[Estimate, None, None]:

@@ -93,21 +93,21 @@ def run(
     ] = None,
 ) -> None:
     """Estimate a pose per frame."""
-    from mixpose.cli.run import RunRequest, run_session  # noqa: PLC0415
-    from mixpose.runner import Selection  # noqa: PLC0415
+    from mixpose.cli.request import RunRequest  # noqa: PLC0415
+    from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
     request = RunRequest(output, format.value, tuple(source or ()), selection, resume, overlay)
-    if len(sessions) == 1:
-        if workers > 1:
-            from mixpose.cli.notices import warn  # noqa: PLC0415
+    if len(sessions) > 1:
+        from mixpose.cli.several import run_sessions  # noqa: PLC0415
 
-            warn(f"--workers {workers}: one session is one process, frames follow each other")
-        run_session(sessions[0], request)
-        return
-    from mixpose.cli.several import run_sessions  # noqa: PLC0415
+        raise typer.Exit(run_sessions(sessions, request, workers))
+    from mixpose.cli.notices import warn  # noqa: PLC0415
+    from mixpose.cli.run import run_session  # noqa: PLC0415
 
-    raise typer.Exit(run_sessions(sessions, request, workers))
+    if workers > 1:
+        warn(f"--workers {workers}: one session is one process, frames follow each other")
+    run_session(sessions[0], request)
 
 
 @app.command()

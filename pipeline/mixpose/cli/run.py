@@ -5,34 +5,23 @@ from __future__ import annotations
 import sys
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.notices import Summary, say, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import read_poses, resume_point
 from mixpose.records import Estimate, Floats
-from mixpose.runner import Selection, Watch, open_sources, run
+from mixpose.runner import Watch, open_sources, run
+from mixpose.selection import Selection
 from mixpose.session import Session, load_session
 
 SWITCH_S = 1e-4
 """After so long a thread that has decoded a frame is let on; Python's own 5 ms is a whole frame."""
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """The options of ``mixpose run``."""
-
-    output: Path | None
-    format: str
-    sources: tuple[str, ...]
-    selection: Selection
-    resume: bool
-    overlay: Path | None = None
 
 
 def run_session(path: Path, request: RunRequest) -> None:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from mixpose.cli.run import RunRequest
+from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 
 USUAL_STEM = "session"
