@@ -189,6 +189,22 @@ def test_the_best_hypothesis_of_an_ambiguous_frame_is_measured_apart() -> None:
     assert outcome.best_rotation_deg.max == pytest.approx(1.0)
 
 
+def test_frames_that_are_ok_are_measured_alone_where_others_are_ambiguous() -> None:
+    T = a_pose()
+    wrong = turned_about_z(T, 60.0)
+    poses = file_of(
+        line(0, wrong, status="ambiguous", rivals=(wrong,)), line(1, turned_about_z(T, 2.0))
+    )
+    outcome = evaluate(poses, file_of(line(0, T), line(1, T)))
+    assert outcome.ok_rotation_deg is not None
+    assert outcome.ok_rotation_deg.max == pytest.approx(2.0)
+    assert outcome.ok_rotation_deg.worst_frame == 1
+    rows = [row for row in as_table(outcome).splitlines() if row.startswith("ok alone, deg")]
+    assert [row.split()[3] for row in rows] == ["2"]
+    only_ok = evaluate(file_of(line(1, T)), file_of(line(1, T)))
+    assert "ok alone" not in as_table(only_ok)
+
+
 def drawn_from(covariance: Floats, count: int) -> tuple[PoseFile, PoseFile]:
     rng = np.random.default_rng(RNG_SEED)
     T = a_pose()

@@ -116,6 +116,8 @@ class Evaluation:
     per_axis_rms : mapping or None
         RMS along and about the world's axes, by the names of `mixpose.rigid.TWIST_NAMES`;
         lengths and degrees.
+    ok_rotation_deg, ok_translation : Spread or None
+        Over "ok" frames alone; None without such a frame.
     best_rotation_deg, best_translation : Spread or None
         Over ambiguous frames: the error of the best hypothesis.
     nees : Consistency or None
@@ -132,6 +134,8 @@ class Evaluation:
     rotation_deg: Spread | None
     translation: Spread | None
     per_axis_rms: Mapping[str, float] | None
+    ok_rotation_deg: Spread | None
+    ok_translation: Spread | None
     best_rotation_deg: Spread | None
     best_translation: Spread | None
     nees: Consistency | None
@@ -158,12 +162,15 @@ def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
     compared = {(error.frame, error.object) for error in errors}
     with_pose = [error for error in errors if error.twist is not None]
     twists = [(error.frame, error.twist) for error in with_pose if error.twist is not None]
+    trusted = [error for error in with_pose if error.status == "ok"]
+    sure = [(error.frame, error.twist) for error in trusted if error.twist is not None]
     best = [(error.frame, error.best_twist) for error in errors if error.best_twist is not None]
     counts = {
         status: sum(error.status == status for error in errors)
         for status in ("ok", "ambiguous", "lost", "missing")
     }
     rotation_deg, translation = _spreads(twists)
+    ok_rotation_deg, ok_translation = _spreads(sure)
     best_rotation_deg, best_translation = _spreads(best)
     return Evaluation(
         unit=poses.unit or truth.unit,
@@ -173,9 +180,11 @@ def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
         rotation_deg=rotation_deg,
         translation=translation,
         per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
+        ok_rotation_deg=ok_rotation_deg,
+        ok_translation=ok_translation,
         best_rotation_deg=best_rotation_deg,
         best_translation=best_translation,
-        nees=_consistency([error for error in with_pose if error.status == "ok"]),
+        nees=_consistency(trusted),
     )
 
 

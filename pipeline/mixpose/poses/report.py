@@ -14,7 +14,8 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """The evaluation as plain values for JSON; what could not be measured is None.
 
     ``per_axis`` holds the RMS along (x, y, z, in ``unit``) and about (rx, ry, rz, in degrees)
-    the world's axes; ``best_hypothesis`` the errors of the best hypothesis of ambiguous frames.
+    the world's axes; ``ok_frames`` the errors of frames that are ok alone; ``best_hypothesis``
+    those of the best hypothesis of ambiguous frames.
     """
     nees = evaluation.nees
     per_axis = evaluation.per_axis_rms
@@ -30,6 +31,12 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "rotation_deg": _spread_dict(evaluation.rotation_deg),
         "translation": _length_dict(evaluation.translation, evaluation.unit),
         "per_axis": None if per_axis is None else dict(per_axis),
+        "ok_frames": None
+        if evaluation.ok_rotation_deg is None
+        else {
+            "rotation_deg": _spread_dict(evaluation.ok_rotation_deg),
+            "translation": _length_dict(evaluation.ok_translation, evaluation.unit),
+        },
         "best_hypothesis": {
             "frames": evaluation.ambiguous,
             "rotation_deg": _spread_dict(evaluation.best_rotation_deg),
@@ -65,7 +72,8 @@ def as_table(evaluation: Evaluation) -> str:
         lines += [
             "",
             f"rotation and position count the ambiguous frame{'s' * (evaluation.ambiguous != 1)}, "
-            "too; best hypothesis: of each of these, the pose nearest to the truth",
+            "too; ok alone: without these; best hypothesis: of each of these, the pose nearest to "
+            "the truth",
         ]
     nees = evaluation.nees
     if nees is None:
@@ -89,6 +97,11 @@ def _spread_lines(evaluation: Evaluation, unit: str) -> list[str]:
         (f"position, {unit}", evaluation.translation),
     ]
     if evaluation.best_rotation_deg is not None and evaluation.best_translation is not None:
+        if evaluation.ok_rotation_deg is not None and evaluation.ok_translation is not None:
+            rows += [
+                ("ok alone, deg", evaluation.ok_rotation_deg),
+                (f"ok alone, {unit}", evaluation.ok_translation),
+            ]
         rows += [
             ("best hypothesis, deg", evaluation.best_rotation_deg),
             (f"best hypothesis, {unit}", evaluation.best_translation),
