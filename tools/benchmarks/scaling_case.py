@@ -72,10 +72,10 @@ def absent() -> dict[str, Any]:
     """Seconds of a frame without the body, for one camera and for two."""
     found = {}
     for sensors in (1, 2):
-        tasks = {f"{n}, {false}": absent_task(n, sensors, false) for n, false in ABSENT}
+        tasks = {f"{n} features, {false}": absent_task(n, sensors, false) for n, false in ABSENT}
         seconds = medians(tasks, rounds=3, warm_up=0, clock=PROCESSOR)
         for name, s in seconds.items():
-            show(f"no body; its features, false detections: {name}; {sensors} cameras, s", s)
+            show(f"no body ({name} false), cameras: {sensors}, s", s)
         found[f"absent_{sensors}_s"] = seconds
     return found
 

@@ -69,22 +69,10 @@ def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
 
 
 def recurrence(points: Floats, tolerance: float) -> float:
-    """Find how much of a point set a shift by one step maps onto the set itself.
+    """Largest share of points (N, 3) that a shift from one to a neighbour maps onto points.
 
-    Parameters
-    ----------
-    points : (N, 3) array
-        Feature means.
-    tolerance : float
-        Largest distance, in length units, between an image and its feature.
-
-    Returns
-    -------
-    float
-        Largest share over all shifts from a point to one of its neighbours: 1/N for points at
-        random, near 1 for a large grid.
+    It is 1/N for points at random, and near 1 for a large grid.
     """
-    points = np.asarray(points, dtype=np.float64)
     if len(points) < 2:
         return 0.0
     _, near = cKDTree(points).query(points, k=min(len(points), 1 + _NEIGHBOURS))

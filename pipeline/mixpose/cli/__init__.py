@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
@@ -119,7 +119,7 @@ def _drop_standard_output() -> None:
 
 
 def _fail(message: str, status: int) -> int:
-    line = " ".join(message.split())
-    with suppress(OSError):  # the status still tells
-        print(f"mixpose: {line}", file=sys.stderr, flush=True)
+    from mixpose.cli.notices import say  # noqa: PLC0415
+
+    say(" ".join(message.split()))
     return status

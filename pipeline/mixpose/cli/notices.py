@@ -7,10 +7,12 @@ from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
 from statistics import median
+from typing import TYPE_CHECKING
 
-from mixpose.frames import Source
-from mixpose.records import Estimate, Status
-from mixpose.session import Session
+if TYPE_CHECKING:  # whoever only has to say something need not load them
+    from mixpose.frames import Source
+    from mixpose.records import Estimate, Status
+    from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
 _WELL = 0.1  # above it a sensor is explained, even beside 60 false features

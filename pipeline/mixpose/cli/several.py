@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from mixpose.cli.notices import say
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 
@@ -159,7 +160,7 @@ class _Processes:
     def _status(self, session: Path, returned: int) -> int:
         if returned >= 0 or self._stopped:
             return abs(returned)
-        print(f"mixpose: {session}: ended by signal {-returned}", file=sys.stderr)
+        say(f"{session}: ended by signal {-returned}")
         return 128 - returned
 
     def interrupt(self) -> None:

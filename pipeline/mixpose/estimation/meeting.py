@@ -290,19 +290,22 @@ def _crowd(observation: Observation, y: Floats, sigma: float, count: float) -> f
     overall = _count(observation, count) / _area(upper - lower, smallest)
     if not isinstance(observation.pattern, PointPattern) or not len(y):
         return overall
-    found = observation.pattern.points
     near, far = y.min(axis=0), y.max(axis=0)
-    middle, half = (near + far) / 2, np.maximum(far - near, smallest) / 2
-    inside = (np.abs(found - middle) <= half).all(axis=1)
-    return max(overall, np.count_nonzero(inside) / _area(2 * half, smallest))
+    half = np.maximum(far - near, smallest) / 2
+    found = _detected(observation.pattern, (near + far) / 2, half)
+    return max(overall, found / _area(2 * half, smallest))
 
 
 def _surplus(pattern: PointPattern, y: Floats, met: float) -> float:
     """Detections not met in the box of the body, and as far around it as a grid may slip."""
     near, far = y.min(axis=0), y.max(axis=0)
-    margin = _SLIP * float((far - near).max())
-    inside = ((pattern.points >= near - margin) & (pattern.points <= far + margin)).all(axis=1)
-    return max(float(np.count_nonzero(inside)) - met, 0.0)
+    half = (far - near) / 2 + _SLIP * float((far - near).max())
+    return max(_detected(pattern, (near + far) / 2, half) - met, 0.0)
+
+
+def _detected(pattern: PointPattern, middle: Floats, half: Floats) -> int:
+    """Number of detections in a box (m,) about its middle."""
+    return int(np.count_nonzero((np.abs(pattern.points - middle) <= half).all(axis=1)))
 
 
 def _area(sides: NDArray[np.float64], smallest: float) -> float:

@@ -112,8 +112,8 @@ class Track:
     stride : Stride or None
         None before two uncertain poses.
     loose : mapping of str to (float, float)
-        By sensor, in the last frame with a pose: features missed, and detections around the body
-        that belonged to none.
+        Of a body that looks like itself a step aside, by sensor, in the last frame with a pose:
+        features missed, and detections around the body that belonged to none.
     """
 
     branches: tuple[Branch, ...] = ()

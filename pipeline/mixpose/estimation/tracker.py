@@ -183,7 +183,9 @@ class Tracker:
             hypotheses=() if clear else tuple(Hypothesis(T, w) for T, w, _ in kept),
         )
         noise = best.assessment.noise if clear else track.noise
-        loose = {one.name: (one.missed, one.surplus) for one in best.assessment.meetings}
+        # what other bodies miss says nothing of a slip
+        meetings = best.assessment.meetings if self.body.recurrence >= _RECURRENT else ()
+        loose = {one.name: (one.missed, one.surplus) for one in meetings}
         return follow(track, self.body, kept, frame, time_s, noise, loose), estimate
 
     def _rated(
@@ -319,8 +321,6 @@ class Tracker:
 
         So it is where a body that looks like itself a step aside was followed to there.
         """
-        if self.body.recurrence < _RECURRENT:
-            return False
         for one in rated.assessment.meetings:
             missed, surplus = track.loose.get(one.name, (np.inf, np.inf))
             if one.missed > missed + _HALF and one.surplus > surplus + _HALF:

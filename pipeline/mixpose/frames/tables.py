@@ -124,14 +124,12 @@ class DetectionTable:
             self._complain(group)
         points = values[:, [self.columns.index(name) for name in self.coordinates]]
         weights = self._column("weight", values)
-        if max(np.abs(points).max(), 0 if weights is None else weights.max()) > _LARGEST:
-            self._complain(group)
         if weights is None:
-            pattern = PointPattern(points, np.ones(len(points)))
-        elif ((weights != 0) & (weights < _SMALLEST_WEIGHT)).any():
+            weights = np.ones(len(points))
+        too_small = (weights != 0) & (weights < _SMALLEST_WEIGHT)
+        if too_small.any() or max(np.abs(points).max(), weights.max()) > _LARGEST:
             self._complain(group)
-        else:
-            pattern = PointPattern(points[weights > 0], weights[weights > 0])
+        pattern = PointPattern(points[weights > 0], weights[weights > 0])
         times = self._column("time_s", values)
         time_s = None if times is None else float(times.min())
         if self.clock is not None:
