@@ -51,7 +51,7 @@ class Gravity:
     sigma: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """A rigid body known by its features.
 

@@ -1,13 +1,14 @@
 """From feature pattern to density: Gaussian blur and normalisation, g = g0 * ε.
 
-Point patterns are rendered exactly: a separable Gaussian at every grid point is one matrix
-product over the points, whatever their number.  Grid patterns are filtered; wide blurs on a
-reduced grid whose averaging is taken off the blur.
+A Gaussian blur is separable.  At the crossings of columns u and rows v it is a product of three
+matrices: Gaussians along v, the pattern, Gaussians along u.  The pattern is diagonal for
+detections, and the values themselves for grey values and profiles.  Nothing is interpolated, and
+no filter is cut off but where a Gaussian has vanished.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -17,78 +18,92 @@ from mixpose.density.grid import Density, Window, merge
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
+Singles: TypeAlias = NDArray[np.float32]
 
-_VANISHED = 50.0  # squared standard deviations at which a Gaussian is 1e-11 of its peak
+CUT = 6.0
+"""Standard deviations at which sums over a grid end: the tail holds 2e-9."""
 
-TRUNCATE = 5.0  # standard deviations at which filter kernels end; the tail holds 6e-7
+_SAMPLES_PER_SIGMA = 4.0  # of a grid that is averaged before a wide blur: sums err by 1e-30
+_HAT = 0.3  # of a grid's step: a narrower blur is linear interpolation
 
 
-def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern and normalise it to a probability density.
+class Factors(NamedTuple):
+    """A blurred pattern as products: ``left.T @ right`` at rows v and columns u.
+
+    `left` is (K, V), `right` is (K, U); the slopes are their derivatives by v and u.
+    """
+
+    left: Singles
+    left_slope: Singles
+    right: Singles
+    right_slope: Singles
+
+    def layers(self, *, gradient: bool) -> list[Singles]:
+        """Density (V, U), and where wanted its derivatives by u and v."""
+        value = self.left.T @ self.right
+        if not gradient:
+            return [value]
+        return [value, self.left.T @ self.right_slope, self.left_slope.T @ self.right]
+
+
+def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None) -> Factors:
+    """Blur a pattern, normalised, at columns u (U,) and rows v (V,), None for ranges.
 
     Parameters
     ----------
     pattern : PointPattern or GridPattern
-        g0.
+        Not empty.
     sigma : float
-        Standard deviation of the blur in sensor units; positive.
-    window : Window
-        Where the density is wanted.  The normalisation is that of the whole pattern, so that a
-        window shows a part of the same density.
-    gradient : bool
-        Whether to add the gradient channels.
-
-    Returns
-    -------
-    Density
-        Zero everywhere when the pattern is empty.
+        Standard deviation of the blur in sensor units; positive for detections.
     """
     if isinstance(pattern, PointPattern):
-        values = _render_points(pattern, sigma, window, gradient)
-    else:
-        values = _render_grid(pattern, sigma, window, gradient)
-    return Density(values, window, sigma)
+        weights = (pattern.weights / pattern.weights.sum()).astype(np.float32)[:, None]
+        right, right_slope = bell(u, pattern.points[:, 0], sigma)
+        if v is None:
+            return Factors(weights, np.zeros_like(weights), right, right_slope)
+        left, left_slope = bell(v, pattern.points[:, 1], sigma)
+        return Factors(left * weights, left_slope * weights, right, right_slope)
+    m = len(pattern.origin)
+    columns, right, right_slope = _along(pattern, 0, sigma, u)
+    scale = np.float32(pattern.step**m / mass(pattern))
+    if v is None:
+        one = np.ones((1, 1), dtype=np.float32)
+        values = pattern.values[:, columns] * scale
+        return Factors(one, np.zeros_like(one), values @ right, values @ right_slope)
+    rows, left, left_slope = _along(pattern, 1, sigma, v)
+    values = pattern.values[rows, columns] * scale
+    return Factors(left, left_slope, values @ right, values @ right_slope)
 
 
-def _nothing(window: Window, gradient: bool) -> NDArray[np.float32]:
-    return np.zeros((*window.shape, 3) if gradient else window.shape, dtype=np.float32)
+def _along(
+    pattern: GridPattern, axis: int, sigma: float, places: Floats
+) -> tuple[slice, Singles, Singles]:
+    """The part of a grid that matters along an axis, and its Gaussians at places."""
+    step, count = pattern.step, pattern.values.shape[1 - axis]
+    margin = max(CUT * sigma, step)
+    first = int(np.clip((places.min() - margin - pattern.origin[axis]) / step, 0, count - 1))
+    last = (places.max() + margin - pattern.origin[axis]) / step + 2
+    part = slice(first, int(np.clip(last, first + 1, count)))
+    grid = pattern.origin[axis] + step * np.arange(part.start, part.stop)
+    if sigma > _HAT * step:
+        return part, *bell(places, grid, sigma)
+    away = (places - grid[:, None]) / step
+    hat = np.maximum(1 - np.abs(away), 0.0) / step
+    slope = np.where(np.abs(away) <= 1, -np.sign(away), 0.0) / step**2
+    return part, hat.astype(np.float32), slope.astype(np.float32)
 
 
-def _render_points(
-    pattern: PointPattern, sigma: float, window: Window, gradient: bool
-) -> NDArray[np.float32]:
-    dimension = pattern.points.shape[1]
-    total = pattern.weights.sum()
-    if total <= 0:
-        return _nothing(window, gradient)
-    weights = (pattern.weights / total).astype(np.float32)
-    bells, slopes, _ = zip(
-        *(bell(window.axis(k), pattern.points[:, k], sigma) for k in range(dimension)), strict=True
-    )
-    if dimension == 1:
-        profiles = (weights @ bells[0], weights @ slopes[0])
-        layers: list[NDArray[np.float32]] = [each.reshape(window.shape) for each in profiles]
-    else:
-        rows = bells[1].T * weights
-        layers = [rows @ bells[0]]
-        if gradient:
-            layers += [rows @ slopes[0], (slopes[1].T * weights) @ bells[0]]
-    if not gradient:
-        return layers[0]
-    return merge(layers[: 1 + dimension])
+_VANISHED = 50.0  # squared standard deviations at which a Gaussian is 1e-11 of its peak
 
 
-def bell(
-    axis: Floats, centres: Floats, sigma: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Gaussians (..., M, n) around centres (M,) along axes (..., n), and two derivatives."""
+def bell(axis: Floats, centres: Floats, sigma: float) -> tuple[Singles, Singles]:
+    """Gaussians (M, n) around centres (M,) along an axis (n,), and their derivative."""
     away = ((axis - centres[:, None]) / sigma).astype(np.float32)
     squared = away * away
     values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
     # products of far tails would be subnormal numbers, on which matrix products crawl
     values[squared > _VANISHED] = 0.0
-    slopes = values * away * np.float32(-1.0 / sigma)
-    return values, slopes, values * (squared - 1) * np.float32(1.0 / sigma**2)
+    return values, values * away * np.float32(-1.0 / sigma)
 
 
 def mass(pattern: GridPattern) -> float:
@@ -101,54 +116,33 @@ def mass(pattern: GridPattern) -> float:
     return absolute * pattern.step ** len(pattern.origin)
 
 
-def _render_grid(
-    pattern: GridPattern, sigma: float, window: Window, gradient: bool
-) -> NDArray[np.float32]:
-    dimension = len(pattern.origin)
-    # magnitudes: the plain sum of a profile with noise about zero may be nothing or negative
-    total = mass(pattern)
-    if total <= 0:
-        return _nothing(window, gradient)
-    source = _blocks(pattern, window, margin=TRUNCATE * sigma)
-    # averaging twice over n pixels adds 2 (n² − 1)/12 px² of variance
-    variance = sigma**2 - (source.step**2 - pattern.step**2) / 6
-    spread = float(np.sqrt(max(variance, 0.0))) / source.step
-    layers = _filtered(source.values / np.float32(total), spread, source.step, gradient)
-    stacked = merge(layers) if gradient else layers[0]
-    on_source = Density(stacked, Window(source.origin, source.values.shape, source.step), sigma)
-    first = (window.origin - source.origin) / source.step
-    if abs(window.step / source.step - 1) < 1e-9 and np.allclose(first, first.round(), atol=1e-6):
-        column, row = int(first[0].round()), int(first[1].round()) if dimension == 2 else 0
-        cut = stacked[row : row + window.shape[0], column : column + window.shape[1]]
-        return np.ascontiguousarray(cut)
-    sampled = on_source.sample(_grid_points(window))
-    return merge([sampled[..., k] for k in range(1 + dimension)]) if gradient else sampled
+def reduced(pattern: Pattern, sigma: float) -> tuple[Pattern, float]:
+    """A grid on fewer points where a wide blur leaves nothing between them, and the blur left.
 
-
-def _blocks(pattern: GridPattern, window: Window, margin: float) -> GridPattern:
-    """The part of a pattern within a margin of the window, averaged over blocks.
-
-    Blocks are as large as the window's step allows, and centred on the window's grid points
-    where whole pixels permit; beyond the pattern is zero.  The average is a triangle (a box run
-    over the pixels, then blocks): blocks alone would move a feature to the centre of its block.
+    Points are averaged by a triangle (a box run over the pixels, then blocks): blocks alone would
+    move a feature to the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off
+    the blur.
     """
-    dimension, step = len(pattern.origin), pattern.step
-    factor = odd_factor(window.step / step)
-    count = np.array(window.shape[::-1])[:dimension]
-    far = window.origin + (count - 1) * window.step
-    blocks_before = int(np.ceil(margin / (factor * step))) + 1
-    start = window.origin - blocks_before * factor * step
-    begin = np.floor((start - pattern.origin) / step - (factor - 1) / 2 + 0.5 + 1e-6).astype(int)
-    blocks = np.ceil((far + margin - start) / (factor * step)).astype(int) + 2
-    values = _cut_out(pattern.values, begin, begin + blocks * factor)
-    origin = pattern.origin + (begin + (factor - 1) / 2) * step
-    if factor > 1:
-        size = (int(blocks[0]), int(blocks[1]) if dimension == 2 else 1)
-        box = (factor, factor if dimension == 2 else 1)
-        smooth = cv2.blur(values, box, borderType=cv2.BORDER_CONSTANT)
-        averaged = cv2.resize(smooth, size, interpolation=cv2.INTER_AREA)
-        values = np.asarray(averaged, dtype=np.float32)
-    return GridPattern(values, np.asarray(origin), step * factor)
+    if isinstance(pattern, PointPattern):
+        return pattern, sigma
+    factor = odd_factor(sigma / (_SAMPLES_PER_SIGMA * pattern.step))
+    if factor == 1:
+        return pattern, sigma
+    flat = len(pattern.origin) == 1
+    rows, columns = pattern.values.shape
+    box = (factor, 1 if flat else factor)
+    size = (-(-columns // factor) + 2, rows if flat else -(-rows // factor) + 2)
+    after = (size[0] * factor - columns - factor, 0 if flat else size[1] * factor - rows - factor)
+    before = 0 if flat else factor
+    padded = cv2.copyMakeBorder(
+        pattern.values, before, after[1], factor, after[0], cv2.BORDER_CONSTANT, value=0
+    )
+    smooth = cv2.blur(padded, box, borderType=cv2.BORDER_CONSTANT)
+    values = np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    step = factor * pattern.step
+    origin = pattern.origin - factor * pattern.step + (factor - 1) / 2 * pattern.step
+    left = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))
+    return GridPattern(values.reshape(size[1], size[0]), origin, step), float(left)
 
 
 def odd_factor(ratio: float) -> int:
@@ -157,62 +151,40 @@ def odd_factor(ratio: float) -> int:
     return whole if whole % 2 else whole - 1
 
 
-def _cut_out(
-    values: NDArray[np.float32], begin: NDArray[np.int_], end: NDArray[np.int_]
-) -> NDArray[np.float32]:
-    """Rows and columns from `begin` to `end` (u first), zero where there are none."""
-    size = np.array(values.shape[::-1])[: len(begin)]
-    low, high = np.clip(begin, 0, size), np.clip(end, 0, size)
-    flat = len(begin) == 1
-    inside = values[:, low[0] : high[0]] if flat else values[low[1] : high[1], low[0] : high[0]]
-    along_u = (int(low[0] - begin[0]), int(end[0] - max(high[0], begin[0])))
-    if inside.size == 0:
-        rows = 1 if flat else int(end[1] - begin[1])
-        return np.zeros((rows, int(end[0] - begin[0])), dtype=np.float32)
-    along_v = (0, 0) if flat else (int(low[1] - begin[1]), int(end[1] - high[1]))
-    return np.pad(inside, (along_v, along_u))
+def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
+    """Blur a pattern and normalise it to a probability density.
+
+    Parameters
+    ----------
+    pattern : PointPattern or GridPattern
+        g0.
+    sigma : float
+        Standard deviation of the blur in sensor units; positive for detections.
+    window : Window
+        Where the density is wanted.  The normalisation is that of the whole pattern, so that a
+        window shows a part of the same density.
+    gradient : bool
+        Whether to add the gradient channels.
+
+    Returns
+    -------
+    Density
+        Zero everywhere when the pattern is empty.
+    """
+    m = len(window.origin)
+    if is_empty(pattern):
+        shape = (*window.shape, 3) if gradient else window.shape
+        return Density(np.zeros(shape, dtype=np.float32), window, sigma)
+    small, left = reduced(pattern, sigma)
+    made = factors(small, left, window.axis(0), window.axis(1) if m == 2 else None)
+    layers = made.layers(gradient=gradient)
+    values = merge(layers[: 1 + m]) if gradient else layers[0]
+    return Density(values, window, sigma)
 
 
-def _filtered(
-    values: NDArray[np.float32], spread: float, step: float, gradient: bool
-) -> list[NDArray[np.float32]]:
-    """Gaussian-filtered values and, on demand, derivatives by u and v in sensor units."""
-    reach = max(int(np.ceil(TRUNCATE * spread)), 1)
-    offsets = np.arange(-reach, reach + 1, dtype=np.float64)
-    if spread < 1e-3:
-        bell = (offsets == 0).astype(np.float64)
-        slope = np.where(np.abs(offsets) == 1, 0.5 * np.sign(offsets), 0.0)
-    else:
-        bell = np.exp(-0.5 * (offsets / spread) ** 2)
-        bell /= bell.sum()
-        slope = offsets * bell / (offsets**2 * bell).sum()
-    kernel = bell.astype(np.float32)
-    # correlation with +x weights is the derivative: Σ f(x + k) k bell(k) / Σ k² bell(k)
-    derivative = (slope / step).astype(np.float32)
-    one_row = values.shape[0] == 1
-    across = np.ones(1, dtype=np.float32) if one_row else kernel
-    layers = [_separable(values, kernel, across)]
-    if gradient:
-        layers.append(_separable(values, derivative, across))
-        if not one_row:
-            layers.append(_separable(values, kernel, derivative))
-    return layers
-
-
-def _separable(
-    values: NDArray[np.float32], along_u: NDArray[np.float32], along_v: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Filter with zeros beyond the border (OpenCV extrapolates unless the border is padded)."""
-    pad_u, pad_v = len(along_u) // 2, len(along_v) // 2
-    padded = cv2.copyMakeBorder(values, pad_v, pad_v, pad_u, pad_u, cv2.BORDER_CONSTANT, value=0)
-    out = cv2.sepFilter2D(padded, cv2.CV_32F, along_u, along_v, borderType=cv2.BORDER_CONSTANT)
-    return np.asarray(
-        out[pad_v : pad_v + values.shape[0], pad_u : pad_u + values.shape[1]], dtype=np.float32
-    )
-
-
-def _grid_points(window: Window) -> Floats:
-    u = window.axis(0)
-    if len(window.origin) == 1:
-        return u[None, :, None]
-    return np.stack(np.meshgrid(u, window.axis(1)), axis=-1)
+def is_empty(pattern: Pattern) -> bool:
+    """Whether a pattern has no feature at all."""
+    if isinstance(pattern, PointPattern):
+        return len(pattern.points) == 0 or not pattern.weights.sum() > 0
+    # a profile that lies below zero as a whole has no density anywhere
+    return not pattern.values.max() > 0

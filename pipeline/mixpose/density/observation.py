@@ -2,13 +2,14 @@
 
 Two densities are made of a pattern g0 whose features have standard deviation σ after blurring:
 
-* ``density(σ)``: g = g0 * ε, the paper's observation density;
-* ``matched(σ)``: g blurred once more by σ, whose samples are inner products ⟨g, N(p, σ²)⟩ of the
-  observation with a predicted feature of the same width.
+* g = g0 * ε, the paper's observation density;
+* C, g blurred once more by σ, whose samples are inner products ⟨g, N(p, σ²)⟩ of the observation
+  with a predicted feature of the same width.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -16,25 +17,24 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density.atlas import Atlas, render_atlas
-from mixpose.density.blur import TRUNCATE, odd_factor, render
+from mixpose.density.atlas import Atlas, draw
+from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
-from mixpose.density.mixture import FEW, Mixture, mixture
-from mixpose.density.overlap import self_overlap, squared_distances
+from mixpose.density.overlap import self_overlap
 from mixpose.records import Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
 
 STEPS_PER_SIGMA = 4.0
-"""Grid points per standard deviation: bilinear gradients then err by 0.2 % of a step at a peak."""
-
-TILE_REACH = 3.0
-"""Half-width of a tile in standard deviations of the matched density."""
+"""Grid points per standard deviation of dense windows."""
 
 MOST_CELLS = 1_500_000
+"""Grid points of a dense window; a larger one gets coarser."""
+
+_MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Observation:
     """A feature pattern with what is known about its blur.
 
@@ -69,13 +69,24 @@ class Observation:
             return int(self.pattern.points.shape[1])
         return len(self.pattern.origin)
 
+    @property
+    def cell(self) -> float | None:
+        """Size of a cell whose value carries noise of its own; None for detections."""
+        if isinstance(self.pattern, PointPattern):
+            return None
+        return float(self.pattern.step**self.dimension)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells, or of detections."""
+        if isinstance(self.pattern, PointPattern):
+            return len(self.pattern.points)
+        return int(self.pattern.values.size)
+
     @cached_property
     def is_empty(self) -> bool:
         """Whether the sensor saw no feature at all."""
-        if isinstance(self.pattern, PointPattern):
-            return len(self.pattern.points) == 0 or not self.pattern.weights.sum() > 0
-        # a profile that lies below zero as a whole has no density anywhere
-        return not self.pattern.values.max() > 0
+        return is_empty(self.pattern)
 
     @cached_property
     def extent(self) -> tuple[Floats, Floats]:
@@ -90,31 +101,14 @@ class Observation:
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False
     ) -> Density:
         """Make g with features of standard deviation sigma, on a window over the box `within`."""
-        return self._render(sigma**2 - self.intrinsic**2, sigma, within, gradient)
+        window = self._window(sigma, within)
+        rendered = render(self.pattern, self.blur(sigma), window, gradient=gradient)
+        return Density(rendered.values, window, sigma)
 
-    def matched(self, sigma: float, within: tuple[Floats, Floats]) -> Density:
-        """Make g blurred once more by sigma, with gradients, on a window over the box `within`."""
-        return self._render(2 * sigma**2 - self.intrinsic**2, np.sqrt(2) * sigma, within, True)
-
-    def matched_near(
-        self, sigma: float, centres: Floats | None, reach: float = TILE_REACH
-    ) -> Atlas | Mixture | None:
-        """As `matched`, exact, around expected features (n, m), or None for anywhere.
-
-        Detections are summed where they are asked for; grids are drawn finely on tiles that reach
-        `reach` standard deviations of the matched density to each side.
-
-        None where a grid pattern is too coarse for the blur to be summed over its points, or no
-        features are given.
-        """
-        blur = float(np.sqrt(2 * sigma**2 - self.intrinsic**2))
-        if isinstance(self.pattern, PointPattern):
-            if sigma == self.sigma and len(self.pattern.points) <= FEW:
-                return self._finest
-            return mixture(self.pattern, blur, centres, reach * blur)
-        if centres is None or blur < self.pattern.step:
-            return None
-        return render_atlas(self.pattern, blur, centres, reach * np.sqrt(2) * sigma)
+    def blur(self, sigma: float, *, matched: bool = False) -> float:
+        """Blur of the pattern that gives features a standard deviation, once or for C."""
+        variance = (2 if matched else 1) * sigma**2 - self.intrinsic**2
+        return float(np.sqrt(max(variance, 0.0)))
 
     def energy(self, sigma: float) -> float:
         """⟨g, g⟩ at the given standard deviation of a feature, over the whole pattern."""
@@ -122,51 +116,16 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(pattern, PointPattern):
-            if sigma == self.sigma:
-                return self._finest_energy
-            return self_overlap(pattern.points, self._shares, 2 * sigma**2, self._apart)
+            weights = pattern.weights / pattern.weights.sum()
+            return self_overlap(pattern.points, weights, 2 * sigma**2)
         lower, upper = self.extent
-        margin = TRUNCATE * sigma
-        g = self.density(sigma, (lower - margin, upper + margin))
+        g = self.density(sigma, (lower - _MARGIN * sigma, upper + _MARGIN * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
 
-    # what is made of detections at σ_ε serves the estimate, its rivals and their judgement
-
-    @cached_property
-    def _finest(self) -> Mixture:
-        assert isinstance(self.pattern, PointPattern)
-        blur = float(np.sqrt(2 * self.sigma**2 - self.intrinsic**2))
-        return mixture(self.pattern, blur, None, 0.0)
-
-    @cached_property
-    def _finest_energy(self) -> float:
-        assert isinstance(self.pattern, PointPattern)
-        return self_overlap(self.pattern.points, self._shares, 2 * self.sigma**2, self._apart)
-
-    @cached_property
-    def _shares(self) -> Floats:
-        """Weights of detections, normalised."""
-        assert isinstance(self.pattern, PointPattern)
-        return np.asarray(self.pattern.weights / self.pattern.weights.sum())
-
-    @cached_property
-    def _apart(self) -> Floats | None:
-        """Squared distances of all detections from one another, where they are few."""
-        assert isinstance(self.pattern, PointPattern)
-        return squared_distances(self.pattern.points)
-
-    def _render(
-        self, variance: float, feature_sigma: float, within: tuple[Floats, Floats], gradient: bool
-    ) -> Density:
-        window = self._window(feature_sigma, within)
-        blur = float(np.sqrt(max(variance, 0.0)))
-        rendered = render(self.pattern, blur, window, gradient=gradient)
-        return Density(rendered.values, window, feature_sigma)
-
     def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
         """A window over the box, fine enough for the blur and within the budget of cells."""
-        margin = TRUNCATE * feature_sigma
+        margin = _MARGIN * feature_sigma
         near, far = self.extent
         lower = np.maximum(within[0], near - margin)
         upper = np.maximum(np.minimum(within[1], far + margin), lower)
@@ -176,6 +135,31 @@ class Observation:
             return Window.around(lower, upper, step)
         grid = self.pattern
         factor = odd_factor(step / grid.step)
-        # grid points at the centres of blocks of pixels, so that averages need no resampling
+        # grid points at the centres of blocks of pixels
         begin = np.floor((lower - grid.origin) / grid.step) + (factor - 1) / 2
         return Window.around(grid.origin + begin * grid.step, upper, factor * grid.step)
+
+
+def matched_atlas(
+    observations: Sequence[Observation],
+    sigmas: Sequence[float],
+    steps_per_sigma: float,
+    near: Sequence[Floats | None] | None = None,
+) -> Atlas:
+    """Draw C of several sensors, none of which is empty.
+
+    Parameters
+    ----------
+    observations : sequence of Observation
+    sigmas : sequence of float
+        Standard deviation of a feature, per sensor, in sensor units.
+    steps_per_sigma : float
+        Cells per standard deviation of C, as `mixpose.density.atlas.draw` has it.
+    near : sequence of (n, m) array or None
+        Places about which alone C is wanted; None: wherever it is not zero.
+    """
+    blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
+    patterns = [observation.pattern for observation in observations]
+    return draw(patterns, blurs, steps_per_sigma, near or [None] * len(patterns))
+
+

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from mixpose.objective.base import Objective, Quadratic, View, pose_jacobian
+from mixpose.objective.base import Objective, Quadratic, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
-from mixpose.objective.gaze import Gaze, Projected, gazes_of
 from mixpose.objective.matched import MatchedObjective, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
+from mixpose.objective.projection import BodyProjection, Projected, pose_jacobian, project_body
 
 __all__ = [
     "OBJECTIVES",
-    "Gaze",
+    "BodyProjection",
     "IndependentObjective",
     "MatchedObjective",
     "Objective",
@@ -20,8 +20,8 @@ __all__ = [
     "Quadratic",
     "View",
     "build_objective",
-    "gazes_of",
     "matched_objective",
     "pose_jacobian",
+    "project_body",
     "sampled_terms",
 ]

@@ -70,41 +70,6 @@ class Objective(Protocol):
         ...
 
 
-def facing(
-    sensor: Sensor, T_world_object: Floats, points_world: Floats, normals: Floats | None
-) -> NDArray[np.bool_]:
-    """Which features turn their face to a sensor: (..., n), true where normals are not known.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    T_world_object : (..., 4, 4) array
-    points_world : (..., n, 3) array
-    normals : (n, 3) array or None
-        In the object's frame.
-    """
-    if normals is None:
-        return np.ones(points_world.shape[:-1], dtype=np.bool_)
-    outward = normals @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
-    return np.asarray((outward * sensor.towards(points_world)).sum(axis=-1) > 0)
-
-
-def pose_jacobian(by_world: Floats, T_world_object: Floats, points: Floats) -> Floats:
-    """Chain the Jacobian (..., n, m, 3) by world points into (..., n, m, 6) by the pose's twist.
-
-    A turn ω about the object's origin moves R z by ω × R z, and a · (ω × x) = ω · (x × a).
-    """
-    arms = points @ np.swapaxes(T_world_object[..., :3, :3], -1, -2)
-    x, y, z = arms[..., 0, None], arms[..., 1, None], arms[..., 2, None]
-    a, b, c = by_world[..., 0], by_world[..., 1], by_world[..., 2]
-    J = np.empty((*by_world.shape[:-1], 6))
-    J[..., :3] = by_world
-    J[..., 3] = y * c - z * b
-    J[..., 4] = z * a - x * c
-    J[..., 5] = x * b - y * a
-    return J
-
-
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
     """Box (lower, upper) around projected points (n, m), within the sensor.
 

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Objective, View
-from mixpose.objective.gaze import Gaze
-from mixpose.objective.matched import matched_objective
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 
 Floats: TypeAlias = NDArray[np.float64]
 ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
 Builder: TypeAlias = Callable[
-    [Sequence[View], Body, Floats, Sequence[float], Floats, bool, Sequence[Gaze]], Objective
+    [Sequence[View], Body, Floats, Sequence[float], Floats, bool], Objective
 ]
 
 
@@ -28,9 +27,9 @@ def _matched(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
-    gazes: Sequence[Gaze],
 ) -> Objective:
-    return matched_objective(views, body, sigmas, near, fine=fine, gazes=gazes)
+    steps = FINE_STEPS if fine else STEPS_PER_SIGMA
+    return matched_objective(views, body, sigmas, near, steps_per_sigma=steps)
 
 
 def _paper(
@@ -40,7 +39,6 @@ def _paper(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
-    gazes: Sequence[Gaze],
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
     return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
@@ -53,7 +51,6 @@ def _independent(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool,
-    gazes: Sequence[Gaze],
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
     return IndependentObjective(terms, samples, body.world_offsets(samples.shape[1]))
@@ -74,7 +71,6 @@ def build_objective(
     sigmas: Sequence[float],
     near: Floats,
     fine: bool = False,
-    gazes: Sequence[Gaze] = (),
 ) -> Objective:
     """Build an objective of the pose at one level of blur.
 
@@ -91,8 +87,6 @@ def build_objective(
     near : (4, 4) array
         Pose around whose projection densities are made.
     fine : bool
-        Whether the matched objective makes its densities on fine tiles, for the last digits.
-    gazes : sequence of Gaze
-        Of the views' sensors at the body, where they are at hand.
+        Whether the matched objective draws its densities finely, for the last digits.
     """
-    return OBJECTIVES[name](views, body, samples, sigmas, near, fine, gazes)
+    return OBJECTIVES[name](views, body, samples, sigmas, near, fine)

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.objective.base import Quadratic, View, pose_jacobian, region_of_interest
+from mixpose.objective.base import Quadratic, View, region_of_interest
 from mixpose.objective.index_maps import (
     Projection,
     SampledTerm,
@@ -29,6 +29,7 @@ from mixpose.objective.index_maps import (
     index_maps,
     look_up_array,
 )
+from mixpose.objective.projection import pose_jacobian
 from mixpose.rigid import transform
 
 __all__ = ["REACH", "IndependentObjective", "PaperObjective", "SampledTerm", "sampled_terms"]
@@ -120,7 +121,7 @@ class _SampledObjective:
         result = []
         for term in self.terms:
             y, by_world, _ = term.sensor.linearise(points)
-            J = pose_jacobian(by_world, T_world_object, self.points)
+            J = pose_jacobian(by_world, self.points @ T_world_object[:3, :3].T)
             g = term.density.sample(y).astype(np.float64)
             by_pose = np.einsum("sm,smk->sk", g[:, 1:], J)
             result.append(_Sampled(g[:, 0], by_pose, J, term.density.sigma))

@@ -5,13 +5,14 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 
 from __future__ import annotations
 
-from mixpose.sensors.bank import Bank, bank
 from mixpose.sensors.base import OUTSIDE, Sensor
+from mixpose.sensors.batch import SensorBatch, side_by_side
+from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
-from mixpose.sensors.motion import moved_against
 from mixpose.sensors.parallel import ParallelBeam
 from mixpose.sensors.pinhole import PinholeCamera
+from mixpose.sensors.rays import Rays
 
 SENSOR_MODELS: dict[str, type[Sensor]] = {
     "pinhole": PinholeCamera,
@@ -23,12 +24,13 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
 __all__ = [
     "OUTSIDE",
     "SENSOR_MODELS",
-    "Bank",
     "FisheyeCamera",
     "ParallelBeam",
     "PinholeCamera",
     "RangeSensor",
+    "Rays",
     "Sensor",
-    "bank",
-    "moved_against",
+    "SensorBatch",
+    "facing",
+    "side_by_side",
 ]

@@ -12,10 +12,13 @@ Conventions
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mixpose.sensors.rays import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
 Mask: TypeAlias = NDArray[np.bool_]
@@ -57,6 +60,20 @@ class Sensor(Protocol):
 
     def towards(self, points_world: Floats) -> Floats:
         """Directions (..., 3) from world points (..., 3) to the sensor, of any length."""
+        ...
+
+    def rays(self, y: Floats) -> Rays | None:
+        """Lines of sight of detections (M, m); None where a detection leaves no line in space.
+
+        Detections that no point in space can cause are left out.
+        """
+        ...
+
+    def moved(self, motion: Floats) -> Self:
+        """The sensor that measures of points x what this one measures of ``motion @ x``.
+
+        `motion` is a rigid motion (4, 4) of the world.
+        """
         ...
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
+import cv2
 import numpy as np
 
 from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.sensors.rays import Rays, central_rays
 
 _WIDEST = np.pi / 2  # as cv2.fisheye, which divides by depth; points beside the camera are dropped
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FisheyeCamera:
     """A fisheye camera: image radius θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) for the angle θ.
 
@@ -74,6 +76,17 @@ class FisheyeCamera:
         """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
         centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
         return np.asarray(centre - points_world)
+
+    def rays(self, y: Floats) -> Rays:
+        """Lines of sight of pixels (M, 2)."""
+        K = self.camera_matrix
+        distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        xy = cv2.fisheye.undistortPoints(distorted.reshape(-1, 1, 2), np.eye(3), self.distortion)
+        return central_rays(self, y, np.asarray(xy, dtype=np.float64).reshape(-1, 2))
+
+    def moved(self, motion: Floats) -> Self:
+        """The camera that sees points x where this one sees ``motion @ x``."""
+        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
 
     def _radius(self, theta: Floats) -> tuple[Floats, Floats]:
         k1, k2, k3, k4 = self.distortion

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import numpy as np
 
 from mixpose.sensors.base import Floats, Mask, hide, within
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RangeSensor:
     """Measures distances: range = ‖x_world − position‖ + range_bias.
 
@@ -59,3 +59,12 @@ class RangeSensor:
     def towards(self, points_world: Floats) -> Floats:
         """Vectors (..., 3) from world points (..., 3) to the lateration source."""
         return np.asarray(self.position - points_world)
+
+    def rays(self, y: Floats) -> None:
+        """None: a range leaves a sphere, not a line."""
+        return None
+
+    def moved(self, motion: Floats) -> Self:
+        """The sensor that measures of points x what this one measures of ``motion @ x``."""
+        # distances stay when the source moves back in place of the points
+        return replace(self, position=motion[:3, :3].T @ (self.position - motion[:3, 3]))

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import numpy as np
 
+from mixpose.rigid import inverse
 from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.sensors.rays import Rays
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ParallelBeam:
     """A camera without perspective: pixel = (x_s, y_s) / pixel_size + principal_point.
 
@@ -62,3 +64,15 @@ class ParallelBeam:
     def towards(self, points_world: Floats) -> Floats:
         """Unit vectors (..., 3) against the beam, the same for all world points (..., 3)."""
         return np.broadcast_to(-self.T_sensor_world[2, :3], points_world.shape)
+
+    def rays(self, y: Floats) -> Rays:
+        """Lines of sight of pixels (M, 2), all parallel."""
+        T_world_sensor = inverse(self.T_sensor_world)
+        across = (y - self.principal_point) * self.pixel_size
+        origins = across @ T_world_sensor[:3, :2].T + T_world_sensor[:3, 3]
+        directions = np.tile(T_world_sensor[:3, 2], (len(y), 1))
+        return Rays(origins, directions, y, False, self.pixel_size, 0.0)
+
+    def moved(self, motion: Floats) -> Self:
+        """The camera that sees points x where this one sees ``motion @ x``."""
+        return replace(self, T_sensor_world=self.T_sensor_world @ motion)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
 from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
 from mixpose.sensors.distortion import LensDistortion
+from mixpose.sensors.rays import Rays, central_rays
 
 NEAREST = 1e-9  # depth in length units below which a point counts as behind the camera
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PinholeCamera:
     """A perspective camera.
 
@@ -79,6 +81,21 @@ class PinholeCamera:
         """Vectors (..., 3) from world points (..., 3) to the centre of projection."""
         centre = -self.T_sensor_world[:3, :3].T @ self.T_sensor_world[:3, 3]
         return np.asarray(centre - points_world)
+
+    def rays(self, y: Floats) -> Rays:
+        """Lines of sight of pixels (M, 2)."""
+        K = self.camera_matrix
+        # cv2 ignores skew, so that the camera matrix is taken off before
+        distorted = (y - K[:2, 2]) @ np.linalg.inv(K[:2, :2]).T
+        if self.lens is None:
+            return central_rays(self, y, distorted)
+        k = self.lens.coefficients
+        xy = cv2.undistortPoints(distorted.reshape(-1, 1, 2), np.eye(3), k).reshape(-1, 2)
+        return central_rays(self, y, np.asarray(xy, dtype=np.float64))
+
+    def moved(self, motion: Floats) -> Self:
+        """The camera that sees points x where this one sees ``motion @ x``."""
+        return replace(self, T_sensor_world=self.T_sensor_world @ motion)
 
     def _normalised(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         points = points_world @ self.T_sensor_world[:3, :3].T + self.T_sensor_world[:3, 3]

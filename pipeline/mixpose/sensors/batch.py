@@ -17,42 +17,46 @@ from mixpose.sensors.lateration import RangeSensor
 from mixpose.sensors.pinhole import NEAREST, PinholeCamera
 
 
-class Bank(Protocol):
-    """L sensors that measure the same number m of coordinates."""
+class SensorBatch(Protocol):
+    """L sensors side by side; those of one coordinate have 0 as their second."""
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """Coordinates (L, n, m), Jacobians (L, n, m, 3) and visibility (L, n) of points (n, 3).
+        """Coordinates (L, n, 2), Jacobians (L, n, 2, 3) and visibility (L, n) of points (n, 3).
 
         As `Sensor.linearise` gives them one by one.
         """
         ...
 
 
-def bank(sensors: Sequence[Sensor]) -> Bank:
-    """Put sensors of one dimension side by side."""
+def side_by_side(sensors: Sequence[Sensor]) -> SensorBatch:
+    """Put sensors of any kinds side by side."""
     cameras = [sensor for sensor in sensors if isinstance(sensor, PinholeCamera)]
     if len(cameras) == len(sensors) and not any(_is_tilted(camera) for camera in cameras):
-        return PinholeBank(cameras)
+        return PinholeBatch(cameras)
     ranges = [sensor for sensor in sensors if isinstance(sensor, RangeSensor)]
     if len(ranges) == len(sensors):
-        return RangeBank(ranges)
-    return MixedBank(sensors)
+        return RangeBatch(ranges)
+    return MixedBatch(sensors)
 
 
-class MixedBank:
+class MixedBatch:
     """Sensors of any kinds, one after the other."""
 
     def __init__(self, sensors: Sequence[Sensor]) -> None:
         self._sensors = tuple(sensors)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `Bank.linearise`."""
-        parts = [sensor.linearise(points_world) for sensor in self._sensors]
-        y, J, visible = (np.stack(part) for part in zip(*parts, strict=True))
+        """As `SensorBatch.linearise`."""
+        L, n = len(self._sensors), len(points_world)
+        y, J = np.zeros((L, n, 2)), np.zeros((L, n, 2, 3))
+        visible = np.empty((L, n), dtype=np.bool_)
+        for k, sensor in enumerate(self._sensors):
+            m = sensor.dimension
+            y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(points_world)
         return y, J, visible
 
 
-class RangeBank:
+class RangeBatch:
     """Range sensors, one row of positions each."""
 
     def __init__(self, sensors: Sequence[RangeSensor]) -> None:
@@ -62,16 +66,17 @@ class RangeBank:
         self._upper = np.array([sensor.upper for sensor in sensors])
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `Bank.linearise`."""
+        """As `SensorBatch.linearise`."""
         away = points_world - self._positions
         distance = np.sqrt((away * away).sum(axis=2))
-        y = distance + self._biases
-        J = away / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
-        visible = (y >= self._lower) & (y <= self._upper)
-        return _hidden(y[..., None], J[:, :, None, :], visible)
+        y, J = np.zeros((*distance.shape, 2)), np.zeros((*distance.shape, 2, 3))
+        y[..., 0] = distance + self._biases
+        J[..., 0, :] = away / np.maximum(distance, np.finfo(np.float64).tiny)[..., None]
+        visible = (y[..., 0] >= self._lower) & (y[..., 0] <= self._upper)
+        return _hidden(y, J, visible)
 
 
-class PinholeBank:
+class PinholeBatch:
     """Pinhole cameras without tilted sensors: one product projects the points into all."""
 
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
@@ -88,7 +93,7 @@ class PinholeBank:
         self._lens = _lenses(cameras)
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `Bank.linearise`."""
+        """As `SensorBatch.linearise`."""
         points = self._rows @ points_world.T
         points += self._t
         points = points.reshape(self._count, 3, -1)

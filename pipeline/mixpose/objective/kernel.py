@@ -1,0 +1,194 @@
+"""The matched kernel: ⟨g, h⟩² / ⟨h, h⟩ of L sensors at H poses, with its derivatives.
+
+With c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
+amplitude a = c / n that fits h to g best,
+
+    S = c a,     ∇S = 2 a (∇c − a ∇n / 2),
+    −∇²S = −2 a ∇²c + a² ∇²n − (2 / n) (∇c − a ∇n) (∇c − a ∇n)ᵀ.
+
+Second derivatives of the projection are left out; they act on residuals only.
+
+Where predicted features lie apart, n does not change, and the second derivatives of C follow from
+its value and gradient, as C is a Gaussian around a feature: −∇²C = C I / v − ∇C ∇Cᵀ / C.  The
+curvature that is never negative is that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v: every feature
+is drawn to where the detections around it lie, and one that meets none does not hold the others
+back.  Where they overlap their pulls are not their own, and the curvature is Gauss-Newton's of the
+residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n), which stands for the Hessian, too.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.density import close_pairs
+from mixpose.objective.projection import Projected
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+class Matched(NamedTuple):
+    """Inner products of observed and predicted densities, per sensor and pose (L, H).
+
+    Attributes
+    ----------
+    product : (L, H) float64
+        c = ⟨g, h⟩.
+    norm : (L, H) float64
+        n = ⟨h, h⟩; 1 where a sensor sees no feature.
+    """
+
+    product: Floats
+    norm: Floats
+
+    @property
+    def amplitude(self) -> Floats:
+        """The factor a (L, H) with which h meets g best."""
+        return self.product / self.norm
+
+
+class Slopes(NamedTuple):
+    """Σ_l s_l c_l² / n_l at H poses: value (H,), gradient (H, 6), curvature and Hessian (H, 6, 6).
+
+    `hessian` is minus the second derivative.
+    """
+
+    value: Floats
+    gradient: Floats
+    curvature: Floats
+    hessian: Floats
+
+
+class Overlaps(NamedTuple):
+    """⟨h, h⟩ (L, H), and what its derivatives are made of: close pairs of predicted features.
+
+    Attributes
+    ----------
+    norm : (L, H) float64
+    pairs : (P, 2) int
+        i < j.
+    bells : (L, H, P) float64
+        w_i w_j N(p_i − p_j; 0, v).
+    away : (L, H, P, 2) float64
+        p_i − p_j.
+    """
+
+    norm: Floats
+    pairs: NDArray[np.intp]
+    bells: Floats
+    away: Floats
+
+
+def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
+    """How far the predicted features overlap.
+
+    Parameters
+    ----------
+    y : (L, H, n, 2) array
+    weights : (L, H, n) array
+    variances, tops : (L, 1) array
+        v, and the peak of a Gaussian of that variance.
+    """
+    pairs = _pairs(y, variances)
+    away = y[:, :, pairs[:, 0]] - y[:, :, pairs[:, 1]]
+    exponents = (away * away).sum(axis=3) * (-0.5 / variances)[..., None]
+    products = weights[:, :, pairs[:, 0]] * weights[:, :, pairs[:, 1]]
+    near = (exponents > _NEGLIGIBLE) & (products > 0)
+    norm = tops * (weights * weights).sum(axis=2)
+    overlapping = near.any(axis=(0, 1))
+    if not overlapping.all():
+        pairs, away = pairs[overlapping], away[:, :, overlapping]
+        exponents, products = exponents[..., overlapping], products[..., overlapping]
+    if not len(pairs):
+        return Overlaps(np.where(norm > 0, norm, 1.0), pairs, exponents, away)
+    bells = products * np.exp(exponents) * tops[..., None]
+    norm = norm + 2 * bells.sum(axis=2)
+    return Overlaps(np.where(norm > 0, norm, 1.0), pairs, bells, away)
+
+
+def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
+    """Pairs of features that may overlap at any of the poses."""
+    each = [
+        close_pairs(y[k, h], float(v))
+        for k, v in enumerate(variances[:, 0])
+        for h in range(y.shape[1])
+    ]
+    if all(one is each[0] for one in each):
+        return each[0]
+    n = y.shape[2]
+    codes = np.unique(np.concatenate([np.sort(one, axis=1) @ [n, 1] for one in each]))
+    return np.stack(np.divmod(codes, n), axis=1)
+
+
+def inner_products(C: Floats, over: Overlaps) -> Matched:
+    """⟨g, h⟩ and ⟨h, h⟩ from weighted densities C (L, H, n) at the predicted features."""
+    return Matched(C.sum(axis=2), over.norm)
+
+
+def slopes(
+    at: Projected, sampled: Floats, over: Overlaps, variances: Floats, tops: Floats, scales: Floats
+) -> Slopes:
+    """Second-order models of the matched objective at H poses.
+
+    Parameters
+    ----------
+    at : Projected
+    sampled : (L, H, n, 3) array
+        C and its gradient at the predicted features.
+    over : Overlaps
+    variances, tops, scales : (L, 1) array
+        v, N(0; 0, v), and the factor s of each sensor.
+    """
+    L, H, n = at.weights.shape
+    C = sampled[..., 0] * at.weights
+    pull = sampled[..., 1:] * at.weights[..., None]
+    by_feature = pull[..., 0, None] * at.J[..., 0, :] + pull[..., 1, None] * at.J[..., 1, :]
+    matched = inner_products(C, over)
+    amplitude, strength = matched.amplitude, 2 * scales * matched.amplitude
+    value = (scales * matched.product * amplitude).sum(axis=0)
+    rest = by_feature.sum(axis=2)
+    J = at.J.reshape(L, H, 2 * n, 6)
+    if len(over.pairs):
+        half, gram = _pair_terms(at, over, variances, tops)
+        gradient = (strength[..., None] * (rest - amplitude[..., None] * half)).sum(axis=0)
+        outer = half[..., :, None] * half[..., None, :] / over.norm[..., None, None]
+        level = (2 * scales * amplitude**2)[..., None, None]
+        curvature = (level * (gram - outer)).sum(axis=0)
+        return Slopes(value, gradient, curvature, curvature)
+    drawn = np.repeat((strength / variances)[..., None] * C, 2, axis=2)
+    curvature = (J.swapaxes(2, 3) @ (drawn[..., None] * J)).sum(axis=0)
+    met = C > 0
+    bent = np.where(met, strength[..., None] / np.where(met, C, 1.0), 0.0)[..., None] * by_feature
+    hessian = curvature - (by_feature.swapaxes(2, 3) @ bent).sum(axis=0)
+    across = (2 * scales / matched.norm)[..., None, None] * rest[..., :, None]
+    hessian -= (across * rest[..., None, :]).sum(axis=0)
+    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature, hessian)
+
+
+def _pair_terms(
+    at: Projected, over: Overlaps, variances: Floats, tops: Floats
+) -> tuple[Floats, Floats]:
+    """⟨h, ∂h⟩ (L, H, 6) and ⟨∂h, ∂hᵀ⟩ (L, H, 6, 6)."""
+    L, H, n = at.weights.shape
+    v = variances[..., None]
+    weighted = (at.J * at.weights[..., None, None]).reshape(L, H, 2 * n, 6)
+    gram = weighted.swapaxes(2, 3) @ weighted * (tops / variances)[..., None, None]
+    i, j = over.pairs[:, 0], over.pairs[:, 1]
+    J_i, J_j = at.J[:, :, i], at.J[:, :, j]
+    along_i, along_j = ((over.away[..., None] * each).sum(axis=3) for each in (J_i, J_j))
+    scaled = over.bells[..., None] / v[..., None]
+    half = -(scaled * (along_i - along_j)).sum(axis=2)
+    cross = _gram(scaled[..., None] * J_i, J_j)
+    cross -= (scaled / v[..., None] * along_i).swapaxes(2, 3) @ along_j
+    return half, gram + cross + cross.swapaxes(2, 3)
+
+
+def _gram(A: Floats, B: Floats) -> Floats:
+    """Σ_p A_pᵀ B_p (L, H, 6, 6) of A and B (L, H, P, 2, 6)."""
+    L, H, P = A.shape[:3]
+    return A.reshape(L, H, 2 * P, 6).swapaxes(2, 3) @ B.reshape(L, H, 2 * P, 6)

@@ -1,0 +1,108 @@
+"""A body in several sensors at once, at one pose or many.
+
+Arrays have the sensors first, then the poses: places y (L, H, n, 2), Jacobians J (L, H, n, 2, 6).
+Sensors of one coordinate have 0 as their second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.sensors import Sensor, facing, side_by_side
+
+Floats: TypeAlias = NDArray[np.float64]
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+class Projected(NamedTuple):
+    """A body in L sensors at H poses.
+
+    Attributes
+    ----------
+    y : (L, H, n, 2) float64
+    J : (L, H, n, 2, 6) float64
+        By the twist of the pose; zero where a feature is not visible.
+    seen : (L, H, n) bool
+        In view, and facing the sensor where normals are known.
+    faced : (L, H, n) bool
+        Facing the sensor, in view or not.
+    weights : (L, H, n) float64
+        Zero where a feature is not seen.
+    """
+
+    y: Floats
+    J: Floats
+    seen: Mask
+    faced: Mask
+    weights: Floats
+
+
+class BodyProjection:
+    """Sensors that look at a body; made once for the same ones by `project_body`.
+
+    Attributes
+    ----------
+    sensors : tuple of Sensor
+    body : Body
+    dimensions : (L,) int
+        m, the coordinates of each sensor.
+    """
+
+    def __init__(self, sensors: Sequence[Sensor], body: Body) -> None:
+        self.sensors = tuple(sensors)
+        self.body = body
+        self.dimensions = np.array([sensor.dimension for sensor in sensors])
+        self._points = body.nodes.points
+        self._weights = body.nodes.weights
+        self._normals = body.node_normals
+        self._batch = side_by_side(self.sensors)
+
+    def project(self, poses: Floats) -> Projected:
+        """Where the sensors see the body at poses (H, 4, 4)."""
+        H, n, L = len(poses), len(self._points), len(self.sensors)
+        arms = (self._points @ poses[:, :3, :3].swapaxes(1, 2)).reshape(-1, 3)
+        world = arms + np.repeat(poses[:, :3, 3], n, axis=0)
+        y, by_world, visible = self._batch.linearise(world)
+        J = pose_jacobian(by_world, arms).reshape(L, H, n, 2, 6)
+        seen = visible.reshape(L, H, n)
+        if self._normals is None:
+            faced = np.ones((L, H, n), dtype=np.bool_)
+        else:
+            points = world.reshape(H, n, 3)
+            each = [facing(one, poses, points, self._normals) for one in self.sensors]
+            faced = np.array(each)
+            seen &= faced
+        return Projected(y.reshape(L, H, n, 2), J, seen, faced, self._weights * seen)
+
+
+@lru_cache(maxsize=64)
+def project_body(sensors: tuple[Sensor, ...], body: Body) -> BodyProjection:
+    """The projection of a body into sensors, which are the same objects from frame to frame."""
+    return BodyProjection(sensors, body)
+
+
+def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
+    """Chain Jacobians (..., n, m, 3) by world points into (..., n, m, 6) by the pose's twist.
+
+    A turn ω about the object's origin moves an arm x = R z by ω × x, and a · (ω × x) = ω · (x × a).
+
+    Parameters
+    ----------
+    by_world : (..., n, m, 3) array
+    arms : (..., n, 3) array
+        Points relative to the object's origin, in world axes.
+    """
+    J = np.empty((*by_world.shape[:-1], 6))
+    x, y, z = arms[..., 0, None], arms[..., 1, None], arms[..., 2, None]
+    a, b, c = by_world[..., 0], by_world[..., 1], by_world[..., 2]
+    J[..., :3] = by_world
+    J[..., 3] = y * c - z * b
+    J[..., 4] = z * a - x * c
+    J[..., 5] = x * b - y * a
+    return J

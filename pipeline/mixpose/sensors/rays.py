@@ -1,0 +1,76 @@
+"""Lines of sight: where in space the features that a sensor detected may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.rigid import inverse
+from mixpose.sensors.base import Floats
+
+if TYPE_CHECKING:
+    from mixpose.sensors.fisheye import FisheyeCamera
+    from mixpose.sensors.pinhole import PinholeCamera
+
+_WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Half-lines (lines, for parallel beams) in the world, one per detection.
+
+    Attributes
+    ----------
+    origins : (M, 3) float64
+        Centre of projection, or a point on the sensor's plane.
+    directions : (M, 3) float64
+        Unit vectors away from the sensor.
+    pixels : (M, 2) float64
+        The detections.
+    central : bool
+        Whether all rays start at one centre, in front of which alone the camera sees.
+    offset, slope : float
+        Length that a px covers across the ray at a distance d from its origin:
+        ``offset + slope * d``.
+    """
+
+    origins: Floats
+    directions: Floats
+    pixels: Floats
+    central: bool
+    offset: float
+    slope: float
+
+    def __len__(self) -> int:
+        return len(self.origins)
+
+    def select(self, chosen: NDArray[Any]) -> Rays:
+        """The rays of some detections."""
+        return Rays(
+            self.origins[chosen],
+            self.directions[chosen],
+            self.pixels[chosen],
+            self.central,
+            self.offset,
+            self.slope,
+        )
+
+
+def central_rays(camera: PinholeCamera | FisheyeCamera, pixels: Floats, xy: Floats) -> Rays:
+    """Rays through the centre of projection, of normalised coordinates (M, 2) without distortion.
+
+    Detections outside of what the lens model explains are left out.
+    """
+    T_world_sensor = inverse(camera.T_sensor_world)
+    directions = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    directions = directions @ T_world_sensor[:3, :3].T
+    origin = T_world_sensor[:3, 3]
+    focal = float(np.sqrt(abs(np.linalg.det(camera.camera_matrix[:2, :2]))))
+    rays = Rays(np.tile(origin, (len(pixels), 1)), directions, pixels, True, 0.0, 1.0 / focal)
+    again, visible = camera.project(origin + directions)
+    error = np.linalg.norm(again - pixels, axis=1)
+    return rays.select(visible & (error < _WORST_ROUND_TRIP))
