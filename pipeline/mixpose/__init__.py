@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mixpose.body import Body, PointFeature, SegmentFeature
     from mixpose.density import Observation
     from mixpose.errors import MixposeError, RecordingError, SessionError
-    from mixpose.estimation import estimate_pose
+    from mixpose.tracking import estimate_pose
     from mixpose.objective import View
     from mixpose.records import Estimate
     from mixpose.runner import run
@@ -36,7 +36,7 @@ _HOMES = {
     "Session": "mixpose.session",
     "SessionError": "mixpose.errors",
     "View": "mixpose.objective",
-    "estimate_pose": "mixpose.estimation",
+    "estimate_pose": "mixpose.tracking",
     "load_session": "mixpose.session",
     "run": "mixpose.runner",
 }

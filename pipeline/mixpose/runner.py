@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from mixpose.density import Observation
 from mixpose.errors import SessionError
-from mixpose.estimation import Encounter, Expectation, Track, Tracker, predict
 from mixpose.extraction import Window, extract
 from mixpose.frames import Source, SourceSpec, open_source, pair
 from mixpose.objective import View
@@ -28,6 +27,15 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.tracking import (
+    Expectation,
+    Track,
+    Tracker,
+    are_as_good,
+    have_fewer,
+    is_convincing,
+    predict,
+)
 
 if TYPE_CHECKING:
     from mixpose.sensors import Sensor
@@ -149,15 +157,13 @@ def _estimates(
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
 ) -> Generator[Estimate, None, None]:
-    cameras = _windowed(session)
-    gaze = next(iter(tracker.gazes_of(list(cameras.values()))), None)
-    expectation = Expectation(tracker.body, cameras, tracker.free, gaze)
-    met: Encounter | None = None
+    expectation = Expectation(tracker.body, _windowed(session), tracker.free)
+    tracked = False
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            step = _advance(session, tracker, expectation, track, frame_set, met)
-            track, met = step.track, step.met
+            step = _advance(session, tracker, expectation, track, frame_set, tracked)
+            track, tracked = step.track, step.convinces
             estimate = _with_silent_sensors(step.estimate, session.sensors)
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
             if watch is not None:
@@ -177,12 +183,12 @@ def _windowed(session: Session) -> dict[str, Sensor]:
 
 
 class _Step(NamedTuple):
-    """A frame's estimate, what it was made from, and how the body was met if that convinces."""
+    """A frame's estimate, what it was made from, and whether the next need not be seen whole."""
 
     track: Track
     estimate: Estimate
     views: list[View]
-    met: Encounter | None
+    convinces: bool
 
 
 def _advance(
@@ -191,21 +197,20 @@ def _advance(
     expectation: Expectation,
     track: Track,
     frame_set: FrameSet,
-    before: Encounter | None,
+    tracked: bool,
 ) -> _Step:
     """Estimate a frame: around the prediction if that convinces, else from all that is there.
 
-    `before` tells how the body was met in the frame before, None if that did not convince.
+    `tracked` tells whether the frame before convinced.
     """
 
     def estimated(views: list[View]) -> _Step:
         after, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
-        met = None
-        if estimate.status == "ok" and estimate.T_world_object is not None:
-            met = expectation.encounter(views, estimate.T_world_object)
-        return _Step(after, estimate, views, met if met is not None and met.convincing else None)
+        share = tracker.rules.acceptance.convincing
+        met = estimate.status == "ok" and is_convincing(after.tallies, expectation.names, share)
+        return _Step(after, estimate, views, met)
 
-    if before is not None:
+    if tracked:
         predictions = predict(track, tracker.body, frame_set.number, frame_set.time_s)
         images = {
             name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)
@@ -214,20 +219,11 @@ def _advance(
         windows = {name: window for name, window in windows.items() if name in images}
         if windows:
             views = observe(session, frame_set, windows)
-            if not _fewer(views, before):
+            if not have_fewer(views, track.tallies):
                 step = estimated(views)
-                if step.met is not None and step.met.as_good_as(before):
+                if step.convinces and are_as_good(step.track.tallies, track.tallies):
                     return step
     return estimated(observe(session, frame_set))
-
-
-def _fewer(views: Sequence[View], before: Encounter) -> bool:
-    """Whether a camera has fewer detections than it met features in the frame before."""
-    patterns = {view.name: view.observation.pattern for view in views}
-    return any(
-        isinstance(pattern, PointPattern) and len(pattern.points) < before.met.get(name, 0)
-        for name, pattern in patterns.items()
-    )
 
 
 def observe(

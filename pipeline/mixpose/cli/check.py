@@ -29,7 +29,8 @@ from mixpose.checking import (
     with_image_sizes,
 )
 from mixpose.errors import RecordingError
-from mixpose.estimation import expected_covariance, free_mask
+from mixpose.fit import free_mask
+from mixpose.judgement import expected_covariance
 from mixpose.frames import Source
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.runner import open_sources

@@ -117,10 +117,13 @@ class _Planes:
 
 @dataclass(frozen=True)
 class _Pages:
-    """Squares that are drawn, as places in the table, and three layers (S, side, side) of them."""
+    """Squares that are drawn, as places in the table, and layers (3, 1 + S, side, side).
+
+    The first page of the layers is empty.
+    """
 
     cells: Indices
-    layers: Sequence[Singles]
+    layers: Singles
 
 
 def draw(
@@ -147,14 +150,16 @@ def draw(
     steps = np.asarray(sigmas, dtype=np.float64) / steps_per_sigma
     reach = REACH * steps_per_sigma
     # looking up linearly is one more blur by a triangle, averaged over the places within a cell
-    narrowed = steps * np.sqrt(steps_per_sigma**2 - 1 / 6)
-    kept = [_nearby(one, places, 6 * REACH * s) for one, places, s in zip(patterns, near, sigmas)]
-    planes = _planes(kept, steps, reach)
+    narrowed = steps * math.sqrt(steps_per_sigma**2 - 1 / 6)
+    bounds = [_bounds(one, places, 6 * REACH * s) for one, places, s in zip(patterns, near, sigmas)]
+    points = [places for places, _ in bounds]
+    planes = _planes(points, [_dimension(pattern) for pattern in patterns], steps, reach)
     drawn = []
-    detected = [k for k, pattern in enumerate(kept) if isinstance(pattern, PointPattern)]
+    detected = [k for k, pattern in enumerate(patterns) if isinstance(pattern, PointPattern)]
     if detected:
-        drawn.append(_pages_of_points(kept, detected, planes, narrowed, reach))
-    for k, pattern in enumerate(kept):
+        some = [bounds[k] for k in detected]
+        drawn.append(_pages_of_points(some, np.array(detected), planes, narrowed, reach))
+    for k, pattern in enumerate(patterns):
         if isinstance(pattern, GridPattern):
             drawn.append(_pages_of_grid(pattern, k, planes, float(narrowed[k]), reach, near[k]))
     count = 1 + sum(len(pages.cells) for pages in drawn)
@@ -182,57 +187,73 @@ def _packed(drawn: Sequence[_Pages], count: int) -> tuple[Singles, Floats]:
     side = PAGE + 1
     columns = -(-count // _ROWS)
     rows = -(-count // columns)
-    stacked = np.empty((3, columns, rows * side, side), dtype=np.float32)
-    flat = stacked.reshape(3, -1, side, side)
-    flat[:, 0], flat[:, count:] = 0.0, 0.0
-    for k in range(3):
-        first = 1
-        for pages in drawn:
-            flat[k, first : first + len(pages.cells)] = pages.layers[k]
-            first += len(pages.cells)
-    layers = [grid[0] if columns == 1 else np.hstack(list(grid)) for grid in stacked]
+    if len(drawn) == columns == 1:
+        layers = drawn[0].layers.reshape(3, -1, side)
+    else:
+        stacked = np.zeros((3, columns, rows * side, side), dtype=np.float32)
+        parts = [pages.layers[:, 1:] for pages in drawn]
+        stacked.reshape(3, -1, side, side)[:, 1:count] = np.concatenate(parts, axis=1)
+        layers = stacked.swapaxes(1, 2).reshape(3, rows * side, columns * side)
     number = np.arange(rows * columns)
-    corners = side * np.stack([number // rows, number % rows], axis=1).astype(np.float64)
-    return np.asarray(cv2.merge(layers), dtype=np.float32), corners
+    corners = np.zeros((rows * columns, 2))
+    corners[:, 0], corners[:, 1] = side * (number // rows), side * (number % rows)
+    return np.asarray(cv2.merge(list(layers)), dtype=np.float32), corners
 
 
-def _nearby(pattern: Pattern, near: Floats | None, margin: float) -> Pattern:
-    """Detections within a margin of the box of predicted features, with the weight of all."""
+def _dimension(pattern: Pattern) -> int:
+    if isinstance(pattern, PointPattern):
+        return int(pattern.points.shape[1])
+    return len(pattern.origin)
+
+
+def _bounds(pattern: Pattern, near: Floats | None, margin: float) -> tuple[Floats, Floats]:
+    """Detections with normalised weights, in the box of predicted features; corners of a grid."""
     if isinstance(pattern, GridPattern):
-        return pattern
+        size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
+        return np.array([pattern.origin, pattern.origin + size * pattern.step]), np.zeros(2)
     points, weights = pattern.points, pattern.weights / pattern.weights.sum()
     if near is not None and len(near):
         lower, upper = near.min(axis=0) - margin, near.max(axis=0) + margin
         kept = ((points >= lower) & (points <= upper)).all(axis=1)
+        kept[:1] |= not kept.any()  # a plane lies somewhere
         points, weights = points[kept], weights[kept]
-    return PointPattern(points, weights)
+    return points, weights
 
 
-def _planes(patterns: Sequence[Pattern], steps: Floats, reach: float) -> _Planes:
-    """Planes around what each sensor saw, with a ring of pages that are never drawn.
+def _together(points: Sequence[Floats]) -> tuple[Floats, Indices, Indices]:
+    """Places (K, 2) of all sensors, how many each has, and where each begins."""
+    counts = np.array([len(each) for each in points])
+    begins = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    if all(each.shape[1] == 2 for each in points):
+        return np.concatenate(points), counts, begins
+    places = np.zeros((int(counts.sum()), 2))
+    for each, begin in zip(points, begins.tolist(), strict=True):
+        places[begin : begin + len(each), : each.shape[1]] = each
+    return places, counts, begins
 
-    What is too far from the middle of its pattern for a table of `MOST_PAGES` is outside.
+
+def _planes(
+    points: Sequence[Floats], dimensions: Sequence[int], steps: Floats, reach: float
+) -> _Planes:
+    """Planes around places (K, m) of each sensor, with a ring of pages that are never drawn.
+
+    What is too far from the middle of its places for a table of `MOST_PAGES` is outside.
     """
-    L = len(patterns)
-    origins, shapes = np.zeros((L, 2)), np.ones((L, 2), dtype=np.intp)
-    two = np.zeros(L, dtype=np.bool_)
-    for k, (pattern, step) in enumerate(zip(patterns, steps.tolist(), strict=True)):
-        if isinstance(pattern, PointPattern):
-            places = pattern.points
-        else:
-            size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
-            places = np.array([pattern.origin, pattern.origin + size * pattern.step])
-        m = places.shape[1]
-        two[k] = m == 2
-        if not len(places):
-            continue
-        lower, upper = places.min(axis=0), places.max(axis=0)
-        if math.prod(((upper - lower) / (PAGE * step) + 2).tolist()) > MOST_PAGES:
-            middle, half = np.median(places, axis=0), PAGE * step * MOST_PAGES ** (1 / m) / 2.5
-            lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
-        origins[k, :m] = lower - (reach + PAGE) * step
-        shapes[k, :m] = np.ceil((upper - lower) / (PAGE * step) + 2 * reach / PAGE) + 3
-    offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]]).astype(np.intp)
+    two = np.array(dimensions) == 2
+    places, _, begins = _together(points)
+    lower = np.minimum.reduceat(places, begins)
+    upper = np.maximum.reduceat(places, begins)
+    pages = PAGE * steps[:, None]
+    crowded = ((upper - lower) / pages + 2).prod(axis=1) > MOST_PAGES
+    for k in np.flatnonzero(crowded).tolist():
+        half = float(pages[k, 0]) * MOST_PAGES ** (1 / dimensions[k]) / 2.5
+        middle = np.zeros(2)
+        middle[: dimensions[k]] = np.median(points[k], axis=0)
+        lower[k], upper[k] = np.maximum(lower[k], middle - half), np.minimum(upper[k], middle + half)
+    shapes = (((upper - lower) / pages + (2 * reach / PAGE + 3)) + 1).astype(np.intp)
+    origins = lower - (reach + PAGE) * steps[:, None]
+    shapes[~two, 1], origins[~two, 1] = 1, 0.0
+    offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
     return _Planes(steps, origins, shapes, offsets, two)
 
 
@@ -251,55 +272,68 @@ def _squares(
 
 
 def _pages_of_points(
-    patterns: Sequence[Pattern], chosen: Sequence[int], planes: _Planes, sigmas: Floats, reach: float
+    detections: Sequence[tuple[Floats, Floats]],
+    chosen: Indices,
+    planes: _Planes,
+    sigmas: Floats,
+    reach: float,
 ) -> _Pages:
     """Pages within reach of detections, which are drawn as exact Gaussians."""
-    points = [p.points for p in patterns if isinstance(p, PointPattern)]
-    sensor = np.repeat(np.array(chosen), [len(each) for each in points])
-    places = np.zeros((len(sensor), 2))
-    row = 0
-    for each in points:
-        places[row : row + len(each), : each.shape[1]] = each
-        row += len(each)
-    weights = np.concatenate([p.weights for p in patterns if isinstance(p, PointPattern)])
+    places, counts, _ = _together([points for points, _ in detections])
+    weights = np.concatenate([weights for _, weights in detections])
+    sensor = np.repeat(chosen, counts)
     two, step, sigma = planes.two[sensor], planes.steps[sensor], sigmas[sensor]
     q = (places - planes.origins[sensor]) / step[:, None]
     u, v, source = _squares(q, planes.shapes[sensor], two, reach)
     cells = planes.offsets[sensor][source] + v * planes.shapes[sensor, 0][source] + u
     order = np.argsort(cells, kind="stable")
     cells, source = cells[order], source[order]
-    page = np.stack([u[order], v[order]], axis=1)
-    away = (PAGE * page - q[source])[:, :, None] + np.arange(PAGE + 1)
-    away *= (step / sigma)[source][:, None, None]
-    bells = np.exp(-0.5 * away * away)
-    slopes = bells * away * (-1 / sigma)[source][:, None, None]
+    first = PAGE * np.stack([u[order], v[order]], axis=1) - q[source]
+    scale = (step / sigma)[source]
+    away = (first * scale[:, None]).astype(np.float32)[:, :, None]
+    away = away + scale.astype(np.float32)[:, None, None] * np.arange(PAGE + 1, dtype=np.float32)
+    bells = np.exp(np.float32(-0.5) * away * away)
     height = weights / (np.sqrt(2 * np.pi) * sigma) ** (1 + two)
-    bells[:, 0] *= height[source][:, None]
-    slopes[:, 0] *= height[source][:, None]
+    bells[:, 0] *= height.astype(np.float32)[source, None]
+    slopes = bells * away
+    slopes *= (-1 / sigma).astype(np.float32)[source, None, None]
     if not two.all():  # one row, which does not change across
         flat = ~two[source]
         bells[flat, 1], slopes[flat, 1] = 1.0, 0.0
-    bells, slopes = bells.astype(np.float32), slopes.astype(np.float32)
-    along = bells[:, 0, None], slopes[:, 0, None]
-    across = bells[:, 1, :, None], slopes[:, 1, :, None]
-    factors_of = ((across[0], along[0]), (across[0], along[1]), (across[1], along[0]))
-    is_new = np.diff(cells, prepend=-1) > 0
-    layers = [_summed(a, b, is_new) for a, b in factors_of]
+    is_new = np.empty(len(cells), dtype=np.bool_)
+    is_new[:1], is_new[1:] = True, cells[1:] > cells[:-1]
+    layers = _summed(bells, slopes, is_new)
     return _Pages(cells[is_new], layers)
 
 
-def _summed(v: Singles, u: Singles, is_new: NDArray[np.bool_]) -> Singles:
-    """Products of columns (K, side, 1) and rows (K, 1, side), summed over those of one page."""
-    if is_new.all():
-        return v * u
-    pages = v[is_new] * u[is_new]
+def _summed(bells: Singles, slopes: Singles, is_new: NDArray[np.bool_]) -> Singles:
+    """Layers (3, 1 + S, side, side): products of rows and columns, summed over those of a page.
+
+    Parameters
+    ----------
+    bells, slopes : (K, 2, side) array
+        Gaussians along u and v, and their derivatives, by ascending page.
+    is_new : (K,) bool
+        Where a page begins.
+    """
+    side = bells.shape[2]
+    page = np.cumsum(is_new)
+    layers = np.empty((3, int(page[-1]) + 1 if len(page) else 1, side, side), dtype=np.float32)
+    layers[:, 0] = 0.0
     begins = np.flatnonzero(is_new)
-    page = np.cumsum(is_new) - 1
-    rank = np.arange(len(is_new)) - begins[page]
-    for k in range(1, int(rank.max()) + 1):
-        more = rank == k
-        pages[page[more]] += v[more] * u[more]
-    return pages
+    alone = len(begins) == len(is_new)
+    rank = np.zeros(1) if alone else np.arange(len(is_new)) - begins[page - 1]
+    for k in range(int(rank.max()) + 1):
+        chosen = slice(None) if alone else np.flatnonzero(rank == k)
+        bell, slope = bells[chosen], slopes[chosen]
+        u, v = bell[:, 0, None], bell[:, 1, :, None]
+        products = ((v, u), (v, slope[:, 0, None]), (slope[:, 1, :, None], u))
+        for layer, (rows, columns) in zip(layers, products, strict=True):
+            if k == 0:
+                np.multiply(rows, columns, out=layer[1:])
+            else:
+                layer[page[chosen]] += rows * columns
+    return layers
 
 
 def _pages_of_grid(
@@ -326,11 +360,13 @@ def _pages_of_grid(
     small, left_over = reduced(pattern, sigma)
     made = factors(small, left_over, places[0], places[1] if two else None)
     along = [each.reshape(len(each), len(columns), side) for each in made[2:]]
+    layers = np.zeros((3, 1 + len(cells), side, side), dtype=np.float32)
     if not two:
-        layers = [np.zeros((len(cells), side, side), dtype=np.float32) for _ in range(3)]
-        layers[0][:, 0], layers[1][:, 0] = along[0][0, iu], along[1][0, iu]
+        layers[0, 1:, 0], layers[1, 1:, 0] = along[0][0, iu], along[1][0, iu]
         return _Pages(planes.offsets[k] + cells, layers)
     across = [each.reshape(len(each), len(rows), side) for each in made[:2]]
     U = [np.ascontiguousarray(each[:, iu].swapaxes(0, 1)) for each in along]
     V = [np.ascontiguousarray(each[:, iv].transpose(1, 2, 0)) for each in across]
-    return _Pages(planes.offsets[k] + cells, [V[0] @ U[0], V[0] @ U[1], V[1] @ U[0]])
+    for layer, rows_, columns_ in zip(layers, (V[0], V[0], V[1]), (U[0], U[1], U[0]), strict=True):
+        layer[1:] = rows_ @ columns_
+    return _Pages(planes.offsets[k] + cells, layers)

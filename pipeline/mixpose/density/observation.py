@@ -83,6 +83,11 @@ class Observation:
             return len(self.pattern.points)
         return int(self.pattern.values.size)
 
+    @property
+    def is_sparse(self) -> bool:
+        """Whether its density costs little to draw everywhere: detections, and profiles."""
+        return self.cell is None or self.dimension == 1
+
     @cached_property
     def is_empty(self) -> bool:
         """Whether the sensor saw no feature at all."""
@@ -112,6 +117,13 @@ class Observation:
 
     def energy(self, sigma: float) -> float:
         """⟨g, g⟩ at the given standard deviation of a feature, over the whole pattern."""
+        return self._finest_energy if sigma == self.sigma else self._energy(sigma)
+
+    @cached_property
+    def _finest_energy(self) -> float:
+        return self._energy(self.sigma)
+
+    def _energy(self, sigma: float) -> float:
         pattern = self.pattern
         if self.is_empty:
             return 0.0

@@ -29,7 +29,9 @@ from mixpose.objective.projection import Projected
 Floats: TypeAlias = NDArray[np.float64]
 
 _NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
-_TINY = float(np.finfo(np.float64).tiny)
+_FEW = 24  # features up to which all pairs are looked at first
+_NOTHING = 1e-12  # of a feature's peak: less is no detection
+_NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
 
 
 class Matched(NamedTuple):
@@ -94,12 +96,14 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     variances, tops : (L, 1) array
         v, and the peak of a Gaussian of that variance.
     """
+    norm = tops * (weights * weights).sum(axis=2)
+    if _are_apart(y, variances):
+        return Overlaps(np.where(norm > 0, norm, 1.0), _NO_PAIRS, norm, norm)
     pairs = _pairs(y, variances)
     away = y[:, :, pairs[:, 0]] - y[:, :, pairs[:, 1]]
     exponents = (away * away).sum(axis=3) * (-0.5 / variances)[..., None]
     products = weights[:, :, pairs[:, 0]] * weights[:, :, pairs[:, 1]]
     near = (exponents > _NEGLIGIBLE) & (products > 0)
-    norm = tops * (weights * weights).sum(axis=2)
     overlapping = near.any(axis=(0, 1))
     if not overlapping.all():
         pairs, away = pairs[overlapping], away[:, :, overlapping]
@@ -109,6 +113,17 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     bells = products * np.exp(exponents) * tops[..., None]
     norm = norm + 2 * bells.sum(axis=2)
     return Overlaps(np.where(norm > 0, norm, 1.0), pairs, bells, away)
+
+
+def _are_apart(y: Floats, variances: Floats) -> bool:
+    """Whether no two of few features are near enough to overlap."""
+    L, H, n, _ = y.shape
+    if n > _FEW:
+        return False
+    away = y[:, :, :, None] - y[:, :, None]
+    away *= away
+    close = away[..., 0] + away[..., 1] < (-2 * _NEGLIGIBLE) * variances[..., None, None]
+    return int(np.count_nonzero(close)) <= L * H * n  # each is close to itself
 
 
 def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
@@ -144,15 +159,14 @@ def slopes(
     variances, tops, scales : (L, 1) array
         v, N(0; 0, v), and the factor s of each sensor.
     """
-    L, H, n = at.weights.shape
     C = sampled[..., 0] * at.weights
     pull = sampled[..., 1:] * at.weights[..., None]
     by_feature = pull[..., 0, None] * at.J[..., 0, :] + pull[..., 1, None] * at.J[..., 1, :]
     matched = inner_products(C, over)
-    amplitude, strength = matched.amplitude, 2 * scales * matched.amplitude
+    amplitude = matched.amplitude
+    strength = 2 * scales * amplitude
     value = (scales * matched.product * amplitude).sum(axis=0)
     rest = by_feature.sum(axis=2)
-    J = at.J.reshape(L, H, 2 * n, 6)
     if len(over.pairs):
         half, gram = _pair_terms(at, over, variances, tops)
         gradient = (strength[..., None] * (rest - amplitude[..., None] * half)).sum(axis=0)
@@ -160,14 +174,19 @@ def slopes(
         level = (2 * scales * amplitude**2)[..., None, None]
         curvature = (level * (gram - outer)).sum(axis=0)
         return Slopes(value, gradient, curvature, curvature)
-    drawn = np.repeat((strength / variances)[..., None] * C, 2, axis=2)
-    curvature = (J.swapaxes(2, 3) @ (drawn[..., None] * J)).sum(axis=0)
-    met = C > 0
-    bent = np.where(met, strength[..., None] / np.where(met, C, 1.0), 0.0)[..., None] * by_feature
-    hessian = curvature - (by_feature.swapaxes(2, 3) @ bent).sum(axis=0)
-    across = (2 * scales / matched.norm)[..., None, None] * rest[..., :, None]
-    hessian -= (across * rest[..., None, :]).sum(axis=0)
-    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature, hessian)
+    strength = strength[..., None]
+    drawn = (strength / variances[..., None] * C)[..., None, None] * at.J
+    curvature = _by_pose(at.J).swapaxes(1, 2) @ _by_pose(drawn)
+    bent = (strength / np.maximum(C, _NOTHING * tops[..., None]))[..., None] * by_feature
+    across = (2 * scales / matched.norm)[..., None] * rest
+    hessian = curvature - _by_pose(by_feature).swapaxes(1, 2) @ _by_pose(bent)
+    hessian -= rest.transpose(1, 2, 0) @ across.swapaxes(0, 1)
+    return Slopes(value, (strength * rest).sum(axis=0), curvature, hessian)
+
+
+def _by_pose(rows: Floats) -> Floats:
+    """Rows of all sensors and features (H, K, 6), of arrays (L, H, ..., 6)."""
+    return rows.swapaxes(0, 1).reshape(rows.shape[1], -1, 6)
 
 
 def _pair_terms(

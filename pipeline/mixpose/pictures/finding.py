@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.estimation.meeting import LEAST_SHARE, Meeting, meet
+from mixpose.density import AssociationRules
+from mixpose.judgement import Association, associate
 from mixpose.objective import View, matched_objective
-from mixpose.objective.base import facing
+from mixpose.objective.matched import FINE_STEPS
 from mixpose.pictures.overlay import projected_features
 from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
@@ -124,37 +125,30 @@ def _features_worth(view: View) -> float:
 
 def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
-    nodes, nodes_seen = _nodes(view, body, T)
-    meeting = _meeting(view, body, T)
+    found = _association(view, body, T)
     met = np.zeros(len(body), dtype=np.bool_)
-    if meeting is not None:
-        feature = body.nodes.feature[nodes_seen]
-        shares = np.bincount(feature, meeting.shares, minlength=len(body))
+    if found is not None:
+        feature = body.nodes.feature[found.features]
+        shares = np.bincount(feature, found.shares, minlength=len(body))
         full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
-        met = seen & (shares > LEAST_SHARE * full)
+        met = seen & (shares > AssociationRules().min_share * full)
     unexplained = np.zeros(0, dtype=np.bool_)
     if points is not None:
-        away = np.linalg.norm(points[:, None] - nodes[nodes_seen], axis=-1)
-        reach = 2 * view.observation.sigma * np.sqrt(-np.log(LEAST_SHARE))
+        nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
+        if found is not None:
+            in_view[np.setdiff1d(np.arange(len(in_view)), found.features)] = False
+        away = np.linalg.norm(points[:, None] - nodes[in_view], axis=-1)
+        reach = view.observation.sigma * np.sqrt(2 * AssociationRules().reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
-    explained = 0.0 if meeting is None else meeting.explained
-    return Expectation(
-        y, seen, met, unexplained, explained, None if meeting is None else meeting.rms
-    )
+    explained = 0.0 if found is None else found.explained
+    return Expectation(y, seen, met, unexplained, explained, None if found is None else found.rms)
 
 
-def _meeting(view: View, body: Body, T: Floats) -> Meeting | None:
+def _association(view: View, body: Body, T: Floats) -> Association | None:
     """The pose against the sensor's density; None where the sensor has nothing of either."""
     if view.observation.is_empty:
         return None
-    objective = matched_objective([view], body, [view.observation.sigma], T, fine=True)
-    if not objective.stacks:
-        return None
-    return meet(objective.stacks[0], [view.observation], T)[0]
-
-
-def _nodes(view: View, body: Body, T: Floats) -> tuple[Floats, Mask]:
-    """Sensor coordinates (Q, m) of the body's nodes, and which of them it sees."""
-    points = transform(T, body.nodes.points)
-    y, seen = view.sensor.project(points)
-    return y, seen & facing(view.sensor, T, points, body.node_normals)
+    sigmas = [view.observation.sigma]
+    objective = matched_objective([view], body, sigmas, T, steps_per_sigma=FINE_STEPS)
+    found = associate(objective, T, AssociationRules())[0]
+    return found if len(found.features) else None

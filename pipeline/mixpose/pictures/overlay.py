@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
-from mixpose.objective.base import facing
 from mixpose.pictures.canvas import (
     GREY,
     WHITE,
@@ -25,7 +24,7 @@ from mixpose.pictures.canvas import (
 )
 from mixpose.records import Status
 from mixpose.rigid import transform
-from mixpose.sensors import Sensor
+from mixpose.sensors import Sensor, facing
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -156,7 +155,7 @@ def projected_covariances(
 ) -> Floats:
     """Covariances (N, m, m) of the projected features that the pose's covariance (6, 6) makes."""
     _, by_world, _ = sensor.linearise(transform(T_world_object, body.means))
-    J = pose_jacobian(by_world, T_world_object, body.means)
+    J = pose_jacobian(by_world, body.means @ T_world_object[:3, :3].T)
     return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
 
 

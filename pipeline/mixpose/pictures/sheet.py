@@ -9,8 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.estimation import Tracker
-from mixpose.estimation.annealing import RATIO, ladder
+from mixpose.fit import ScheduleRules, blur_schedule
 from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, words
 from mixpose.pictures.finding import Finding
@@ -26,6 +25,7 @@ from mixpose.pictures.stages import (
 )
 from mixpose.records import Estimate
 from mixpose.session import SensorSetup, Session
+from mixpose.tracking import Tracker
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -114,9 +114,9 @@ def blur_levels(
         return {}
     if estimate.T_world_object is None:
         steps = range(_LEVELS_WITHOUT_POSE - 1, -1, -1)
-        return {view.name: [view.observation.sigma * RATIO**k for k in steps] for view in views}
+        return {view.name: [view.observation.sigma * ScheduleRules().ratio**k for k in steps] for view in views}
     around = np.where(tracker.free, tracker.start_uncertainty, 0.0)
-    levels = ladder(views, tracker.body, estimate.T_world_object, around)
+    levels = blur_schedule(views, tracker.body, estimate.T_world_object, around)
     return {view.name: [level[k] for level in levels] for k, view in enumerate(views)}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.estimation import EstimatorOptions, free_mask
+from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View, build_objective, pose_jacobian
 from mixpose.rigid import perturb, transform
 
@@ -128,7 +128,7 @@ def _one_blur(
     for view, sigma in zip(views, sigmas, strict=True):
         _, by_world, seen = view.sensor.linearise(transform(T_world_object, points))
         if seen.any():
-            J = pose_jacobian(by_world, T_world_object, points)[seen] / sigma
+            J = pose_jacobian(by_world, points @ T_world_object[:3, :3].T)[seen] / sigma
             keenest = np.maximum(keenest, (J**2).sum(axis=1).mean(axis=0))
     usual = np.repeat([0.02 * body.radius, np.radians(1.0)], 3)
     return np.where(keenest > 0, 1 / np.sqrt(np.maximum(keenest, 1e-300)), usual)

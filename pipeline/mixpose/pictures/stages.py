@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Density
 from mixpose.extraction.corners import SIGMA_PX, saddle_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
-from mixpose.objective import View
+from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.base import region_of_interest
 from mixpose.pictures.canvas import (
     WHITE,
@@ -98,7 +97,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
 def densities_picture(
     view: View, body: Body, T: Floats | None, sigmas: Sequence[float], room: Size, columns: int
 ) -> Picture:
-    """G of one camera at several blurs around the body, in panels of some size."""
+    """The densities of one camera that the estimator looks up, blur by blur, in panels."""
     if len(sigmas) > _MOST_LEVELS:
         keep = np.round(np.linspace(0, len(sigmas) - 1, _MOST_LEVELS)).astype(int)
         sigmas = [sigmas[k] for k in keep]
@@ -106,7 +105,7 @@ def densities_picture(
     part, size = _fitted(box, room)
     panels = []
     for sigma in sigmas:
-        values = _sampled(view.observation.density(sigma, box), part, size)
+        values = _sampled(matched_objective([view], body, [sigma], T), sigma, part, size)
         share = np.clip(values / max(float(values.max()), 1e-30), 0, 1)
         grey = np.round(255 * np.sqrt(share)).astype(np.uint8)
         panel = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
@@ -115,12 +114,13 @@ def densities_picture(
     return in_grid(panels, -(-len(panels) // rows))  # five are three and two, not four and one
 
 
-def _sampled(density: Density, part: Part, size: Size) -> NDArray[np.float32]:
+def _sampled(objective: MatchedObjective, sigma: float, part: Part, size: Size) -> Floats:
     """Values of a density on a picture (H, W): of each pixel the largest, lest peaks be missed."""
-    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * density.sigma))), 1)
+    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
     u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
     pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    values = density.sample((pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner)
+    places = (pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner
+    values = objective.atlas.look_up(places[None])[..., 0]
     blocks = values.reshape(size[1], fine, size[0], fine)
     return np.asarray(blocks.max(axis=(1, 3)))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mixpose.errors import SessionError
-from mixpose.estimation import EstimatorOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.features import build_body
 from mixpose.session.messages import BadKeyError, one_line, one_of, under

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from mixpose.body import Body
-from mixpose.estimation.options import EstimatorOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.extraction.options import ExtractOptions
 from mixpose.rigid import Floats
 from mixpose.sensors import Sensor

@@ -1,0 +1,236 @@
+"""Which features of a predicted mixture a pattern has something at, and how far off.
+
+For detections, the nearest ones, each taken once; two features whose images run together share
+the one detection in their middle.  For grey values and profiles, the pull of what is left of the
+density once the neighbours' share of it is taken off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.constants import constant
+from mixpose.density.observation import Observation
+from mixpose.density.overlap import peak
+from mixpose.records import GridPattern, PointPattern
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AssociationRules:
+    """When a feature counts as met."""
+
+    min_share: float = constant(
+        0.3,
+        "share of a feature's peak density from which it is met: within 1.55 standard deviations "
+        "of C, 2.2 σ_ε; false features pass for true ones beyond (search rows)",
+    )
+    min_region: float = constant(
+        20.0,
+        "σ_ε: features crowd at least over so wide a region, so that two that are close do not "
+        "make the density of clutter infinite",
+    )
+    slip: float = constant(
+        0.25,
+        "of the body's size in the image: around its box, a grid shifted by a step has detections "
+        "that belong to no feature (chessboards have steps of 1/8)",
+    )
+
+    @property
+    def reach_squared(self) -> float:
+        """Squared distance within which a feature is met, in variances of C."""
+        return -2 * math.log(self.min_share)
+
+
+class FeaturesMet(NamedTuple):
+    """What a pattern has at n predicted features.
+
+    Attributes
+    ----------
+    shares : (n,) float64
+        How far each feature was met, 0 to its weight.
+    offsets : (n, m) float64
+        Observed minus predicted place, sensor units; of features that run together, of their
+        middle.
+    partner : (n,) int
+        The feature that one shares its detection with; itself where it shares none.
+    """
+
+    shares: Floats
+    offsets: Floats
+    partner: NDArray[np.intp]
+
+
+def features_met(
+    observation: Observation,
+    y: Floats,
+    weights: Floats,
+    variance: float,
+    sampled: Floats,
+    amplitude: float,
+    rules: AssociationRules,
+) -> FeaturesMet:
+    """Compare predicted features with what was observed.
+
+    Parameters
+    ----------
+    observation : Observation
+    y : (n, m) array
+        Predicted places.
+    weights : (n,) array
+    variance : float
+        Of C, 2σ².
+    sampled : (n, 1 + m) array
+        C and its gradient there.
+    amplitude : float
+        The factor with which the predicted mixture meets the observed one.
+    rules : AssociationRules
+    """
+    if isinstance(observation.pattern, GridPattern):
+        return _residuals(y, weights, variance, sampled, amplitude, rules)
+    reach = rules.reach_squared * variance
+    shares, offsets = _nearest(observation.pattern, y, weights, reach)
+    alone = np.arange(len(y))
+    if np.count_nonzero(shares) == len(shares):
+        return FeaturesMet(shares, offsets, alone)
+    return _run_together(FeaturesMet(shares, offsets, alone), y, weights, reach)
+
+
+def _nearest(
+    pattern: PointPattern, y: Floats, weights: Floats, reach: float
+) -> tuple[Floats, Floats]:
+    """Shares (n,) and offsets (n, m) to the nearest detections, each taken once."""
+    shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
+    away = pattern.points - y[:, None]
+    squared = (away * away).sum(axis=-1)
+    near_i, near_j = np.nonzero(squared <= reach)
+    order = np.argsort(squared[near_i, near_j], kind="stable")
+    met: set[int] = set()
+    taken: set[int] = set()
+    for i, j in zip(near_i[order].tolist(), near_j[order].tolist(), strict=True):
+        if i not in met and j not in taken:
+            met.add(i)
+            taken.add(j)
+            shares[i] = weights[i]
+            offsets[i] = away[i, j]
+    return shares, offsets
+
+
+def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) -> FeaturesMet:
+    """Let two features share a detection that lies nearer to their middle than to either.
+
+    Images that overlap are detected as one, in the middle.  The two count as one feature that was
+    met there: half of each, with the offset of their middle.
+    """
+    shares, offsets, partner = (each.copy() for each in found)
+    single = shares > 0
+    for i in np.flatnonzero(shares == 0).tolist():
+        seen = np.flatnonzero(single)
+        if not len(seen):
+            break
+        places = y[seen] + offsets[seen]
+        near = ((places - y[i]) ** 2).sum(axis=1) <= reach
+        middle = places - (y[seen] + y[i]) / 2
+        closer = (middle**2).sum(axis=1) - (offsets[seen] ** 2).sum(axis=1)
+        k = int(np.argmin(np.where(near, closer, np.inf)))
+        if not near[k] or closer[k] >= 0:
+            continue
+        pair = [i, int(seen[k])]
+        shares[pair] = weights[pair] / 2
+        offsets[pair] = middle[k]
+        partner[pair] = pair[::-1]
+        single[pair[1]] = False
+    return FeaturesMet(shares, offsets, partner)
+
+
+def _residuals(
+    y: Floats,
+    weights: Floats,
+    variance: float,
+    sampled: Floats,
+    amplitude: float,
+    rules: AssociationRules,
+) -> FeaturesMet:
+    """How far a grid of values puts each feature from its prediction.
+
+    Around a prediction that fits, C is `amplitude` times the predicted mixture blurred alike.
+    What is left of the gradient is the pull on this feature alone, without its neighbours'.
+    """
+    top = peak(variance, y.shape[1])
+    away = y[:, None] - y[None]
+    bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
+    predicted_gradient = -(bells[..., None] * away).sum(axis=1) / variance
+    own = sampled[:, 0] - amplitude * (bells.sum(axis=1) - weights * top)
+    shares, offsets, alone = np.zeros(len(y)), np.zeros(y.shape), np.arange(len(y))
+    # what the better half of the features looks like on its own
+    full = float(np.median(np.sort(own)[len(own) // 2 :]))
+    if full <= 0:
+        return FeaturesMet(shares, offsets, alone)
+    shares = np.clip(own / full, 0.0, 1.0)
+    shares = np.where(shares > rules.min_share, shares, 0.0) * weights
+    pull = sampled[:, 1:] - amplitude * predicted_gradient
+    offsets = variance * pull / np.maximum(own, rules.min_share * full)[:, None]
+    return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone)
+
+
+def crowding(
+    observation: Observation, y: Floats, sigma: float, participation: float, rules: AssociationRules
+) -> tuple[float, float]:
+    """Number of observed features, and their density over the whole pattern or near the body.
+
+    Parameters
+    ----------
+    observation : Observation
+    y : (n, m) array
+        Predicted features.
+    sigma : float
+        σ_ε.
+    participation : float
+        Number of equal features that give the pattern's energy, which counts where the pattern is
+        not made of detections.
+    rules : AssociationRules
+
+    Returns
+    -------
+    float
+        Number.
+    float
+        Per unit of the sensor's coordinates; the larger of the two.
+    """
+    smallest = rules.min_region * sigma
+    lower, upper = observation.extent
+    pattern = observation.pattern
+    count = float(len(pattern.points)) if isinstance(pattern, PointPattern) else participation
+    overall = count / _area(upper - lower, smallest)
+    if not isinstance(pattern, PointPattern) or not len(y):
+        return count, overall
+    near, far = y.min(axis=0), y.max(axis=0)
+    half = np.maximum(far - near, smallest) / 2
+    found = _detected(pattern, (near + far) / 2, half)
+    return count, max(overall, found / _area(2 * half, smallest))
+
+
+def surplus(observation: Observation, y: Floats, met: float, rules: AssociationRules) -> float:
+    """Detections not met in the box of the body (n, 2), and as far around it as a grid may slip."""
+    pattern = observation.pattern
+    if y.shape[1] != 2 or not len(y) or not isinstance(pattern, PointPattern):
+        return 0.0
+    near, far = y.min(axis=0), y.max(axis=0)
+    half = (far - near) / 2 + rules.slip * float((far - near).max())
+    return max(_detected(pattern, (near + far) / 2, half) - met, 0.0)
+
+
+def _detected(pattern: PointPattern, middle: Floats, half: Floats) -> int:
+    """Number of detections in a box (m,) about its middle."""
+    return int(np.count_nonzero((np.abs(pattern.points - middle) <= half).all(axis=1)))
+
+
+def _area(sides: Floats, smallest: float) -> float:
+    """Size of a box, no side of which counts as less than the smallest."""
+    return math.prod(max(side, smallest) for side in sides.tolist())

@@ -1,0 +1,17 @@
+"""Fit: a pose near a start, through narrowing blurs."""
+
+from __future__ import annotations
+
+from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
+from mixpose.fit.near import Fit, FitRules, fit_near
+from mixpose.fit.options import EstimatorOptions, free_mask
+
+__all__ = [
+    "EstimatorOptions",
+    "Fit",
+    "FitRules",
+    "ScheduleRules",
+    "blur_schedule",
+    "fit_near",
+    "free_mask",
+]

@@ -1,0 +1,152 @@
+"""A pose near a start: ascent of an objective through narrowing blurs.
+
+    draw C of every sensor at a blur → climb Σ_l ω_l S_l → narrow the blur → ... → σ_ε
+
+Where most features are near a detection at the start already, σ_ε alone will do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.constants import constant
+from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
+from mixpose.fit.free_features import freed
+from mixpose.fit.options import EstimatorOptions, free_mask
+from mixpose.fit.prior import Prior, has_likelihood, most_probable
+from mixpose.objective import MatchedObjective, View, build_objective, matched_objective
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.rigid import perturb
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def _value_error(steps_per_sigma: float) -> float:
+    """Relative error of looked-up values: 1/8n² along each of two axes, and squared."""
+    return 4.0 / (8 * steps_per_sigma**2)
+
+
+COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_value_error(STEPS_PER_SIGMA))
+# after a step that gains 1e-6, 1e-5 σ are left to go
+SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=_value_error(STEPS_PER_SIGMA))
+FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_value_error(FINE_STEPS))
+
+
+@dataclass(frozen=True)
+class FitRules:
+    """How a fit begins."""
+
+    schedule: ScheduleRules = ScheduleRules()
+    near: float = constant(
+        0.1,
+        "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
+        "on average; below, it descends through the blurs",
+    )
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where an ascent ended.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    value : float
+        Of the objective at that pose, at the finest blur.
+    converged : bool
+    iterations : int
+        Evaluations at the finest blur.
+    proposer : str
+        Where the start came from.
+    freed : bool
+        Whether the body did not fit, and the pose was fitted to freed features.
+    """
+
+    T_world_object: Floats
+    value: float
+    converged: bool
+    iterations: int
+    proposer: str = ""
+    freed: bool = False
+
+
+def fit_near(
+    views: Sequence[View],
+    body: Body,
+    T_start: Floats,
+    uncertainty: Floats,
+    options: EstimatorOptions,
+    samples: Floats,
+    *,
+    finest: MatchedObjective | None = None,
+    rules: FitRules = FitRules(),
+) -> Fit:
+    """Descend from coarse blurs to σ_ε and climb the objective at each.
+
+    Parameters
+    ----------
+    views : sequence of View
+        At least one, none with an empty observation.
+    body : Body
+    T_start : (4, 4) array
+    uncertainty : (6,) array
+        Standard deviations of the start, lengths and radians.
+    options : EstimatorOptions
+    samples : (N, R, 3) array
+        Samples of the body, for the objectives that integrate by sampling.
+    finest : MatchedObjective or None
+        At σ_ε, wherever something is seen, where it is at hand.
+    rules : FitRules
+    """
+    free = free_mask(options)
+    matched = options.objective == "matched"
+    sparse = all(view.observation.is_sparse for view in views)
+    ascent = None
+    if matched and sparse and not has_likelihood(views):
+        finest = finest or matched_objective(
+            views, body, [view.observation.sigma for view in views]
+        )
+        here = finest.linearise(T_start)
+        if here.value >= rules.near * len(views):
+            ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
+    if ascent is None:
+        ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, rules)
+    T, is_freed = ascent.state, False
+    if matched and has_likelihood(views):
+        prior = Prior(T_start, uncertainty, free)
+        T = most_probable(views, body, T, prior)
+        T_freed = freed(views, body, T, prior)
+        T, is_freed = (T, False) if T_freed is None else (T_freed, True)
+    return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
+
+
+def _through_blurs(
+    views: Sequence[View],
+    body: Body,
+    T_start: Floats,
+    uncertainty: Floats,
+    options: EstimatorOptions,
+    samples: Floats,
+    rules: FitRules,
+) -> Ascent[Floats]:
+    """The ascent at one blur after the other."""
+    free = free_mask(options)
+    spread = np.where(free, uncertainty, 0.0)
+    fine = has_likelihood(views) or options.objective != "matched"
+    ascent = Ascent(T_start, 0.0, False, 0)
+    schedule = blur_schedule(views, body, T_start, spread, rules.schedule)
+    for k, sigmas in enumerate(schedule):
+        last = k == len(schedule) - 1
+        newton = (FINE if fine else SHARP) if last else COARSE
+        objective = build_objective(
+            options.objective, views, body, samples, sigmas, ascent.state, last and fine
+        )
+        ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
+    return ascent

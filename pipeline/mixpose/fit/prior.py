@@ -1,0 +1,166 @@
+"""The most probable pose, where it is known how far off the start may be.
+
+The matched objective of a sensor is ⟨g, h⟩² / ⟨h, h⟩, the energy of its density g that a pose
+explains.  Under white noise half of it over the noise of a cell is the log-likelihood, with the
+amplitude at its best.  To this the Gaussian prior of the start is added, and the sum is maximised.
+
+Under heavy noise the sum has several maxima.  They are sought from the start, from the maximum of
+the objective through the blurs, and from the points of the cubature rule of third degree, which
+has the mean and the covariance of the prior; the highest is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.optimise import NewtonOptions, ascend
+from mixpose.rigid import perturb, twist_between
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
+_ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
+_VALUE_ERROR = 4.0 / (8 * FINE_STEPS**2)  # of values looked up linearly
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A normal distribution of the pose.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+        Its mean.
+    uncertainty : (6,) float64
+        Standard deviations, lengths and radians; positive where free.
+    free : (6,) bool
+        Directions in which the pose may change.
+    """
+
+    T_world_object: Floats
+    uncertainty: Floats
+    free: NDArray[np.bool_]
+
+    def information(self) -> Floats:
+        """Inverse variances (6,), 0 where not free."""
+        return np.where(self.free, 1 / np.where(self.free, self.uncertainty, 1.0) ** 2, 0.0)
+
+    def points(self) -> list[Floats]:
+        """The mean, and √k standard deviations to either side along each of k directions."""
+        count = int(self.free.sum())
+        steps = np.sqrt(count) * np.diag(np.where(self.free, self.uncertainty, 0.0))[self.free]
+        around = [perturb(self.T_world_object, s * step) for step in steps for s in (1, -1)]
+        return [self.T_world_object, *around]
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Log-likelihood of densities with noise in every cell, made around a pose.
+
+    Attributes
+    ----------
+    objective : MatchedObjective
+        In nats.
+    shares : (L,) float64
+        Of each sensor's energy ⟨g, g⟩, explained by the pose: ⟨g, h⟩² / (⟨g, g⟩ ⟨h, h⟩).
+    noise : (L,) float64
+        Variance of a cell's noise times the size of a cell, per sensor.
+    """
+
+    objective: MatchedObjective
+    shares: Floats
+    noise: Floats
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other pose can be as likely.
+
+        The shares of one density that orthogonal predictions explain sum to 1 at the most
+        (Bessel's inequality): a pose that explains more than half of each is alone.
+        """
+        return bool(self.shares.min() > 0.5)
+
+
+def has_likelihood(views: Sequence[View]) -> bool:
+    """Whether all sensors gave grey values or profiles, whose noise is that of their cells."""
+    return all(view.observation.cell is not None for view in views)
+
+
+def likelihood_near(
+    views: Sequence[View], body: Body, T_world_object: Floats, *, fine: bool
+) -> Likelihood:
+    """Make the log-likelihood at σ_ε around a pose; what that pose leaves is taken for noise."""
+    sigmas = [view.observation.sigma for view in views]
+    steps = FINE_STEPS if fine else STEPS_PER_SIGMA
+    objective = matched_objective(views, body, sigmas, T_world_object, steps_per_sigma=steps)
+    plain = replace(objective, weights=np.ones_like(objective.weights))
+    shares = plain.shares(T_world_object[None])[:, 0]
+    cells = np.array([view.observation.cells for view in views])
+    energies = objective.energies[:, 0]
+    # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
+    noise = np.maximum(1 - shares, 1e-9) * energies / cells
+    weights = (0.5 * energies / noise)[:, None]
+    return Likelihood(replace(objective, weights=weights), shares, noise)
+
+
+def most_probable(
+    views: Sequence[View], body: Body, T_world_object: Floats, prior: Prior
+) -> Floats:
+    """Maximise likelihood and prior.
+
+    Parameters
+    ----------
+    views : sequence of View
+        All with noise in their cells.
+    body : Body
+    T_world_object : (4, 4) array
+        A maximum of the likelihood.
+    prior : Prior
+
+    Returns
+    -------
+    (4, 4) array
+    """
+    T = T_world_object
+    likelihood = likelihood_near(views, body, T, fine=True)
+    if not likelihood.is_alone:
+        wide = likelihood_near(views, body, T, fine=False)
+        T = _highest(wide, prior, [T, *prior.points()], _ROUGH)
+        likelihood = likelihood_near(views, body, T, fine=True)
+    for _ in range(2):  # the second is drawn around the maximum and knows the noise there
+        T = _highest(likelihood, prior, [T], _NATS)
+        likelihood = likelihood_near(views, body, T, fine=True)
+    return T
+
+
+def _highest(
+    likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float
+) -> Floats:
+    """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
+    information = prior.information()
+
+    def posterior(T: Floats) -> Quadratic:
+        one = likelihood.objective.linearise(T)
+        away = twist_between(prior.T_world_object, T)
+        assert one.hessian is not None
+        return Quadratic(
+            one.value - 0.5 * float(away @ (information * away)),
+            one.gradient - information * away,
+            one.curvature + np.diag(information),
+            one.hessian + np.diag(information),
+        )
+
+    ends = []
+    for T in starts:
+        scale = max(abs(posterior(T).value), 1.0)
+        options = NewtonOptions(60, max(1e-11, nats / scale), value_error=_VALUE_ERROR)
+        ends.append(ascend(posterior, perturb, T, prior.free, options))
+    return max(ends, key=lambda end: end.value).state

@@ -1,0 +1,42 @@
+"""Judgement: which features a pose meets, what that is worth, and whether it is believed."""
+
+from __future__ import annotations
+
+from mixpose.judgement.acceptance import (
+    AcceptanceRules,
+    Verdict,
+    convinces,
+    decide,
+    insert,
+    is_possible,
+    is_sure,
+)
+from mixpose.judgement.association import Association, associate
+from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior
+from mixpose.judgement.expected_covariance import expected_covariance
+from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
+from mixpose.judgement.noise import Noise, NoiseModel, enlargement
+
+__all__ = [
+    "AcceptanceRules",
+    "Association",
+    "DetectionModel",
+    "Judged",
+    "JudgementRules",
+    "Noise",
+    "NoiseModel",
+    "Prior",
+    "Verdict",
+    "associate",
+    "beliefs",
+    "convinces",
+    "decide",
+    "enlargement",
+    "expected_covariance",
+    "flat_prior",
+    "insert",
+    "is_possible",
+    "is_sure",
+    "judge",
+    "nearest_alike",
+]

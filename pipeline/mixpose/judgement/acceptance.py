@@ -1,0 +1,154 @@
+"""From judged poses to a status: what is possible, what is sure, what is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.constants import constant
+from mixpose.judgement.judge import Judged, beliefs, nearest_alike
+from mixpose.records import Status
+from mixpose.rigid import rotation_angle_deg, twist_between
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_OPEN_TURN = np.pi / np.sqrt(3)  # rad, standard deviation of a turn of which nothing is known
+
+
+@dataclass(frozen=True)
+class AcceptanceRules:
+    """When a pose is believed."""
+
+    sure: float = constant(
+        7.0, "log odds against clutter from which a pose is ok: one in a thousand by chance"
+    )
+    possible: float = constant(0.0, "log odds from which a pose is worth telling: even odds")
+    doubtful: float = constant(
+        -4.5, "the same where `doubtful_coverage` is met: sure, less the share of two misses"
+    )
+    doubtful_coverage: float = constant(
+        0.6, "share of the body met from which log odds down to `doubtful` are worth telling"
+    )
+    rival: float = constant(0.01, "belief from which another pose makes a frame ambiguous")
+    listed: float = constant(0.001, "belief from which a pose stands among the hypotheses")
+    widest_turn_deg: float = constant(
+        15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
+    )
+    convincing: float = constant(
+        0.75,
+        "share of the body that must be met for the prediction to be taken without looking "
+        "elsewhere: a body slipped by a step of its grid meets less",
+    )
+    same_rotation_deg: float = constant(1.0, "poses nearer than this are one, unless both fit")
+    same_distance: float = constant(0.02, "the same, of the body's radius")
+    same_peak: float = constant(
+        9.0, "squared distance in standard deviations below which uncertain poses are one"
+    )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The decision about a frame.
+
+    Attributes
+    ----------
+    status : {"ok", "ambiguous", "lost"}
+    best : Judged or None
+        None where the frame is lost.
+    kept : list of (Judged, float)
+        Poses worth telling with their beliefs, best first.
+    """
+
+    status: Status
+    best: Judged | None
+    kept: list[tuple[Judged, float]]
+
+
+def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+    """Whether a pose is worth telling."""
+    enough = judged.measurements >= int(free.sum())
+    doubtful = judged.coverage >= rules.doubtful_coverage
+    return enough and judged.log_evidence > (rules.doubtful if doubtful else rules.possible)
+
+
+def is_turned_surely(judged: Judged, rules: AcceptanceRules) -> bool:
+    """Whether no wide sector of turns is left open, as ranges may."""
+    if judged.spread is None:
+        return True
+    return bool(1.96 * judged.spread[3:].max() < np.radians(rules.widest_turn_deg))
+
+
+def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+    """Whether a pose is believed, if no rival casts doubt on it."""
+    possible = is_possible(judged, free, rules) and judged.log_evidence > rules.sure
+    return possible and is_turned_surely(judged, rules)
+
+
+def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+    """Whether a pose near its prediction needs no other to compare with."""
+    return judged.coverage > rules.convincing and is_sure(judged, free, rules)
+
+
+def decide(
+    ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules
+) -> Verdict:
+    """Decide about a frame from all its poses, the most evident first."""
+    best = next((one for one in ranked if is_possible(one, free, rules)), None)
+    if best is None:
+        return Verdict("lost", None, [])
+    weights = beliefs(ranked)
+    # what is not possible by itself still casts doubt on the others
+    rivals = [weight for one, weight in zip(ranked, weights, strict=True) if one is not best]
+    clear = max(rivals, default=0.0) < rules.rival
+    clear = clear and is_sure(best, free, rules) and _is_determined(best)
+    kept = [
+        (one, weight)
+        for one, weight in zip(ranked, weights, strict=True)
+        if one is best or (weight >= rules.listed and is_possible(one, free, rules))
+    ]
+    return Verdict("ok" if clear else "ambiguous", best, kept)
+
+
+def _is_determined(judged: Judged) -> bool:
+    """Whether no turn is left open, as about the line that all features met lie on."""
+    turns = np.linalg.eigvalsh(judged.covariance[3:, 3:])
+    return bool(turns.max() < _OPEN_TURN**2)
+
+
+def insert(
+    ranked: list[Judged],
+    new: Judged,
+    body: Body,
+    free: NDArray[np.bool_],
+    rules: AcceptanceRules,
+) -> None:
+    """Keep a list of distinct poses, the most evident first."""
+    for k, old in enumerate(ranked):
+        if _alike(old, new, body, free, rules):
+            if new.log_evidence > old.log_evidence:
+                ranked[k] = new
+            break
+    else:
+        ranked.append(new)
+    ranked.sort(key=lambda one: -one.log_evidence)
+
+
+def _alike(
+    a: Judged, b: Judged, body: Body, free: NDArray[np.bool_], rules: AcceptanceRules
+) -> bool:
+    T_a = a.T_world_object
+    T_b = nearest_alike(b.T_world_object, body, T_a)
+    if a.spread is not None:
+        # one peak of the likelihood, drawn to different priors
+        away = twist_between(T_a, T_b)[free]
+        widest = (a.covariance + b.covariance)[np.ix_(free, free)]
+        return bool(away @ np.linalg.solve(widest, away) < rules.same_peak)
+    centre = np.append(body.means.mean(axis=0), 1.0)
+    apart = float(np.linalg.norm((T_a - T_b) @ centre))
+    near = apart < rules.same_distance * body.radius
+    return near and float(rotation_angle_deg(T_a, T_b)) < rules.same_rotation_deg

@@ -1,0 +1,161 @@
+"""A pose against one sensor: which features were met, and how closely."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.density import AssociationRules, crowding, features_met, surplus
+from mixpose.objective import MatchedObjective
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Association:
+    """A pose against one sensor, at the finest blur; n features are in view.
+
+    Attributes
+    ----------
+    name : str
+        Of the sensor.
+    explained : float
+        Share of the sensor's density that the pose accounts for.
+    features : (n,) int
+        Nodes of the body that are in view.
+    shares : (n,) float64
+        How far each was met, 0 to its weight.
+    offsets : (n, m) float64
+        Observed minus predicted place of each, sensor units; 0 where it was not met.  Two that
+        were detected as one have those of their middle.
+    J : (n, m, 6) float64
+        Jacobian of the predicted places by the pose, likewise.
+    expected : float
+        Sum of the weights of the features in view.
+    unseen : float
+        Sum of the weights of the features that face the sensor outside its view.
+    sigma : float
+        σ_ε.
+    crowd : float
+        Observed features per unit of the sensor's coordinates, around the prediction.
+    count : float
+        Number of observed features.
+    merged : int
+        Features that were detected as one with another.
+    surplus : float
+        Where features are missed in an image: detections around the body that belong to none.
+    """
+
+    name: str
+    explained: float
+    features: NDArray[np.intp]
+    shares: Floats
+    offsets: Floats
+    J: Floats
+    expected: float
+    unseen: float
+    sigma: float
+    crowd: float
+    count: float
+    merged: int = 0
+    surplus: float = 0.0
+
+    @cached_property
+    def met(self) -> float:
+        """Sum of the shares."""
+        return float(self.shares.sum())
+
+    @property
+    def missed(self) -> float:
+        """Sum of the weights of the features in view that were not met."""
+        return self.expected - self.met
+
+    @property
+    def coverage(self) -> float:
+        """Share of the features that face the sensor that were met."""
+        return self.met / max(self.expected + self.unseen, 1e-12)
+
+    @property
+    def measurements(self) -> float:
+        """Number of coordinates that were met."""
+        return self.met * int(self.J.shape[1])
+
+    @cached_property
+    def squared(self) -> Floats:
+        """Squared offset of each feature, in σ² (n,)."""
+        return np.asarray((self.offsets * self.offsets).sum(axis=1) / self.sigma**2)
+
+    @cached_property
+    def squares(self) -> float:
+        """Sum of the squared offsets, in σ."""
+        return float(self.shares @ self.squared)
+
+    @property
+    def rms(self) -> float | None:
+        """Root mean square of the offsets of the met features, sensor units; None without any."""
+        if self.met == 0:
+            return None
+        return self.sigma * math.sqrt(self.squares / self.met)
+
+
+def associate(
+    objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules
+) -> list[Association]:
+    """Compare what a pose predicts with what every sensor observed.
+
+    Parameters
+    ----------
+    objective : MatchedObjective
+        At σ_ε of every sensor.
+    T_world_object : (4, 4) array
+    rules : AssociationRules
+
+    Returns
+    -------
+    list of Association
+        One per view.
+    """
+    at, sampled, matched, _ = objective.match(T_world_object[None])
+    node_weights = objective.projection.body.nodes.weights
+    found = []
+    for k, view in enumerate(objective.views):
+        m, observation = int(objective.projection.dimensions[k]), view.observation
+        variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
+        features = np.flatnonzero(at.seen[k, 0])
+        y, weights = at.y[k, 0, features, :m], at.weights[k, 0, features]
+        J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
+        product, norm = float(matched.product[k, 0]), float(matched.norm[k, 0])
+        shares, offsets, merged = np.zeros(len(y)), np.zeros(y.shape), 0
+        if product > 0:
+            met = features_met(observation, y, weights, variance, C, product / norm, rules)
+            shares, offsets = met.shares, met.offsets
+            paired = met.partner != np.arange(len(y))
+            merged = int(np.count_nonzero(paired)) // 2
+            J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
+        sigma = math.sqrt(variance / 2)
+        participation = float(objective.tops[k, 0]) / energy
+        count, crowd = crowding(observation, y, sigma, participation, rules)
+        complete = np.count_nonzero(shares) == len(y)
+        found.append(
+            Association(
+                name=view.name,
+                explained=min(product**2 / (energy * norm), 1.0) if product > 0 else 0.0,
+                features=features,
+                shares=shares,
+                offsets=offsets,
+                J=J,
+                expected=float(weights.sum()),
+                unseen=float(node_weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
+                sigma=sigma,
+                crowd=crowd,
+                count=count,
+                merged=merged,
+                surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
+            )
+        )
+    return found

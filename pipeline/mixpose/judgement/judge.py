@@ -1,0 +1,150 @@
+"""What a pose is worth: per-sensor reports, covariance and evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import AssociationRules
+from mixpose.judgement.association import Association, associate
+from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
+from mixpose.judgement.noise import (
+    Noise,
+    NoiseModel,
+    covariance_of,
+    information_of,
+    noise_of,
+    noises,
+)
+from mixpose.objective import MatchedObjective
+from mixpose.records import SensorReport
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class JudgementRules:
+    """The models that a pose is judged by."""
+
+    association: AssociationRules = AssociationRules()
+    detection: DetectionModel = DetectionModel()
+    noise: NoiseModel = NoiseModel()
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A pose, and how well it explains the frame.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    sensors : dict of str to SensorReport
+    score : float
+        Mean cosine between predicted and observed densities, 0 to 1.
+    coverage : float
+        Mean share of the body's features in view that are met.
+    measurements : float
+        Number of met sensor coordinates.
+    covariance : (6, 6) float64
+        Zero in directions that are not estimated.
+    log_evidence : float
+        Logarithm of the odds for this pose against mere clutter.
+    noise : Noise
+        Residuals of this frame and, fading, of those before it, for the next frame.
+    associations : tuple of Association
+        The pose against each sensor that saw something.
+    spread : (6,) float64 or None
+        Standard deviations of the pose where they are as large as its motion.
+    proposer : str
+        Where the pose came from.
+    value : float
+        Of what was climbed, at the pose.
+    """
+
+    T_world_object: Floats
+    sensors: dict[str, SensorReport]
+    score: float
+    coverage: float
+    measurements: float
+    covariance: Floats
+    log_evidence: float
+    noise: Noise
+    associations: tuple[Association, ...] = ()
+    spread: Floats | None = None
+    proposer: str = ""
+    value: float = 0.0
+
+
+def judge(
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    free: NDArray[np.bool_],
+    *,
+    before: Noise = Noise(),
+    prior: Prior | None = None,
+    rules: JudgementRules = JudgementRules(),
+) -> Judged:
+    """Judge a pose by the matched densities at the finest blur.
+
+    Parameters
+    ----------
+    objective : MatchedObjective
+        At σ_ε of every sensor.
+    T_world_object : (4, 4) array
+    free : (6,) bool
+        Directions that were estimated.
+    before : Noise
+        Residuals of the frames before.
+    prior : Prior or None
+        What was known of the pose; None: nothing.
+    rules : JudgementRules
+    """
+    found = associate(objective, T_world_object, rules.association)
+    prior = prior or flat_prior(objective.projection.body, free, rules.detection)
+    information = information_of(found)
+    noise, remembered = noises(before, noise_of(found, free), rules.noise)
+    evidence = log_evidence(found, information, noise, free, prior, rules.detection, rules.noise)
+    count = len(found)
+    return Judged(
+        T_world_object=T_world_object,
+        sensors={one.name: SensorReport(True, one.explained, one.rms) for one in found},
+        score=sum(math.sqrt(one.explained) for one in found) / count,
+        coverage=sum(one.coverage for one in found) / count,
+        measurements=sum(one.measurements for one in found),
+        covariance=covariance_of(information, noise, free, rules.noise),
+        log_evidence=evidence,
+        noise=remembered,
+        associations=tuple(found),
+        value=float(objective.value(T_world_object)),
+    )
+
+
+def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
+    """Of the poses that look the same, the one turned least against a reference.
+
+    Without a reference it is the one turned least against the world.
+    """
+    if len(body.symmetries) == 1:
+        return T_world_object
+    alike = T_world_object @ body.symmetries
+    reference = np.eye(4) if T_reference is None else T_reference
+    # the angle grows as the trace of the difference falls
+    traces = np.einsum("ij,kij->k", reference[:3, :3], alike[:, :3, :3])
+    return np.asarray(alike[int(np.argmax(traces))])
+
+
+def beliefs(judged: Sequence[Judged]) -> list[float]:
+    """Share of belief of each pose among its rivals."""
+    if not judged:
+        return []
+    logs = np.array([one.log_evidence for one in judged])
+    if not np.isfinite(logs.max()):  # none meets anything
+        return [1.0 / len(judged)] * len(judged)
+    weights = np.exp(logs - logs.max())
+    return [float(w) for w in weights / weights.sum()]

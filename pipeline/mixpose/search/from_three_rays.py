@@ -1,0 +1,122 @@
+"""Guesses of one camera: three detections as three features, in all ways or many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, permutations
+from math import comb, perm
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.search.alignment import align_triples
+from mixpose.search.budget import SearchBudget
+from mixpose.search.p3p import depths
+from mixpose.search.spread import far_apart
+from mixpose.sensors import Rays
+
+Floats: TypeAlias = NDArray[np.float64]
+Indices: TypeAlias = NDArray[np.intp]
+
+
+def from_three_rays(
+    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
+) -> Iterator[Floats]:
+    """Poses (K, 4, 4) from triples of one camera's rays, chunk by chunk.
+
+    Parameters
+    ----------
+    lines : Rays
+    features : (n, 3) array
+        Of the body.
+    budget : SearchBudget
+    rng : numpy Generator
+        Order of the triples.
+    """
+    if len(lines) < 3 or len(features) < 3:
+        return
+    solve = _perspective if lines.central else _orthographic
+    for detections, corners in _problems(lines, features, budget, rng):
+        yield solve(lines, features, detections, corners, budget.min_pixels)
+
+
+def _problems(
+    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
+) -> Iterator[tuple[Indices, Indices]]:
+    """Chunks of problems: three detections (3, K) as three features (3, K).
+
+    All, where they can be tried; else of detections and features those far apart first, which
+    fix a pose best, and of which the outermost are likely the same.
+    """
+    n, M = len(features), len(lines)
+    if comb(M, 3) * perm(n, 3) <= budget.max_problems:
+        yield from _all_problems(np.arange(M), np.arange(n), budget, rng)
+        return
+    spread_lines = far_apart(lines.pixels, int(1.5 * budget.exhaustive))
+    yield from _all_problems(spread_lines, far_apart(features, budget.exhaustive), budget, rng)
+    for _ in range(budget.max_problems // budget.chunk // 2):
+        yield _drawn(M, budget.chunk, rng), _drawn(n, budget.chunk, rng)
+
+
+def _all_problems(
+    detections: Indices, features: Indices, budget: SearchBudget, rng: np.random.Generator
+) -> Iterator[tuple[Indices, Indices]]:
+    by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
+    by_feature = np.array(list(permutations(features, 3)), dtype=np.intp).T
+    total = by_detection.shape[1] * by_feature.shape[1]
+    order = rng.permutation(total)[: budget.max_problems]
+    for start in range(0, len(order), budget.chunk):
+        a, b = np.divmod(order[start : start + budget.chunk], by_feature.shape[1])
+        yield by_detection[:, a], by_feature[:, b]
+
+
+def _drawn(count: int, problems: int, rng: np.random.Generator) -> Indices:
+    """Random triples (3, K) of different indices."""
+    return np.argsort(rng.random((problems, count)), axis=1)[:, :3].T
+
+
+def _perspective(
+    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
+) -> Floats:
+    directions = lines.directions.T[:, detections].transpose(1, 0, 2)
+    body = features.T[:, corners].transpose(1, 0, 2)
+    sides = [body[i] - body[j] for i, j in ((0, 1), (0, 2), (1, 2))]
+    squared = np.array([(side * side).sum(axis=0) for side in sides])
+    distances, which = depths(directions, squared)
+    # smaller than this in the image, nothing is told apart
+    largest = np.sqrt(squared.max(axis=0))[which]
+    near = largest > min_pixels * lines.slope * distances.min(axis=0)
+    distances, which = distances[:, near], which[near]
+    world = lines.origins[0][:, None] + directions[:, :, which] * distances[:, None]
+    return align_triples(body[:, :, which], world)
+
+
+def _orthographic(
+    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
+) -> Floats:
+    """Three parallel lines: the sides' lengths give depth differences, which must add up.
+
+    The depth of the whole is not seen; the middle is put on the sensor's plane.
+    """
+    body = features.T[:, corners].transpose(1, 0, 2)
+    seen = lines.origins.T[:, detections].transpose(1, 0, 2)
+    tolerance = 3 * min_pixels * lines.offset
+    rise = []
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        side, flat = body[j] - body[i], seen[j] - seen[i]
+        length2, flat2 = (side * side).sum(axis=0), (flat * flat).sum(axis=0)
+        possible = np.sqrt(flat2) <= np.sqrt(length2) + tolerance
+        rise.append(np.where(possible, np.sqrt(np.maximum(length2 - flat2, 0.0)), np.nan))
+    direction = lines.directions[0][:, None]
+    poses = []
+    for sign in (1.0, -1.0):
+        off = np.abs(np.abs(rise[1] - sign * rise[0]) - rise[2])
+        good = np.flatnonzero(off <= tolerance)
+        for mirror in (1.0, -1.0):
+            world = seen[:, :, good].copy()
+            world[1] += mirror * sign * rise[0][good] * direction
+            world[2] += mirror * rise[1][good] * direction
+            world -= ((world - seen[:, :, good]) * direction).sum(axis=1).mean(axis=0) * direction
+            poses.append(align_triples(body[:, :, good], world))
+    return np.concatenate(poses)

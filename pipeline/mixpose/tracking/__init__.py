@@ -1,0 +1,22 @@
+"""Tracking: propose, fit, judge, decide, follow, from frame to frame."""
+
+from __future__ import annotations
+
+from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
+from mixpose.tracking.rules import Rules
+from mixpose.tracking.single_frame import estimate_pose
+from mixpose.tracking.track import Prediction, Track, predict
+from mixpose.tracking.tracker import Tracker
+
+__all__ = [
+    "Expectation",
+    "Prediction",
+    "Rules",
+    "Track",
+    "Tracker",
+    "are_as_good",
+    "estimate_pose",
+    "have_fewer",
+    "is_convincing",
+    "predict",
+]

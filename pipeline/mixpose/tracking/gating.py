@@ -1,0 +1,125 @@
+"""Where a track expects the body in its cameras, and whether it was met there.
+
+While a body is tracked, features are looked for around the prediction only.  That must never
+change what is found: a frame whose pose is not as convincing as the one before it is looked at
+again as a whole (`mixpose.runner`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mixpose.body import Body
+from mixpose.constants import constant
+from mixpose.objective import View, project_body
+from mixpose.records import PointPattern
+from mixpose.sensors import Sensor
+from mixpose.tracking.track import Prediction, SensorTally
+
+Floats: TypeAlias = NDArray[np.float64]
+Box: TypeAlias = tuple[int, int, int, int]
+Tallies: TypeAlias = Mapping[str, SensorTally]
+
+
+@dataclass(frozen=True)
+class GatingRules:
+    """How far around a prediction features are looked for."""
+
+    reach: float = constant(
+        4.0, "standard deviations of the prediction, and of features that have a spread"
+    )
+    min_margin_px: float = constant(40.0, "around the predicted features: a spot and its ground")
+
+
+class Expectation:
+    """A body in front of cameras."""
+
+    def __init__(
+        self,
+        body: Body,
+        cameras: Mapping[str, Sensor],
+        free: NDArray[np.bool_],
+        rules: GatingRules = GatingRules(),
+    ) -> None:
+        """Prepare for a body.
+
+        Parameters
+        ----------
+        body : Body
+        cameras : mapping of str to Sensor
+            Sensors with two coordinates, in px.
+        free : (6,) bool
+            Directions that are estimated.
+        rules : GatingRules
+        """
+        self.names = tuple(cameras)
+        self._projection = project_body(tuple(cameras.values()), body) if cameras else None
+        self._rules = rules
+        self._free = free
+        points = body.nodes.points
+        # A feature's image reaches less than half way to that of its neighbour.
+        apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
+        gravity = body.gravity.sigma if body.gravity is not None else 0.0
+        self._feature_reach = apart / 2 + rules.reach * float(np.hypot(body.spread, gravity))
+
+    def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
+        """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
+
+        It holds all features that a camera will see, four standard deviations of the prediction,
+        and the features' images, but at least 40 px, around them.  Cameras that will not see the
+        body have none; a body of one feature, whose size in the image nothing tells, neither.
+        """
+        if self._projection is None or not np.isfinite(self._feature_reach):
+            return {}
+        boxes: dict[str, Box] = {}
+        for prediction in predictions:
+            at = self._projection.project(prediction.T_world_object[None])
+            y, J, seen = at.y[:, 0], at.J[:, 0], at.seen[:, 0, :, None]
+            variances = (prediction.uncertainty * self._free) ** 2
+            by_shift = J[..., :3]
+            scales = np.sqrt(np.einsum("lnij,lnij->ln", by_shift, by_shift).max(axis=1))
+            margins = self._rules.reach * np.sqrt(J**2 @ variances)
+            margins += np.maximum(scales * self._feature_reach, self._rules.min_margin_px)[
+                :, None, None]
+            lower = np.where(seen, y - margins, np.inf).min(axis=1).tolist()
+            upper = np.where(seen, y + margins, -np.inf).max(axis=1).tolist()
+            for name, low, high in zip(self.names, lower, upper, strict=True):
+                if low[0] > high[0]:
+                    continue
+                u0, v0 = (math.floor(end) for end in low)
+                u1, v1 = (math.ceil(end) + 1 for end in high)
+                a, b, c, d = boxes.get(name, (u0, v0, u1, v1))
+                boxes[name] = (min(a, u0), min(b, v0), max(c, u1), max(d, v1))
+        return boxes
+
+
+def is_convincing(tallies: Tallies, cameras: Sequence[str], share: float) -> bool:
+    """Whether cameras met so much of the body that the next frame need not be seen whole."""
+    some = [tallies[name] for name in cameras if name in tallies]
+    return sum(one.met for one in some) > share * sum(one.in_view for one in some)
+
+
+def are_as_good(tallies: Tallies, before: Tallies) -> bool:
+    """Whether no sensor misses more of the body than in the frame before."""
+    return all(
+        one.in_view - one.met <= before[name].in_view - before[name].met
+        for name, one in tallies.items()
+        if name in before
+    )
+
+
+def have_fewer(views: Sequence[View], before: Tallies) -> bool:
+    """Whether a camera has fewer detections than it met features in the frame before."""
+    return any(
+        isinstance(view.observation.pattern, PointPattern)
+        and view.name in before
+        and len(view.observation.pattern.points) < before[view.name].met
+        for view in views
+    )

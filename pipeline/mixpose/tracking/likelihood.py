@@ -1,0 +1,209 @@
+"""What one frame says of a pose: how to fit it near a start, and how to judge it.
+
+Chosen once per frame: matched densities, or, for single ranges of small bodies, the likelihood
+over all associations of ranges and features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
+from mixpose.judgement import Judged, Prior, judge, nearest_alike
+from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.tracking.association_likelihood import are_associated
+from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
+from mixpose.tracking.rules import Rules
+from mixpose.tracking.track import Prediction, Track, prior_of
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    uncertainty : (6,) float64 or None
+        Standard deviations; None: the pose is there already.
+    prediction : Prediction or None
+        That it comes from.
+    """
+
+    T_world_object: Floats
+    uncertainty: Floats | None = None
+    prediction: Prediction | None = None
+
+
+class Likelihood(Protocol):
+    """What one frame says of a pose."""
+
+    @property
+    def knows_detections(self) -> bool:
+        """Whether each feature's detection is known, so that one may be left out."""
+        ...
+
+    def fit(self, start: Start) -> Fit:
+        """Climb to the most likely pose near a start."""
+        ...
+
+    def judge(self, fit: Fit, start: Start) -> Judged:
+        """Judge a pose that was climbed to from a start."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FrameData:
+    """A frame, and what is known before it."""
+
+    views: Sequence[View]
+    body: Body
+    options: EstimatorOptions
+    samples: Floats
+    track: Track
+    predictions: Sequence[Prediction]
+    T_reference: Floats | None
+    start_uncertainty: Floats
+    rules: Rules
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Directions that are estimated."""
+        return free_mask(self.options)
+
+    def prior(self, T_world_object: Floats) -> Prior:
+        """What was known of a pose before the frame."""
+        return prior_of(
+            T_world_object,
+            self.predictions,
+            self.body,
+            self.free,
+            self.track.misses,
+            self.rules.motion,
+            self.rules.judgement.detection,
+        )
+
+    def at_sigma(
+        self, near: Floats | None = None, *, narrowed: float = 1.0, fine: bool = False
+    ) -> MatchedObjective:
+        """The matched objective at σ_ε, or at a share of it."""
+        sigmas = [narrowed * view.observation.sigma for view in self.views]
+        steps = FINE_STEPS if fine else STEPS_PER_SIGMA
+        return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
+
+    @cached_property
+    def finest(self) -> MatchedObjective | None:
+        """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
+        sparse = all(view.observation.is_sparse for view in self.views)
+        detected = any(view.observation.cell is None for view in self.views)
+        return self.at_sigma() if sparse and detected else None
+
+    def objective_near(self, T_world_object: Floats) -> MatchedObjective:
+        """The objective at σ_ε around a pose."""
+        return self.finest or self.at_sigma(T_world_object, fine=True)
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedLikelihood:
+    """Matched densities of all sensors."""
+
+    data: FrameData
+
+    @property
+    def knows_detections(self) -> bool:
+        """As `Likelihood` has it."""
+        return self.data.options.objective == "matched"
+
+    def fit(self, start: Start) -> Fit:
+        """Ascend the session's objective through narrowing blurs."""
+        if start.uncertainty is None:
+            return Fit(start.T_world_object, 0.0, True, 0)
+        data = self.data
+        return fit_near(
+            data.views,
+            data.body,
+            start.T_world_object,
+            start.uncertainty,
+            data.options,
+            data.samples,
+            finest=data.finest,
+            rules=data.rules.fit,
+        )
+
+    def judge(self, fit: Fit, start: Start) -> Judged:
+        """Judge a pose by matched densities at σ_ε."""
+        data = self.data
+        T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        judged = judge(
+            data.objective_near(T),
+            T,
+            data.free,
+            before=data.track.noise,
+            prior=data.prior(T),
+            rules=data.rules.judgement,
+        )
+        return replace(judged, proposer=fit.proposer)
+
+
+@dataclass(frozen=True, eq=False)
+class AssociationLikelihood:
+    """All associations of single ranges with the features of a small body."""
+
+    data: FrameData
+
+    @property
+    def knows_detections(self) -> bool:
+        """As `Likelihood` has it."""
+        return False
+
+    def fit(self, start: Start) -> Fit:
+        """Climb the posterior; the matched objective leads to where it begins."""
+        T, data = start.T_world_object, self.data
+        if _prior_of(start) is None:
+            T = MatchedLikelihood(data).fit(start).T_world_object
+            T = nearest_alike(T, data.body, data.T_reference)
+        posterior = self._posterior(start)
+        found = fit_ranges(
+            data.views, data.body, T, data.free, posterior.noise, posterior.prior, posterior.detection
+        )
+        return Fit(found.state, found.value, found.converged, found.iterations)
+
+    def judge(self, fit: Fit, start: Start) -> Judged:
+        """Judge a pose by the sum over all associations."""
+        data, T = self.data, fit.T_world_object
+        judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
+        return judge_ranges(
+            replace(judged, proposer=fit.proposer),
+            self._posterior(start),
+            data.track.noise,
+            data.prior(T),
+            data.rules.judgement.noise,
+            data.rules.ranges,
+        )
+
+    def _posterior(self, start: Start) -> Posterior:
+        data = self.data
+        noise = noise_ratio(data.track.noise, data.rules.ranges)
+        detection = data.rules.judgement.detection
+        return Posterior(data.views, data.body, data.free, noise, _prior_of(start), detection)
+
+
+def _prior_of(start: Start) -> Prediction | None:
+    """The prediction that a start comes from, where that is a prior."""
+    return start.prediction if start.prediction and start.prediction.is_prior else None
+
+
+def likelihood_of(data: FrameData) -> Likelihood:
+    """The likelihood for a frame."""
+    ranged = data.options.objective == "matched" and are_associated(data.views, data.body)
+    return AssociationLikelihood(data) if ranged else MatchedLikelihood(data)

@@ -1,0 +1,37 @@
+"""When poses are proposed, and how many."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mixpose.constants import constant
+
+
+@dataclass(frozen=True)
+class ProposalRules:
+    """What the proposers of `mixpose.tracking.proposers` go by."""
+
+    recurrent: float = constant(
+        0.6,
+        "share of a body met a step aside from which it may be followed there: a chessboard has "
+        "0.8, markers at random 1/N",
+    )
+    drawn: int = constant(
+        512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
+    )
+    kept: int = constant(5, "of these, starts that are fitted")
+    narrowing: float = constant(
+        3.0, "how much narrower than the uncertainty the blur is at which they are scored"
+    )
+    outdone: float = constant(
+        10.0, "log odds by which a candidate of the search may be behind to be fitted: e^-10"
+    )
+    flat: float = constant(
+        0.15, "thickness of a body against its smaller width below which it may be tilted"
+    )
+    narrow: float = constant(
+        0.5, "blur of a closer look in σ_ε: twice what centres of blobs err by (0.2 σ_ε)"
+    )
+    noticeable: float = constant(
+        0.35, "squared offset in σ_ε² that makes a closer look worth while: nine times 0.2²"
+    )

@@ -1,0 +1,25 @@
+"""All that is believed but not measured, in one value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mixpose.fit import FitRules
+from mixpose.judgement import AcceptanceRules, JudgementRules
+from mixpose.search import SearchBudget
+from mixpose.tracking.motion import MotionRules
+from mixpose.tracking.proposal_rules import ProposalRules
+from mixpose.tracking.range_posterior import RangeRules
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What a tracker goes by; `docs/constants.md` lists every field."""
+
+    fit: FitRules = FitRules()
+    judgement: JudgementRules = JudgementRules()
+    acceptance: AcceptanceRules = AcceptanceRules()
+    motion: MotionRules = MotionRules()
+    ranges: RangeRules = RangeRules()
+    proposals: ProposalRules = ProposalRules()
+    search: SearchBudget = SearchBudget()

@@ -1,0 +1,66 @@
+"""The pose of one frame, from densities."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View
+from mixpose.records import Estimate
+from mixpose.rigid import is_rigid
+from mixpose.tracking.tracker import Tracker
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+def estimate_pose(
+    views: Sequence[View],
+    model: Body,
+    start: Floats | None = None,
+    options: EstimatorOptions | None = None,
+) -> Estimate:
+    """Estimate one pose.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Sensors with what they observed.
+    model : Body
+    start : (4, 4) array or None
+        T_world_object near the pose; without it the pose is searched for everywhere.
+    options : EstimatorOptions or None
+
+    Returns
+    -------
+    Estimate
+        Of frame 0.
+
+    Raises
+    ------
+    ValueError
+        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
+    """
+    _check(views, start)
+    tracker = Tracker.create(model, options or EstimatorOptions(), start)
+    began = time.perf_counter()
+    _, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def _check(views: Sequence[View], start: Floats | None) -> None:
+    """Refuse arrays that cannot be meant, before they go astray in the search."""
+    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
+        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
+    for view in views:
+        found, allowed = view.observation.dimension, view.sensor.dimension
+        if found != allowed:
+            raise ValueError(
+                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
+            )

@@ -1,0 +1,247 @@
+"""What is known between two frames: where the body may be, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_alike
+from mixpose.rigid import perturb, twist_between
+from mixpose.tracking.motion import MotionRules, RandomWalk
+
+Floats: TypeAlias = NDArray[np.float64]
+
+@dataclass(frozen=True)
+class Branch:
+    """One place where the body may be.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    weight : float
+        Belief in this branch among its rivals.
+    velocity : (6,) float64 or None
+        Twist per second where frames have times, else per frame.
+    uncertainty : (6,) float64
+        Standard deviations of the next pose about the prediction.
+    spread : (6,) float64 or None
+        Standard deviations of the pose itself, where they are as large as its motion: then the
+        next frame takes it as a prior, and no velocity is believed.
+    steady : (6,) float64 or None
+        Mean of the last two velocities: less of a pose's own error is in it.
+    """
+
+    T_world_object: Floats
+    weight: float
+    velocity: Floats | None
+    uncertainty: Floats
+    spread: Floats | None = None
+    steady: Floats | None = None
+
+
+@dataclass(frozen=True)
+class SensorTally:
+    """How a sensor met the body in the last frame with a pose.
+
+    Attributes
+    ----------
+    met, in_view : int
+        Features with a detection, and all that should have one.
+    missed : float
+        Sum of the weights of those without.
+    surplus : float
+        Detections around the body that belonged to none.
+    """
+
+    met: int
+    in_view: int
+    missed: float
+    surplus: float
+
+
+@dataclass(frozen=True)
+class Track:
+    """What is known between two frames.
+
+    Attributes
+    ----------
+    branches : tuple of Branch
+        Best first; empty where nothing is known.
+    frame : int or None
+        The last frame with a pose; None before the first.
+    time_s : float or None
+        Its time.
+    misses : int
+        Frames since then.
+    noise : Noise
+        Residuals so far.
+    walk : RandomWalk or None
+        None before two uncertain poses.
+    tallies : mapping of str to SensorTally
+        By sensor, of the last frame with a pose.
+    """
+
+    branches: tuple[Branch, ...] = ()
+    frame: int | None = None
+    time_s: float | None = None
+    misses: int = 0
+    noise: Noise = field(default_factory=Noise)
+    walk: RandomWalk | None = None
+    tallies: Mapping[str, SensorTally] = field(default_factory=dict)
+
+    def missed(self) -> Track:
+        """The track after a frame without a pose."""
+        return replace(self, misses=self.misses + 1)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where a branch expects the body in a frame."""
+
+    T_world_object: Floats
+    uncertainty: Floats
+    weight: float
+    is_prior: bool = False
+
+
+def predict(
+    track: Track,
+    body: Body,
+    frame: int,
+    time_s: float | None,
+    rules: MotionRules = MotionRules(),
+) -> list[Prediction]:
+    """Where the branches of a track expect the body.
+
+    The longer nothing was seen, the wider; velocities are believed for a few frames only.
+    """
+    elapsed = elapsed_since(track, frame, time_s)
+    widening = min(
+        rules.widening**track.misses, rules.widest * (1 + track.misses / 10)
+    )
+    predictions = []
+    for branch in track.branches:
+        T = branch.T_world_object
+        if branch.spread is not None:
+            walk = track.walk or RandomWalk.unknown(body, elapsed, rules)
+            u = np.sqrt(branch.spread**2 + walk.variance(elapsed))
+            predictions.append(Prediction(T, u, branch.weight, is_prior=True))
+            continue
+        if branch.velocity is not None and track.misses <= rules.coasting:
+            T = perturb(T, branch.velocity * elapsed)
+        predictions.append(Prediction(T, branch.uncertainty * widening, branch.weight))
+    return predictions
+
+
+def prior_of(
+    T_world_object: Floats,
+    predictions: Sequence[Prediction],
+    body: Body,
+    free: NDArray[np.bool_],
+    misses: int,
+    rules: MotionRules,
+    detection: DetectionModel,
+) -> Prior:
+    """Density of a pose before its frame: the predictions, or now and then anywhere."""
+    anywhere = flat_prior(body, free, detection)
+    if not predictions:
+        return anywhere
+    surprise = min(rules.surprise * (1 + misses), 1.0)
+    terms = [np.log(surprise) + anywhere.log_density]
+    for prediction in predictions:
+        u = prediction.uncertainty[free]
+        twist = twist_between(
+            prediction.T_world_object,
+            nearest_alike(T_world_object, body, prediction.T_world_object),
+        )
+        scaled = twist[free] / u
+        log_density = -0.5 * scaled @ scaled - np.log(u * np.sqrt(2 * np.pi)).sum()
+        weight = max((1 - surprise) * prediction.weight, 1e-12)
+        terms.append(np.log(weight) + log_density)
+    return Prior(float(np.logaddexp.reduce(terms)), anywhere.spread)
+
+
+class Found(NamedTuple):
+    """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior."""
+
+    T_world_object: Floats
+    weight: float
+    spread: Floats | None = None
+
+
+def follow(
+    track: Track,
+    body: Body,
+    found: Sequence[Found],
+    frame: int,
+    time_s: float | None,
+    noise: Noise,
+    tallies: Mapping[str, SensorTally],
+    rules: MotionRules,
+) -> Track:
+    """The track after a frame with poses.
+
+    Parameters
+    ----------
+    track : Track
+        Before the frame.
+    body : Body
+    found : sequence of Found
+        Best first.
+    frame, time_s
+        Of the frame.
+    noise : Noise
+        Residuals so far.
+    tallies
+        Of the best pose, as `Track` has them.
+    rules : MotionRules
+    """
+    elapsed = elapsed_since(track, frame, time_s)
+    branches: list[Branch] = []
+    walk = track.walk
+    for T, weight, spread in found:
+        velocity, steady, uncertainty = None, None, rules.unsteady * rules.steady(body)
+        parent = _parent(track, T, body)
+        if spread is not None and parent is not None and elapsed > 0:
+            if not branches and track.frame is not None:
+                moved = twist_between(parent.T_world_object, T)
+                walk = walk or RandomWalk.unknown(body, elapsed, rules)
+                walk = walk.joined(moved, body.radius, elapsed)
+        elif parent is not None and track.frame is not None and elapsed > 0:
+            moved = twist_between(parent.T_world_object, T)
+            if track.misses <= rules.coasting:
+                velocity = moved / elapsed
+                steady = velocity if parent.velocity is None else (velocity + parent.velocity) / 2
+                change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
+                half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
+                uncertainty = np.maximum(_per_kind(half), rules.steady(body))
+        branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
+    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies)
+
+
+def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
+    """Time since the last pose: seconds where both frames have times, else frames."""
+    if time_s is not None and track.time_s is not None:
+        return time_s - track.time_s
+    return float(frame - (track.frame or 0))
+
+
+def _parent(track: Track, T: Floats, body: Body) -> Branch | None:
+    """The branch that a pose goes on from: the nearest."""
+    if not track.branches:
+        return None
+    away = [
+        np.linalg.norm(twist_between(branch.T_world_object, T) / np.repeat([body.radius, 1.0], 3))
+        for branch in track.branches
+    ]
+    return track.branches[int(np.argmin(away))]
+
+
+def _per_kind(twist: Floats) -> Floats:
+    """The largest of the lengths and the largest of the angles, for all directions alike."""
+    return np.repeat([np.abs(twist[:3]).max(), np.abs(twist[3:]).max()], 3)

@@ -1,0 +1,206 @@
+"""From frame to frame: propose, fit, judge, decide, follow.
+
+A tracker is a value: `advance` takes a track and a frame and returns the next track with the
+estimate.  While lost it keeps what it trusted last, looks around it ever more widely and
+everywhere else, and invents nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions, free_mask
+from mixpose.judgement import Judged, decide, insert
+from mixpose.objective import View
+from mixpose.records import Estimate, Hypothesis, SensorReport
+from mixpose.tracking.delays import in_step
+from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
+from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.rules import Rules
+from mixpose.tracking.track import Branch, Found, SensorTally, Track, follow, predict
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """Everything that stays the same from frame to frame.
+
+    Attributes
+    ----------
+    body : Body
+    options : EstimatorOptions
+    samples : (N, R, 3) float64
+        Of the body, for the objectives that integrate by sampling.
+    start_uncertainty : (6,) float64
+    T_start : (4, 4) float64 or None
+    rules : Rules
+    proposers : tuple of Proposer
+        In the order in which they are tried.
+    refinements : tuple of Refinement
+    """
+
+    body: Body
+    options: EstimatorOptions
+    samples: Floats
+    start_uncertainty: Floats
+    T_start: Floats | None = None
+    rules: Rules = Rules()
+    proposers: tuple[Proposer, ...] = PROPOSERS
+    refinements: tuple[Refinement, ...] = REFINEMENTS
+
+    @classmethod
+    def create(
+        cls,
+        body: Body,
+        options: EstimatorOptions,
+        T_start: Floats | None = None,
+        *,
+        rotation_deg: float | None = None,
+        distance: float | None = None,
+        rules: Rules = Rules(),
+    ) -> Tracker:
+        """Prepare tracking of a body.
+
+        Parameters
+        ----------
+        body : Body
+        options : EstimatorOptions
+        T_start : (4, 4) array or None
+            Where the body is about the first frame; None: anywhere.
+        rotation_deg, distance : float or None
+            Half-widths of where to look around the start; None: 5° and a tenth of the radius.
+        rules : Rules
+        """
+        start = rules.motion.start(body)
+        if distance is not None:
+            start[:3] = distance
+        if rotation_deg is not None:
+            start[3:] = np.radians(rotation_deg)
+        samples = body.sample(options.samples, seed=options.seed)
+        return cls(body, options, samples, start, T_start, rules)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which of the six directions are estimated."""
+        return free_mask(self.options)
+
+    def begin(self) -> Track:
+        """The track before the first frame."""
+        if self.T_start is None:
+            return Track()
+        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),))
+
+    def advance(
+        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
+    ) -> tuple[Track, Estimate]:
+        """Estimate one frame.
+
+        Parameters
+        ----------
+        track : Track
+        frame : int
+        time_s : float or None
+        views : sequence of View
+            All sensors with a frame; those that saw nothing are reported and left out.
+
+        Returns
+        -------
+        Track, Estimate
+            The track for the next frame, and the frame's estimate without its latency.
+        """
+        usable = [view for view in views if not view.observation.is_empty]
+        usable = in_step(usable, track, frame, time_s, self.rules.motion)
+        ranked = self.ranked(track, frame, time_s, usable) if usable else []
+        verdict = decide(ranked, self.free, self.rules.acceptance)
+        reports = {view.name: SensorReport(False) for view in views}
+        told = verdict.best or (ranked[0] if ranked else None)
+        estimate = Estimate(
+            frame=frame,
+            time_s=time_s,
+            object=self.body.name,
+            status=verdict.status,
+            T_world_object=None,
+            covariance=None,
+            score=told.score if told else 0.0,
+            sensors=reports | (told.sensors if told else {}),
+        )
+        best = verdict.best
+        if best is None:
+            return track.missed(), estimate
+        hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
+        estimate = replace(
+            estimate,
+            T_world_object=best.T_world_object,
+            covariance=best.covariance,
+            hypotheses=() if verdict.status == "ok" else tuple(hypotheses),
+        )
+        found = [
+            Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
+            for one, weight in verdict.kept
+        ]
+        noise = best.noise if verdict.status == "ok" else track.noise
+        motion = self.rules.motion
+        after = follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
+        return after, estimate
+
+    def ranked(
+        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
+    ) -> list[Judged]:
+        """Distinct poses that may explain a frame, most evident first.
+
+        Parameters
+        ----------
+        track, frame, time_s
+            As `advance` has them.
+        views : sequence of View
+            At least one, none of which saw nothing.
+        """
+        data = self._data(track, frame, time_s, views)
+        likelihood = likelihood_of(data)
+        ranked: list[Judged] = []
+
+        def consider(start: Start, name: str) -> Judged:
+            judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=name)
+            insert(ranked, judged, self.body, self.free, self.rules.acceptance)
+            return judged
+
+        for propose in self.proposers:
+            for start in propose(data, ranked):
+                judged = consider(start, propose.__name__)
+                for refine in self.refinements:
+                    for better in refine(data, likelihood, judged):
+                        consider(better, refine.__name__)
+        return ranked
+
+    def _data(
+        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
+    ) -> FrameData:
+        predictions = predict(track, self.body, frame, time_s, self.rules.motion)
+        return FrameData(
+            views=views,
+            body=self.body,
+            options=self.options,
+            samples=self.samples,
+            track=track,
+            predictions=predictions,
+            T_reference=predictions[0].T_world_object if predictions else self.T_start,
+            start_uncertainty=self.start_uncertainty,
+            rules=self.rules,
+        )
+
+
+def _tallies(judged: Judged) -> dict[str, SensorTally]:
+    """How each sensor met the body."""
+    return {
+        one.name: SensorTally(
+            int(np.count_nonzero(one.shares)), len(one.features), one.missed, one.surplus
+        )
+        for one in judged.associations
+    }
