@@ -96,19 +96,22 @@ class MatchedObjective:
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
+        if len(poses) == 1:
+            return self._slopes(poses)
+        parts = [self._slopes(some) for some in self._blocks(poses)]
+        return Slopes(*map(np.concatenate, zip(*parts)))
+
+    def _slopes(self, poses: Floats) -> Slopes:
+        at = self.projection.project(poses)
+        sampled = self.atlas.look_up(at.y)
+        over = overlaps(at.y, at.weights, self.variances, self.tops)
         scales = self.weights / self.energies
-        parts = []
-        for some in self._blocks(poses):
-            at = self.projection.project(some)
-            sampled = self.atlas.look_up(at.y)
-            over = overlaps(at.y, at.weights, self.variances, self.tops)
-            parts.append(slopes(at, sampled, over, self.variances, self.tops, scales))
-        return parts[0] if len(parts) == 1 else Slopes(*map(np.concatenate, zip(*parts)))
+        return slopes(at, sampled, over, self.variances, self.tops, scales)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient, curvature and Hessian at one pose (4, 4)."""
-        value, gradient, curvature, hessian = self.slopes(T_world_object[None])
-        return Quadratic(float(value[0]), gradient[0], curvature[0], hessian[0])
+        """Value, gradient and curvature at one pose (4, 4)."""
+        value, gradient, curvature = self.slopes(T_world_object[None])
+        return Quadratic(float(value[0]), gradient[0], curvature[0])
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
