@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import STEPS_PER_SIGMA
 from mixpose.estimation.annealing import ladder
-from mixpose.estimation.guidance import all_grids, ascend_guided
+from mixpose.estimation.free_features import Sight, fit_freed
 from mixpose.estimation.options import EstimatorOptions
-from mixpose.estimation.settling import settle
+from mixpose.estimation.prior import GridLikelihood, Prior, cell_variance, most_probable
 from mixpose.objective import Gaze, View, build_objective, gazes_of, matched_objective
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.records import PointPattern
+from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import TWIST_NAMES, perturb
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -90,9 +90,10 @@ def fit_near(
         ascent = _annealed(views, body, T_start, uncertainty, options, samples, gazes)
     T, settled = ascent.state, False
     if options.objective == "matched" and all_grids(views):
-        T = ascend_guided(views, body, T, T_start, uncertainty, free)
-        T_settled = settle(views, body, T, free)
-        T, settled = T_settled, T_settled is not T
+        likelihood, prior = GridLikelihood(views, body), Prior(T_start, uncertainty, free)
+        T = most_probable(likelihood.near, T, prior, alone=likelihood.is_alone(T))
+        T_freed = _freed(likelihood, T, prior)
+        T, settled = (T, False) if T_freed is None else (T_freed, True)
     sigmas = tuple(view.observation.sigma for view in views)
     return Fit(T, ascent.value, ascent.converged, sigmas, settled)
 
@@ -135,6 +136,34 @@ def _annealed(
         )
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     return ascent
+
+
+def _freed(likelihood: GridLikelihood, T: Floats, prior: Prior) -> Floats | None:
+    """The fit to freed features, where all sensors see all of them and the body does not fit."""
+    views, body = likelihood.views, likelihood.body
+    if len(body.nodes.points) != len(body):
+        return None
+    sensors = [view.sensor for view in views]
+    if not all(at.seen.all() for at in (gaze.project(T) for gaze in gazes_of(sensors, body))):
+        return None
+    sigmas = [view.observation.sigma for view in views]
+    whole = {term.name: term for term in matched_objective(views, body, sigmas).terms}
+    sights = [
+        Sight(
+            term.sensor,
+            whole[term.name].matched.sample,
+            term.matched.sample,
+            term.variance,
+            cell_variance(term, likelihood.cells(term), likelihood.explained(term, T)),
+        )
+        for term in likelihood.terms(T, True)
+    ]
+    return fit_freed(sights, body.nodes.points, [T, *prior.points()], prior.free)
+
+
+def all_grids(views: Sequence[View]) -> bool:
+    """Whether all sensors gave grey values or profiles, whose noise is that of their cells."""
+    return all(isinstance(view.observation.pattern, GridPattern) for view in views)
 
 
 def all_points(views: Sequence[View]) -> bool:
