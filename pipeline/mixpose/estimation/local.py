@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from functools import cache, partial
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,9 @@ from mixpose.density import STEPS_PER_SIGMA
 from mixpose.estimation.annealing import ladder
 from mixpose.estimation.free_features import Sight, fit_freed
 from mixpose.estimation.options import EstimatorOptions
-from mixpose.estimation.prior import GridLikelihood, Prior, cell_variance, most_probable
+from mixpose.estimation.prior import Prior, grid_likelihood, most_probable
 from mixpose.objective import Gaze, View, build_objective, gazes_of, matched_objective
+from mixpose.objective.stack import MatchedTerm
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import TWIST_NAMES, perturb
@@ -90,9 +92,9 @@ def fit_near(
         ascent = _annealed(views, body, T_start, uncertainty, options, samples, gazes)
     T, settled = ascent.state, False
     if options.objective == "matched" and all_grids(views):
-        likelihood, prior = GridLikelihood(views, body), Prior(T_start, uncertainty, free)
-        T = most_probable(likelihood.near, T, prior, alone=likelihood.is_alone(T))
-        T_freed = _freed(likelihood, T, prior)
+        prior = Prior(T_start, uncertainty, free)
+        T = most_probable(partial(grid_likelihood, views, body), T, prior)
+        T_freed = _freed(views, body, T, prior)
         T, settled = (T, False) if T_freed is None else (T_freed, True)
     sigmas = tuple(view.observation.sigma for view in views)
     return Fit(T, ascent.value, ascent.converged, sigmas, settled)
@@ -138,25 +140,25 @@ def _annealed(
     return ascent
 
 
-def _freed(likelihood: GridLikelihood, T: Floats, prior: Prior) -> Floats | None:
+def _freed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> Floats | None:
     """The fit to freed features, where all sensors see all of them and the body does not fit."""
-    views, body = likelihood.views, likelihood.body
-    if len(body.nodes.points) != len(body):
+    gazes = gazes_of([view.sensor for view in views], body)
+    likelihood = grid_likelihood(views, body, T, True)
+    all_seen = all(gaze.project(T).seen.all() for gaze in gazes)
+    if likelihood is None or not all_seen or len(body.nodes.points) != len(body):
         return None
-    sensors = [view.sensor for view in views]
-    if not all(at.seen.all() for at in (gaze.project(T) for gaze in gazes_of(sensors, body))):
-        return None
-    sigmas = [view.observation.sigma for view in views]
-    whole = {term.name: term for term in matched_objective(views, body, sigmas).terms}
+
+    @cache
+    def everywhere() -> dict[str, MatchedTerm]:
+        sigmas = [view.observation.sigma for view in views]
+        return {term.name: term for term in matched_objective(views, body, sigmas).terms}
+
+    def density(name: str, y: Floats) -> NDArray[Any]:
+        return everywhere()[name].matched.sample(y)
+
     sights = [
-        Sight(
-            term.sensor,
-            whole[term.name].matched.sample,
-            term.matched.sample,
-            term.variance,
-            cell_variance(term, likelihood.cells(term), likelihood.explained(term, T)),
-        )
-        for term in likelihood.terms(T, True)
+        Sight(term.sensor, partial(density, term.name), term.matched.sample, term.variance, noise)
+        for term, noise in zip(likelihood.objective.terms, likelihood.noise, strict=True)
     ]
     return fit_freed(sights, body.nodes.points, [T, *prior.points()], prior.free)
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.stack import MatchedTerm
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.records import GridPattern
 from mixpose.rigid import perturb, twist_between
@@ -30,11 +29,17 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 # gains of 1e-6 nats do not matter: 0.001 standard deviations; bilinear values on tiles err by 2e-3
 _NATS = 1e-6
+_ROUGH = 1e-2  # that tell which of several maxima is the highest
 _VALUE_ERROR = 2e-3
 
 
 class LogLikelihood(Protocol):
     """A log-likelihood of the pose, in nats."""
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other pose can be as likely as the one around which it was made."""
+        ...
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and curvature at one pose (4, 4)."""
@@ -90,120 +95,121 @@ class Posterior:
             None if one.hessian is None else one.hessian + np.diag(information),
         )
 
-    def highest(self, starts: Sequence[Floats]) -> Floats:
-        """The highest of the maxima (4, 4) that are reached from starts (4, 4)."""
-        ascents = [self._ascend(T) for T in starts]
-        return max(ascents, key=lambda one: one[1])[0]
-
-    def _ascend(self, T: Floats) -> tuple[Floats, float]:
-        scale = max(abs(self.linearise(T).value), 1.0)
-        options = NewtonOptions(60, max(1e-11, _NATS / scale), value_error=_VALUE_ERROR)
-        found = ascend(self.linearise, perturb, T, self.prior.free, options)
-        return found.state, found.value
+    def highest(self, starts: Sequence[Floats], nats: float = _NATS) -> Floats:
+        """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
+        ends = []
+        for T in starts:
+            scale = max(abs(self.linearise(T).value), 1.0)
+            options = NewtonOptions(60, max(1e-11, nats / scale), value_error=_VALUE_ERROR)
+            ends.append(ascend(self.linearise, perturb, T, self.prior.free, options))
+        return max(ends, key=lambda end: end.value).state
 
 
 def most_probable(
     likelihood_near: Callable[[Floats, bool], LogLikelihood | None],
     T_world_object: Floats,
     prior: Prior,
-    *,
-    alone: bool,
 ) -> Floats:
-    """The maximum of the posterior.
+    """Maximise the posterior.
 
     Parameters
     ----------
     likelihood_near : callable
-        The log-likelihood around a pose (4, 4), if true drawn so finely around it that nothing of
-        the drawing is left in its maximum; None where nothing is seen there.
+        The log-likelihood around a pose (4, 4), with the noise that this pose leaves, and if true
+        drawn finely close to it; None where nothing is seen there.
     T_world_object : (4, 4) array
         A maximum of the likelihood.
     prior : Prior
-    alone : bool
-        Whether no other pose can be as likely.
 
     Returns
     -------
     (4, 4) array
     """
-    T = T_world_object
-    if not alone:
-        likelihood = likelihood_near(T, False)
-        if likelihood is not None:
-            T = Posterior(likelihood, prior).highest([T, *prior.points()])
-    # noise is known from the second time on, and drawn places are those asked for
-    for _ in range(3):
-        likelihood = likelihood_near(T, True)
+    T, likelihood = T_world_object, likelihood_near(T_world_object, True)
+    if likelihood is not None and not likelihood.is_alone:
+        wide = likelihood_near(T, False)
+        if wide is not None:
+            T = Posterior(wide, prior).highest([T, *prior.points()], _ROUGH)
+            likelihood = likelihood_near(T, True)
+    for _ in range(2):  # the second is drawn around the maximum and knows the noise there
         if likelihood is None:
             return T
         T = Posterior(likelihood, prior).highest([T])
+        likelihood = likelihood_near(T, True)
     return T
 
 
 @dataclass(frozen=True)
 class GridLikelihood:
-    """Log-likelihood of grey values and profiles.
+    """Log-likelihood of grey values and profiles, made around a pose.
 
     Attributes
     ----------
-    views : sequence of View
-        All with grid patterns.
-    body : Body
+    objective : MatchedObjective
+        In nats.
+    shares : tuple of float
+        Of each sensor's energy ⟨g, g⟩, explained by the pose: ⟨g, h⟩² / (⟨g, g⟩ ⟨h, h⟩).
+    noise : tuple of float
+        Variance of a cell's noise times the size of a cell, per sensor.
     """
 
-    views: Sequence[View]
-    body: Body
+    objective: MatchedObjective
+    shares: tuple[float, ...]
+    noise: tuple[float, ...]
 
-    def terms(self, T_world_object: Floats, fine: bool) -> Sequence[MatchedTerm]:
-        """The terms at σ_ε, each with the energy that the pose explains as its value."""
-        sigmas = [view.observation.sigma for view in self.views]
-        objective = matched_objective(self.views, self.body, sigmas, T_world_object, fine=fine)
-        return [replace(term, weight=term.energy) for term in objective.terms]
-
-    def near(self, T_world_object: Floats, fine: bool) -> MatchedObjective | None:
-        """The log-likelihood around a pose, with the noise that the pose leaves."""
-        terms = self.terms(T_world_object, fine)
-        if not terms:
-            return None
-        noise = [
-            cell_variance(term, self.cells(term), self.explained(term, T_world_object))
-            for term in terms
-        ]
-        weighted = [
-            replace(term, weight=0.5 * term.energy / variance)
-            for term, variance in zip(terms, noise, strict=True)
-        ]
-        return MatchedObjective(weighted, self.body)
-
-    def explained(self, term: MatchedTerm, T_world_object: Floats) -> float:
-        """⟨g, h⟩² / ⟨h, h⟩ of one of the `terms`."""
-        return float(MatchedObjective([term], self.body).value(T_world_object[None])[0])
-
-    def cells(self, term: MatchedTerm) -> int:
-        """Grid points of the pattern that a term is of."""
-        pattern = next(v.observation.pattern for v in self.views if v.name == term.name)
-        assert isinstance(pattern, GridPattern)
-        return int(pattern.values.size)
-
-    def is_alone(self, T_world_object: Floats) -> bool:
-        """Whether no other pose can explain as much.
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other pose can be as likely.
 
         The shares of one density that orthogonal predictions explain sum to 1 at the most
         (Bessel's inequality): a pose that explains more than half of each is alone.
         """
-        terms = self.terms(T_world_object, True)
-        return all(self.explained(term, T_world_object) > 0.5 * term.energy for term in terms)
+        return min(self.shares) > 0.5
+
+    def linearise(self, T_world_object: Floats) -> Quadratic:
+        """Value, gradient and curvature at one pose (4, 4)."""
+        return self.objective.linearise(T_world_object)
 
 
-def cell_variance(term: MatchedTerm, cells: int, explained: float) -> float:
-    """Variance of a cell's noise times its size, from the energy left unexplained.
+def grid_likelihood(
+    views: Sequence[View], body: Body, T_world_object: Floats, fine: bool
+) -> GridLikelihood | None:
+    """Make the log-likelihood of grid patterns at σ_ε around a pose.
 
     Parameters
     ----------
-    term : MatchedTerm
-    cells : int
-    explained : float
-        ⟨g, h⟩² / ⟨h, h⟩.
+    views : sequence of View
+        All with grid patterns.
+    body : Body
+    T_world_object : (4, 4) array
+        What it leaves unexplained is taken for noise.
+    fine : bool
+        Whether densities are drawn finely, close to the features at that pose.
     """
-    # the energy is a difference of single-precision numbers' sums: nothing below 1e-9 is known
-    return max(term.energy - explained, 1e-9 * term.energy) / cells
+    sigmas = [view.observation.sigma for view in views]
+    patterns = {view.name: view.observation.pattern for view in views}
+    terms, shares, noise = [], [], []
+    for term in matched_objective(views, body, sigmas, T_world_object, fine=fine).terms:
+        plain = MatchedObjective([replace(term, weight=1.0)], body)
+        shares.append(float(plain.value(T_world_object[None])[0]))
+        pattern = patterns[term.name]
+        assert isinstance(pattern, GridPattern)
+        noise.append(cell_variance(term.energy, shares[-1], pattern.values.size))
+        terms.append(replace(term, weight=0.5 * term.energy / noise[-1]))
+    objective = MatchedObjective(terms, body)
+    return GridLikelihood(objective, tuple(shares), tuple(noise)) if terms else None
+
+
+def cell_variance(energy: float, share: float, cells: int) -> float:
+    """Variance of a cell's noise times the size of a cell, from the energy left unexplained.
+
+    Parameters
+    ----------
+    energy : float
+        ⟨g, g⟩, the integral of g² over all cells.
+    share : float
+        Of it, explained.
+    cells : int
+    """
+    # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
+    return max(1 - share, 1e-9) * energy / cells
