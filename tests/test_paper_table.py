@@ -181,7 +181,7 @@ def test_under_noise_the_matched_estimate_is_near_the_cramer_rao_bound() -> None
     for number in range(5):
         truth, _ = draw(np.random.default_rng([7, number]))
         measurements = measure(system, scenario, truth, np.random.default_rng(number))
-        bound = cramer_rao(system, scenario, measurements, truth) * DEGREES**2
+        bound = cramer_rao(system, scenario, measurements, truth)[0] * DEGREES**2
         _, error = matched(system, scenario, number)
         ratios.append(error**2 / bound)
     # the mean of 30 dependent ratios has expectation 1 and a standard deviation of about 0.35

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache, partial
-from typing import Any, TypeAlias
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import STEPS_PER_SIGMA
 from mixpose.estimation.annealing import ladder
-from mixpose.estimation.free_features import Sight, fit_freed
+from mixpose.estimation.free_features import fit_freed
+from mixpose.estimation.misfit import Sight, fits
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.prior import Prior, grid_likelihood, most_probable
 from mixpose.objective import Gaze, View, build_objective, gazes_of, matched_objective
-from mixpose.objective.stack import MatchedTerm
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import GridPattern, PointPattern
-from mixpose.rigid import TWIST_NAMES, perturb
+from mixpose.rigid import TWIST_NAMES, perturb, transform
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -147,20 +147,20 @@ def _freed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> Floats
     all_seen = all(gaze.project(T).seen.all() for gaze in gazes)
     if likelihood is None or not all_seen or len(body.nodes.points) != len(body):
         return None
-
-    @cache
-    def everywhere() -> dict[str, MatchedTerm]:
-        sigmas = [view.observation.sigma for view in views]
-        return {term.name: term for term in matched_objective(views, body, sigmas).terms}
-
-    def density(name: str, y: Floats) -> NDArray[Any]:
-        return everywhere()[name].matched.sample(y)
-
-    sights = [
-        Sight(term.sensor, partial(density, term.name), term.matched.sample, term.variance, noise)
-        for term, noise in zip(likelihood.objective.terms, likelihood.noise, strict=True)
+    terms = likelihood.objective.terms
+    here = [
+        Sight(term.sensor, term.matched.sample, term.variance, noise)
+        for term, noise in zip(terms, likelihood.noise, strict=True)
     ]
-    return fit_freed(sights, body.nodes.points, [T, *prior.points()], prior.free)
+    if fits(here, transform(T, body.nodes.points)):
+        return None
+    sigmas = [view.observation.sigma for view in views]
+    everywhere = matched_objective(views, body, sigmas).terms
+    whole = [
+        replace(sight, density=term.matched.sample)
+        for sight, term in zip(here, everywhere, strict=True)
+    ]
+    return fit_freed(whole, body.nodes.points, [T, *prior.points()], prior.free)
 
 
 def all_grids(views: Sequence[View]) -> bool:
