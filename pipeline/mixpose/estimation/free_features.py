@@ -51,7 +51,9 @@ def own_peaks(sight: Sight, count: int) -> Floats | None:
     y = grid[peaks][order[:count]]
     for _ in range(_STEPS):
         rest, height = sight.left(y)
-        y = y + np.sqrt(sight.variance) * rest[:, 1:]
+        if height <= 0:
+            return None
+        y = y + np.sqrt(sight.variance) / height * rest[:, 1:]
     chance = sight.noise() * np.sqrt(2 * np.log(heights.size))
     others = heights[peaks][order[count:]].max(initial=chance)
     return y if others < 0.5 * height < sight.density(y)[:, 0].min() else None

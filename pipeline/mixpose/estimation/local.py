@@ -14,7 +14,7 @@ from mixpose.body import Body
 from mixpose.density import STEPS_PER_SIGMA
 from mixpose.estimation.annealing import ladder
 from mixpose.estimation.free_features import fit_freed
-from mixpose.estimation.misfit import Sight, fits
+from mixpose.estimation.misfit import Sight, misfit
 from mixpose.estimation.options import EstimatorOptions
 from mixpose.estimation.prior import Prior, grid_likelihood, most_probable
 from mixpose.objective import Gaze, View, build_objective, gazes_of, matched_objective
@@ -93,9 +93,7 @@ def fit_near(
     T, settled = ascent.state, False
     if options.objective == "matched" and all_grids(views):
         prior = Prior(T_start, uncertainty, free)
-        T = most_probable(partial(grid_likelihood, views, body), T, prior)
-        T_freed = _freed(views, body, T, prior)
-        T, settled = (T, False) if T_freed is None else (T_freed, True)
+        T, settled = _believed(views, body, T, prior)
     sigmas = tuple(view.observation.sigma for view in views)
     return Fit(T, ascent.value, ascent.converged, sigmas, settled)
 
@@ -140,27 +138,33 @@ def _annealed(
     return ascent
 
 
-def _freed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> Floats | None:
-    """The fit to freed features, where all sensors see all of them and the body does not fit."""
+def _believed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> tuple[Floats, bool]:
+    """The most probable pose, or the fit to freed features of a body that does not fit."""
+    points = body.nodes.points
+    T = most_probable(partial(grid_likelihood, views, body, 1.0), T, prior)
+    likelihood = grid_likelihood(views, body, 1.0, T, True)
     gazes = gazes_of([view.sensor for view in views], body)
-    likelihood = grid_likelihood(views, body, T, True)
     all_seen = all(gaze.project(T).seen.all() for gaze in gazes)
-    if likelihood is None or not all_seen or len(body.nodes.points) != len(body):
-        return None
-    terms = likelihood.objective.terms
+    if likelihood is None or not all_seen or len(points) != len(body):
+        return T, False
     here = [
         Sight(term.sensor, term.matched.sample, term.variance, noise)
-        for term, noise in zip(terms, likelihood.noise, strict=True)
+        for term, noise in zip(likelihood.objective.terms, likelihood.noise, strict=True)
     ]
-    if fits(here, transform(T, body.nodes.points)):
-        return None
+    ratio = misfit(here, transform(T, points), int(prior.free.sum()))
+    if ratio == 1:
+        return T, False
     sigmas = [view.observation.sigma for view in views]
     everywhere = matched_objective(views, body, sigmas).terms
     whole = [
         replace(sight, density=term.matched.sample)
         for sight, term in zip(here, everywhere, strict=True)
     ]
-    return fit_freed(whole, body.nodes.points, [T, *prior.points()], prior.free)
+    T_freed = fit_freed(whole, points, [T, *prior.points()], prior.free)
+    if T_freed is not None:
+        return T_freed, True
+    # what is left at features is no noise of cells: in a body that does not fit it is as large
+    return most_probable(partial(grid_likelihood, views, body, ratio), T, prior), False
 
 
 def all_grids(views: Sequence[View]) -> bool:

@@ -40,25 +40,25 @@ class Sight:
     cell_variance: float
 
     def left(self, y: Floats) -> tuple[Floats, float]:
-        """What equal features (n, m) leave of the density there, in units of their height, and σ.
+        """What equal features (n, m) leave of the density at their places, and their height.
 
-        Values and gradients (n, 1 + m), the gradients times √2 σ; the height of a feature.
+        Values and gradients (n, 1 + m), the gradients times √2 σ: all have the same noise.
         """
         away = (y[:, None] - y) / np.sqrt(self.variance)
         bells = np.exp(-0.5 * (away * away).sum(axis=2))
         mixture = np.dstack([bells, -away * bells[..., None]]).sum(axis=1)
         here = self.density(y).astype(np.float64)
         here[:, 1:] *= np.sqrt(self.variance)
-        height = max(float(here[:, 0].sum() / bells.sum()), np.finfo(np.float64).tiny)
-        return here / height - mixture, height
+        height = float(here[:, 0].sum() / bells.sum())
+        return here - height * mixture, height
 
     def noise(self) -> float:
         """Standard deviation of the noise of the matched density."""
         return float(np.sqrt(self.cell_variance * peak(self.variance, self.sensor.dimension)))
 
 
-def fits(sights: Sequence[Sight], points_world: Floats) -> bool:
-    """Whether what a body leaves unexplained may be noise, by χ² at its features.
+def misfit(sights: Sequence[Sight], points_world: Floats, unknowns: int) -> float:
+    """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
 
     Parameters
     ----------
@@ -66,10 +66,15 @@ def fits(sights: Sequence[Sight], points_world: Floats) -> bool:
         Exact at the features.
     points_world : (n, 3) array
         The body's features.
+    unknowns : int
+        Numbers of the pose that were fitted; each sensor's amplitude was, too.
     """
-    statistic, freedom = 0.0, 0
+    statistic, freedom = 0.0, -unknowns
     for sight in sights:
         rest, height = sight.left(sight.sensor.project(points_world)[0])
-        statistic += float((rest * rest).sum()) / ((sight.noise() / height) ** 2 + _ROUNDING**2)
-        freedom += rest.size
-    return statistic < float(chdtri(freedom, 1 - _BELIEVED))
+        noise = np.hypot(sight.noise(), _ROUNDING * height)
+        statistic += float((rest * rest).sum()) / noise**2
+        freedom += rest.size - 1
+    if freedom <= 0 or statistic < float(chdtri(freedom, 1 - _BELIEVED)):
+        return 1.0
+    return statistic / freedom

@@ -172,7 +172,7 @@ class GridLikelihood:
 
 
 def grid_likelihood(
-    views: Sequence[View], body: Body, T_world_object: Floats, fine: bool
+    views: Sequence[View], body: Body, misfit: float, T_world_object: Floats, fine: bool
 ) -> GridLikelihood | None:
     """Make the log-likelihood of grid patterns at σ_ε around a pose.
 
@@ -181,6 +181,8 @@ def grid_likelihood(
     views : sequence of View
         All with grid patterns.
     body : Body
+    misfit : float
+        Factor on the variance of the noise: χ² per degree of freedom of a body that does not fit.
     T_world_object : (4, 4) array
         What it leaves unexplained is taken for noise.
     fine : bool
@@ -195,7 +197,7 @@ def grid_likelihood(
         pattern = patterns[term.name]
         assert isinstance(pattern, GridPattern)
         noise.append(cell_variance(term.energy, shares[-1], pattern.values.size))
-        terms.append(replace(term, weight=0.5 * term.energy / noise[-1]))
+        terms.append(replace(term, weight=0.5 * term.energy / (misfit * noise[-1])))
     objective = MatchedObjective(terms, body)
     return GridLikelihood(objective, tuple(shares), tuple(noise)) if terms else None
 
