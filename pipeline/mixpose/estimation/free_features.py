@@ -41,7 +41,7 @@ _STEPS = 30  # peaks two widths apart, the least, draw each other by 0.4 of a st
 def own_peaks(sight: Sight, count: int) -> Floats | None:
     """Where each of `count` features (n, m) explains most, if each has a peak of its own."""
     step = np.sqrt(sight.variance / 8)  # half of σ
-    limits = zip(sight.sensor.lower, sight.sensor.upper, strict=True)
+    limits = zip(*sight.extent, strict=True)
     grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in limits)), axis=-1)
     heights = sight.density(grid.reshape(-1, grid.shape[-1]))[:, 0].reshape(grid.shape[:-1])
     peaks = (heights == maximum_filter(heights, size=3)) & (heights > 0)

@@ -147,8 +147,9 @@ def _believed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> tup
     all_seen = all(gaze.project(T).seen.all() for gaze in gazes)
     if likelihood is None or not all_seen or len(points) != len(body):
         return T, False
+    extents = {view.name: view.observation.extent for view in views}
     here = [
-        Sight(term.sensor, term.matched.sample, term.variance, noise)
+        Sight(term.sensor, term.matched.sample, term.variance, noise, extents[term.name])
         for term, noise in zip(likelihood.objective.terms, likelihood.noise, strict=True)
     ]
     ratio = misfit(here, transform(T, points), int(prior.free.sum()))

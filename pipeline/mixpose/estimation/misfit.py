@@ -32,12 +32,15 @@ class Sight:
         2σ², that of a feature in the matched density, in squared sensor units.
     cell_variance : float
         Variance of the noise of a cell times the size of a cell.
+    extent : tuple of (m,) float64
+        Smallest and largest sensor coordinates of the density's cells.
     """
 
     sensor: Sensor
     density: Callable[[Floats], NDArray[Any]]
     variance: float
     cell_variance: float
+    extent: tuple[Floats, Floats]
 
     def left(self, y: Floats) -> tuple[Floats, float]:
         """What equal features (n, m) leave of the density at their places, and their height.
