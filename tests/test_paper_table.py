@@ -16,7 +16,8 @@ TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 from paper import runs  # noqa: E402
-from paper.bounds import cramer_rao, oracle  # noqa: E402
+from paper.bounds import cramer_rao  # noqa: E402
+from paper.deformation import deformed_run  # noqa: E402
 from paper.measurements import measure  # noqa: E402
 from paper.runs import DEGREES, START_UNCERTAINTY, Errors, views  # noqa: E402
 from paper.sampled import sampled_objectives  # noqa: E402
@@ -157,15 +158,22 @@ def test_the_matched_estimate_is_exact_without_noise(
         assert np.abs(error).max() < bound
 
 
-def test_a_deformed_body_is_fitted_like_known_correspondences() -> None:
-    system, scenario = SYSTEMS["1"], BY_NAME["III"]
-    for number in range(3):
-        truth, _ = draw(np.random.default_rng([7, number]))
-        fit, error = matched(system, scenario, number)
-        known = (oracle(system, scenario, system.body(scenario), truth) - truth) * DEGREES
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_a_deformed_body_is_fitted_like_known_correspondences(times: float) -> None:
+    for number in range(2):
+        fit, error, known = deformed_run(SYSTEMS["1"], times, 7, number)
         assert fit.settled
-        assert np.abs(known).max() > 5  # the deformation moves any estimate by that much
-        assert error == pytest.approx(known, abs=1e-3)
+        assert np.abs(known).max() > 5 * times  # the deformation moves any estimate by that much
+        # places of bilinear gradients err by 0.2 % of a quarter of σ: 0.003 units, on arms of 100
+        assert error == pytest.approx(known, abs=1e-2)
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_echoes_that_overlap_are_not_freed(times: float) -> None:
+    for number in range(2):
+        fit, error, _ = deformed_run(SYSTEMS["3"], times, 7, number)
+        assert not fit.settled
+        assert np.abs(error).max() < 25
 
 
 def test_noise_is_not_taken_for_a_deformed_body() -> None:
@@ -181,11 +189,26 @@ def test_under_noise_the_matched_estimate_is_near_the_cramer_rao_bound() -> None
     for number in range(5):
         truth, _ = draw(np.random.default_rng([7, number]))
         measurements = measure(system, scenario, truth, np.random.default_rng(number))
-        bound = cramer_rao(system, scenario, measurements, truth) * DEGREES**2
+        bound = cramer_rao(system, scenario, measurements, truth)[0] * DEGREES**2
         _, error = matched(system, scenario, number)
         ratios.append(error**2 / bound)
     # the mean of 30 dependent ratios has expectation 1 and a standard deviation of about 0.35
     assert 0.2 < np.mean(ratios) < 2.5
+
+
+def test_with_a_start_the_matched_estimate_is_better_than_starts_and_likelihood() -> None:
+    system, scenario = SYSTEMS["3"], BY_NAME["IV"]
+    ratios = []
+    for number in range(12):
+        truth, start = draw(np.random.default_rng([7, number]))
+        measurements = measure(system, scenario, truth, np.random.default_rng(number))
+        bound = cramer_rao(system, scenario, measurements, truth)[1] * DEGREES**2
+        _, error = matched(system, scenario, number)
+        ratios.append([error**2 / bound, ((start - truth) * DEGREES) ** 2 / bound])
+    estimate, begun = np.mean(ratios, axis=(0, 2))
+    # over 300 runs 1.3 and 2.1; the mean of 72 has a standard deviation of about a fifth of that
+    assert estimate < 2.0
+    assert estimate < begun
 
 
 def test_a_run_fills_every_cell(one_run: Errors) -> None:
@@ -199,7 +222,8 @@ def test_a_run_fills_every_cell(one_run: Errors) -> None:
                 values: Any = row[column]
                 assert len(values) == 6
                 assert np.all(np.isfinite(values))
-            assert (row["crlb"] is None) == (name != "IV")
+            for column in ("starts", "crlb", "crlb_prior"):
+                assert (row[column] is None) == (name != "IV")
             assert (row["published"] is None) == (name == "III")
 
 
