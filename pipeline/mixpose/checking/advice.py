@@ -60,7 +60,7 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
     polarity = "dark" if options.polarity == "bright" else "bright"
     trials: list[tuple[str, Any]] = [("polarity", polarity), ("threshold", "auto")]
     if options.method == "blobs":
-        trials += [("threshold", rule) for rule in ("local", "otsu")]
+        trials += [("threshold", rule) for rule in ("local", "otsu", "triangle", "li", "sauvola")]
         trials += [("min_area", area) for area in (3.0, 1.0, 10.0, 30.0, 100.0, 300.0)]
         trials += [("max_area", area) for area in (30.0, 100.0, 1000.0) if area > options.min_area]
     low, high = float(image.min()), float(image.max())

@@ -17,7 +17,8 @@ class ExtractOptions:
     polarity : {"bright", "dark"}
         Whether features are brighter or darker than their surroundings.
     threshold : str or float
-        "auto", "otsu", "local", or a grey level in the units of the image.
+        "auto", "otsu", "local", "li", "triangle", "sauvola", or a grey level in the units of the
+        image.
     min_area, max_area : float
         Limits of a blob's area in px; `max_area` None means no limit.
     sigma : float

@@ -83,8 +83,12 @@ class ExtractTable(Table):
     threshold: Annotated[
         str | Number | None, PlainValidator(read_threshold), Field(description=THRESHOLD_ALLOWED)
     ] = None
-    """Grey level that parts features from the background: by the noise of the image, by Otsu's
-    rule, by the surroundings of each pixel, or a level in grey values of the image.
+    """Grey level that parts features from the background. `"auto"` goes by the noise of the image
+    and the brightest feature. `"triangle"` and `"li"` go by the histogram: they keep what is dim
+    beside something much brighter, and more of what is no feature. `"otsu"` parts two classes of
+    about the same size, whatever they are. `"local"` and `"sauvola"` compare each pixel with its
+    surroundings, `"sauvola"` also with how much these vary. A number is a level in grey values of
+    the image: all that is above it counts.
 
     Example: `threshold = 120`
     """

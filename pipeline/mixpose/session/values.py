@@ -14,7 +14,7 @@ from mixpose.session.arrays import is_number, numbers
 from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
 
 EXTRACT_METHODS = ("blobs", "corners", "intensity")
-THRESHOLDS = ("auto", "otsu", "local")
+THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 
 _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
