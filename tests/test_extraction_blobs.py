@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from mixpose.extraction import ExtractOptions, extract
+from mixpose.extraction import METHODS, ExtractOptions, extract
 from mixpose.extraction.threshold import RULES
 from mixpose.records import Pattern, PointPattern
 
@@ -293,7 +293,7 @@ def test_window_filled_by_one_disk_knows_the_background_around_it() -> None:
 def test_image_is_left_as_it_was() -> None:
     image = photograph(spot((60, 60), 30, 30, 2, 150) + np.linspace(0, 60, 60), 16)
     before = image.copy()
-    for method in ("blobs", "corners", "intensity"):
+    for method in METHODS:
         for polarity in ("bright", "dark"):
             extract(image, ExtractOptions(method=method, polarity=polarity))
     np.testing.assert_array_equal(image, before)

@@ -114,7 +114,7 @@ def test_other_images_are_refused(image: np.ndarray[tuple[int, ...], np.dtype[np
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("method", ["blobs", "corners", "intensity"])
+@pytest.mark.parametrize("method", METHODS)
 def test_values_that_are_no_numbers_are_refused(value: float, method: str) -> None:
     image = np.zeros((40, 50), np.float32)
     image[20, 30] = value
