@@ -118,6 +118,9 @@ def come_apart(
 ) -> list[tuple[NDArray[np.uint8], float]]:
     """Parts of a long blob that come apart at a higher level.
 
+    A watershed (`skimage.segmentation`) from peaks parts no more pairs that are this prominent, in
+    three times the time, and takes minutes where a lit floor is long.
+
     Parameters
     ----------
     scene : Foreground
