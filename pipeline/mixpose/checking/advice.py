@@ -65,6 +65,7 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
         trials += [("threshold", rule) for rule in ("local", "otsu", "triangle", "li", "sauvola")]
         trials += [("min_area", area) for area in (3.0, 1.0, 10.0, 30.0, 100.0, 300.0)]
         trials += [("max_area", area) for area in (30.0, 100.0, 1000.0) if area > options.min_area]
+        trials.append(("method", "log"))
     if options.method == "log":
         trials += [("spot_sigma", width) for width in (3.0, 1.5, 6.0, 12.0)]
     low, high = float(image.min()), float(image.max())

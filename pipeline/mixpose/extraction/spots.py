@@ -120,9 +120,9 @@ def come_apart(
 ) -> list[tuple[NDArray[np.uint8], float]]:
     """Parts of a long blob that come apart at a higher level.
 
-    A watershed (`skimage.segmentation`) from peaks as prominent parts no more pairs (6 px apart, one
-    2.5 times brighter: 16 of 30 to 26) in three times the time, and a photograph of 8 megapixels
-    takes it more than a minute.
+    A watershed (`skimage.segmentation`) from peaks as prominent parts no more pairs (6 px apart,
+    one 2.5 times brighter: 16 of 30 to 26) in three times the time, and a photograph of 8
+    megapixels takes it more than a minute.
 
     Parameters
     ----------
