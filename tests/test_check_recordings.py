@@ -147,6 +147,22 @@ def test_too_few_features_name_the_key_that_mends_it(
     assert hint in report
 
 
+def test_markers_out_of_focus_and_faint_name_the_method_that_finds_them(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    for path in recording.glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        # spots 3 px wide, 7 to 8 grey values high, in noise of 2
+        light = 0.2 * cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.7)
+        light += 10 + rng.normal(0, 2, light.shape)
+        cv2.imwrite(str(path), np.clip(np.rint(light), 0, 255).astype(np.uint8))
+    report = report_on(recording / "session.toml", capsys, quick=True)
+    assert "sensor 'left': too few features, 0 in frame" in report
+    assert 'with method = "log" in [extract] it would be' in report
+
+
 def test_far_too_many_features_name_the_key_that_mends_it(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from mixpose.extraction import ExtractOptions, extract
+from mixpose.extraction import METHODS, ExtractOptions, extract
+from mixpose.extraction.threshold import RULES
 from mixpose.records import Pattern, PointPattern
 
 Floats = NDArray[np.float64]
@@ -229,7 +230,7 @@ def test_light_from_a_lamp_on_the_floor_is_no_blob_but_a_spot_on_it_is() -> None
 
 
 @pytest.mark.parametrize("value", [0, 37, 255])
-@pytest.mark.parametrize("threshold", ["auto", "otsu", "local", 100.0])
+@pytest.mark.parametrize("threshold", [*RULES, 100.0])
 @pytest.mark.parametrize("polarity", ["bright", "dark"])
 def test_even_frames_hold_no_blobs(value: int, threshold: str | float, polarity: str) -> None:
     image = np.full((50, 70), value, np.uint8)
@@ -244,7 +245,7 @@ def test_noise_alone_holds_no_blobs() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 3), (5, 9)])
 def test_tiny_images_hold_no_blobs(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    for threshold in ("auto", "otsu", "local", 10.0):
+    for threshold in (*RULES, 10.0):
         assert blobs(image, threshold=threshold, min_area=20).shape == (0, 2)
 
 
@@ -292,7 +293,7 @@ def test_window_filled_by_one_disk_knows_the_background_around_it() -> None:
 def test_image_is_left_as_it_was() -> None:
     image = photograph(spot((60, 60), 30, 30, 2, 150) + np.linspace(0, 60, 60), 16)
     before = image.copy()
-    for method in ("blobs", "corners", "intensity"):
+    for method in METHODS:
         for polarity in ("bright", "dark"):
             extract(image, ExtractOptions(method=method, polarity=polarity))
     np.testing.assert_array_equal(image, before)

@@ -127,7 +127,7 @@ def test_corners_in_a_window_are_in_pixels_of_the_image() -> None:
     assert np.all((pattern.points >= window[:2]) & (pattern.points < window[2:]))
 
 
-@pytest.mark.parametrize("threshold", ["otsu", "local"])
+@pytest.mark.parametrize("threshold", ["otsu", "local", "li", "triangle", "sauvola"])
 def test_rules_for_grey_levels_do_not_go_with_corners(threshold: str) -> None:
     image, _ = chessboard(8)
     with pytest.raises(SessionError, match=r"extract\.threshold.*corners.*auto"):

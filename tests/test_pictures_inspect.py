@@ -210,6 +210,29 @@ def test_for_dark_features_the_threshold_goes_the_other_way(
     assert "raise it: threshold = 184" in advice_for(session, 6, pose_of_frame_6)
 
 
+@pytest.mark.parametrize(
+    ("threshold", "words"),
+    [
+        ('"auto"', "clear of the noise, and a fifth of the clearest spot"),
+        ("1000.0", "hidden, or lower threshold = 1000"),
+    ],
+)
+def test_unsharp_spots_are_told_by_their_height(
+    threshold: str, words: str, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    lines = f'method = "log"\nspot_sigma = 1.5\nthreshold = {threshold}'
+    assert words in advice_for(with_options(recording, lines), 6, pose_of_frame_6)
+
+
+def test_unsharp_spots_have_a_picture_of_the_response(recording: Path, tmp_path: Path) -> None:
+    session = with_options(recording, 'method = "log"\nspot_sigma = 1.5')
+    assert command("inspect", session, "--frame", 6, "-o", tmp_path / "seen") == 0
+    shown = cv2.imread(str(tmp_path / "seen" / "left_threshold.png"))
+    assert shown is not None
+    # black but for markers and the noise: half of the noise is below zero
+    assert (shown.max(axis=-1) < 30).mean() > 0.9
+
+
 def test_small_clutter_is_told_by_its_area(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:

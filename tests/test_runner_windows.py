@@ -183,6 +183,20 @@ def test_a_reflection_far_from_the_body_does_not_hide_it(
     assert min(one.sensors["left"].explained or 0.0 for one in found[1:]) > 0.8
 
 
+@pytest.mark.parametrize("threshold", ["otsu", "local", "li", "triangle", "sauvola"])
+def test_rules_that_depend_on_the_whole_frame_are_not_used_in_windows(
+    session: Session, windows: list[Any], threshold: str
+) -> None:
+    sensors = [
+        replace(setup, extract=replace(setup.extract, threshold=threshold))
+        for setup in session.sensors
+    ]
+    found = tracked(replace(session, sensors=tuple(sensors)), range(3))
+    assert [one.status for one in found] == ["ok"] * 3
+    # Three frames of two cameras, each looked at once.
+    assert windows == [None] * 6
+
+
 def test_a_spot_near_the_border_of_a_window_is_found_like_in_the_whole_frame(
     session: Session,
 ) -> None:

@@ -172,13 +172,17 @@ def _estimates(
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
-    """Cameras whose features in a part of the frame are those of the whole frame."""
+    """Cameras whose features in a part of the frame are those of the whole frame.
+
+    The other rules for a threshold depend on all that is in the image: on its histogram, or on
+    its size.
+    """
     return {
         setup.name: setup.sensor
         for setup in session.sensors
         if setup.model != "lateration"
         and setup.extract.method == "blobs"
-        and setup.extract.threshold not in ("otsu", "local")
+        and (setup.extract.threshold == "auto" or not isinstance(setup.extract.threshold, str))
     }
 
 

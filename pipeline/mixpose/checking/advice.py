@@ -40,6 +40,8 @@ def advice(image: Image | None, options: ExtractOptions, expected: int, base: Pa
     keys = "polarity, threshold, min_area and max_area"
     if options.method == "corners":
         keys = "threshold"
+    elif options.method == "log":
+        keys = "polarity, threshold and spot_sigma"
     if image is None:
         return "the table of detections does not fit the body: look at its rows"
     if options.method not in METHODS:
@@ -60,9 +62,12 @@ def _trials(options: ExtractOptions, image: Image) -> list[tuple[str, Any]]:
     polarity = "dark" if options.polarity == "bright" else "bright"
     trials: list[tuple[str, Any]] = [("polarity", polarity), ("threshold", "auto")]
     if options.method == "blobs":
-        trials += [("threshold", rule) for rule in ("local", "otsu")]
+        trials += [("threshold", rule) for rule in ("local", "otsu", "triangle", "li", "sauvola")]
         trials += [("min_area", area) for area in (3.0, 1.0, 10.0, 30.0, 100.0, 300.0)]
         trials += [("max_area", area) for area in (30.0, 100.0, 1000.0) if area > options.min_area]
+        trials.append(("method", "log"))
+    if options.method == "log":
+        trials += [("spot_sigma", width) for width in (3.0, 1.5, 6.0, 12.0)]
     low, high = float(image.min()), float(image.max())
     trials += [("threshold", round(low + share * (high - low), 2)) for share in (0.3, 0.5, 0.7)]
     return [(key, value) for key, value in trials if getattr(options, key) != value]

@@ -77,6 +77,10 @@ def _threshold(image: Image, options: ExtractOptions) -> str:
         if isinstance(options.threshold, str):
             return '  threshold "auto": clear of the noise, and a fifth of the clearest corner'
         return f"  threshold {options.threshold:g} grey levels from bright to dark fields"
+    if options.method == "log":
+        if isinstance(options.threshold, str):
+            return '  threshold "auto": clear of the noise, and a fifth of the clearest spot'
+        return f"  threshold {options.threshold:g} grey levels from a spot to what is around it"
     if options.method not in ("blobs", "intensity"):
         return f"  method {options.method} has a threshold of its own"
     scene = _scene(image, options)
@@ -237,7 +241,7 @@ def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
 
 
 def _about_others(finding: Finding, body: Body) -> list[str]:
-    """Advice for corners and for the user's own method."""
+    """Advice for corners, unsharp spots and the user's own method."""
     options = finding.setup.extract
     expected = finding.expectation
     if expected is None:
@@ -249,7 +253,7 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
         missing = f"not met: {_some(lost)}" if lost else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
-    if options.method == "corners":
+    if options.method in ("corners", "log"):
         lower, raised = (_direction(options, lower=way) for way in (True, False))
     lines = []
     if few:
@@ -347,7 +351,7 @@ def _stricter(options: ExtractOptions) -> str:
 
 def _direction(options: ExtractOptions, *, lower: bool) -> str:
     """How the threshold is to be moved, which for dark features is the other way round."""
-    down = lower == (options.polarity == "bright" or options.method == "corners")
+    down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
     if isinstance(now, str):
         return f'set threshold to a grey level {"below" if down else "above"} that of "{now}"'
