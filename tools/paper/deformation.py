@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from mixpose.estimation import EstimatorOptions, Fit, fit_near
+from mixpose.fit import EstimatorOptions, Fit, fit_near
 from paper.bounds import oracle
 from paper.measurements import measure
 from paper.runs import DEGREES, START_UNCERTAINTY, views
@@ -47,7 +47,7 @@ def deformation_rows(strengths: Sequence[float], runs: int, seed: int) -> Rows:
             rows[f"{times:g}"][system.name] = {
                 "matched": _rms([error for _, error, _ in results]),
                 "oracle": _rms([known for _, _, known in results]),
-                "freed": sum(fit.settled for fit, _, _ in results),
+                "freed": sum(fit.freed for fit, _, _ in results),
             }
     return rows
 

@@ -126,6 +126,7 @@ def draw(
     sigmas: Sequence[float],
     steps_per_sigma: float,
     near: Sequence[Floats | None],
+    around: float = REACH,
 ) -> Atlas:
     """Draw patterns, blurred and normalised.
 
@@ -139,8 +140,10 @@ def draw(
         Cells per standard deviation.  The zero of the looked-up gradient errs by 5e-4 standard
         deviations at 3, 2e-4 at 4 and 3e-5 at 8.
     near : sequence of (n, m) array or None
-        Places of predicted features, about which alone a sensor's density is wanted (within
-        `REACH` standard deviations); None: wherever it is not zero.
+        Places of predicted features, about which alone a sensor's density is wanted; None:
+        wherever it is not zero.
+    around : float
+        Standard deviations about predicted features within which grey values are drawn.
     """
     steps = np.asarray(sigmas, dtype=np.float64) / steps_per_sigma
     reach = REACH * steps_per_sigma
@@ -161,7 +164,7 @@ def draw(
             q = None if near[k] is None else parts[k][0]
             first = 1 + sum(layers.shape[1] - 1 for layers in drawn)
             step, sigma = float(steps[k]), float(narrowed[k])
-            drawn.append(_draw_grid(pattern, k, step, sigma, grid, q, reach, table, first))
+            drawn.append(_draw_grid(pattern, k, step, sigma, grid, q, around * steps_per_sigma, table, first))
     values, corners = _packed(drawn, grid.page + 1)
     two = np.array([float(_dimension(pattern) == 2) for pattern in patterns])
     return Atlas(

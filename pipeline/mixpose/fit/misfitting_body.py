@@ -45,7 +45,7 @@ def believed(
     seen = project_body(tuple(view.sensor for view in views), body).project(T[None]).seen
     if not seen.all() or len(points) != len(body):
         return T, False
-    near = likelihood_near(views, body, T, fine=True)
+    near = likelihood_near(views, body, T)
     here = [
         SensorDensity(
             view.sensor,

@@ -20,11 +20,18 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.density.atlas import REACH
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Scale: TypeAlias = tuple[float, float]
+
+COARSE: Scale = (STEPS_PER_SIGMA, REACH)
+FINE: Scale = (FINE_STEPS, REACH)
+CLOSE: Scale = (ZOOM_STEPS, ZOOM)
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
@@ -99,17 +106,19 @@ def likelihood_near(
     body: Body,
     T_world_object: Floats,
     *,
-    fine: bool,
+    scale: Scale = FINE,
     misfit: float = 1.0,
 ) -> Likelihood:
     """Make the log-likelihood at σ_ε around a pose; what that pose leaves is taken for noise.
 
     `misfit` is a factor on the variance of the noise: χ² per degree of freedom of a body that does
-    not fit.  With `fine` densities are drawn for the last digits.
+    not fit.  `scale` says how finely densities are drawn.
     """
     sigmas = [view.observation.sigma for view in views]
-    steps = FINE_STEPS if fine else STEPS_PER_SIGMA
-    objective = matched_objective(views, body, sigmas, T_world_object, steps_per_sigma=steps)
+    steps, around = scale
+    objective = matched_objective(
+        views, body, sigmas, T_world_object, steps_per_sigma=steps, around=around
+    )
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
     cells = np.array([view.observation.cells for view in views])
@@ -161,14 +170,14 @@ def most_probable(
     (4, 4) array
     """
     T = T_world_object
-    likelihood = likelihood_near(views, body, T, fine=True, misfit=misfit)
+    likelihood = likelihood_near(views, body, T, misfit=misfit)
     if not likelihood.is_alone:
-        wide = likelihood_near(views, body, T, fine=False, misfit=misfit)
+        wide = likelihood_near(views, body, T, scale=COARSE, misfit=misfit)
         T = _highest(wide, prior, [T, *prior.points()], _ROUGH)
-        likelihood = likelihood_near(views, body, T, fine=True, misfit=misfit)
+        likelihood = likelihood_near(views, body, T, misfit=misfit)
     T = _highest(likelihood, prior, [T], _NATS)
-    # once more, drawn around the maximum and with the noise that it leaves
-    likelihood = likelihood_near(views, body, T, fine=True, misfit=misfit)
+    # once more, drawn close to the maximum and with the noise that it leaves
+    likelihood = likelihood_near(views, body, T, scale=CLOSE, misfit=misfit)
     return _highest(likelihood, prior, [T], _NATS)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
+from mixpose.density.atlas import REACH
 from mixpose.objective.base import Quadratic, View
 from mixpose.objective.kernel import Matched, Overlaps, Slopes, inner_products, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, Projected, project_body
@@ -31,7 +32,11 @@ STEPS_PER_SIGMA = 3.0
 """Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
 
 FINE_STEPS = 8.0
-"""The same where the last digits of grey values count, which have no detection noise."""
+"""The same where grey values are judged, which have no detection noise."""
+
+ZOOM_STEPS, ZOOM = 256.0, 0.0625
+"""The same for the last digits, and how far around features, in standard deviations of C: where
+features overlap, gradients are looked up beside their zeros and err by the square of a cell."""
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
@@ -126,6 +131,7 @@ def matched_objective(
     near: Floats | None = None,
     *,
     steps_per_sigma: float = STEPS_PER_SIGMA,
+    around: float = REACH,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -140,6 +146,8 @@ def matched_objective(
         Densities are wanted only around the projection of this pose; None: anywhere.
     steps_per_sigma : float
         Cells per standard deviation of C.
+    around : float
+        Standard deviations of C about the projection within which grey values are drawn.
     """
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
@@ -158,7 +166,7 @@ def matched_objective(
     return MatchedObjective(
         tuple(views),
         projection,
-        matched_atlas(observations, sigmas, steps_per_sigma, places),
+        matched_atlas(observations, sigmas, steps_per_sigma, places, around),
         *columns,
         weights[:, None],
     )
