@@ -52,6 +52,8 @@ def run(
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
+    The recording is opened at once, its frames are read as estimates are asked for.
+
     Parameters
     ----------
     session : Session
@@ -68,17 +70,18 @@ def run(
         raw frames and the features found in them, while tracking around the body only; its time
         is not in the latency.
 
-    Yields
-    ------
-    Estimate
-        As soon as each frame is done, by ascending frame number.
+    Returns
+    -------
+    generator of Estimate
+        Each as soon as its frame is done, by ascending frame number.
 
     Raises
     ------
     SessionError
         If the session names no source for a sensor.
     RecordingError
-        In place of the first frame that cannot be read.
+        At once, if a recording cannot be opened or its table of times lacks rows; else in place
+        of the first frame that cannot be read.
     """
     tracker, track = begin(session, T_start)
     if opened is None:

@@ -30,7 +30,7 @@ from mixpose.checking import (
 )
 from mixpose.errors import RecordingError
 from mixpose.estimation import expected_covariance, free_mask
-from mixpose.frames import Source
+from mixpose.frames import ALL_NUMBERS, Source
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.runner import open_sources
 from mixpose.session import SensorSetup, Session, load_session
@@ -75,10 +75,13 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     SessionError
         As ``mixpose run`` would before its first frame.
     RecordingError
-        If a recording cannot be opened, or, after all has been printed, if a frame is damaged.
+        If a recording cannot be opened or its table of times lacks rows, or, after all has been
+        printed, if a frame is damaged.
     """
     session = load_session(path)
     sources = open_sources(session, {})
+    for source in sources.values():
+        source.check_times(ALL_NUMBERS)
     report = _Report()
     report.say("session", f"{session.path}, lengths in {session.unit}")
     _say_object(report, session)
