@@ -14,12 +14,13 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection"}
+GROUND = {"errors", "rigid", "records", "selection", "threads"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
     "records": set(),
     "selection": set(),
+    "threads": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,

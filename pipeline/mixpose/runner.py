@@ -28,6 +28,7 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from mixpose.sensors import Sensor
@@ -159,7 +160,8 @@ def _estimates(
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            step = _advance(session, tracker, expectation, track, frame_set, met)
+            with one_blas_thread():
+                step = _advance(session, tracker, expectation, track, frame_set, met)
             track, met = step.track, step.met
             estimate = _with_silent_sensors(step.estimate, session.sensors)
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
