@@ -12,8 +12,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from benchmarks import objective_case, pose_case
+from benchmarks import objective_case, pose_case, search_rows
 from benchmarks.literal import LiteralObjective, samples_of
+from benchmarks.search_cases import Row, absent, rows_named, trial
+from benchmarks.search_rows import Outcome
 from benchmarks.timing import medians, slope
 from paper.systems import POINTS, pose
 
@@ -84,3 +86,37 @@ def test_tasks_take_turns_and_those_that_warm_up_do_not_count() -> None:
     seconds = medians(tasks, rounds=1, calls=2, warm_up=1)
     assert "".join(turns) == "aabb" * 2
     assert seconds["a"] < 0.1
+
+
+def outcome(status: str, *, first: bool, listed: bool, squared: float | None) -> Outcome:
+    return Outcome(status, first, listed, squared, 1.0, 2.0)
+
+
+def test_an_ambiguous_frame_whose_first_pose_is_wrong_is_no_success_of_the_search() -> None:
+    seen = [
+        outcome("ok", first=True, listed=True, squared=6.0),
+        outcome("ok", first=False, listed=False, squared=60.0),
+        outcome("ambiguous", first=False, listed=True, squared=None),
+        outcome("ambiguous", first=True, listed=True, squared=None),
+    ]
+    empty = [outcome("lost", first=False, listed=False, squared=None)]
+    row = search_rows.figures(rows_named([])[0], seen, empty)
+    assert row["success"] == row["first"] == 0.5
+    assert (row["listed"], row["ok"], row["wrong_ok"]) == (0.75, 0.5, 1)
+    # the wrong pose counts for the covariance: 6 is inside chi2(0.95, 6) = 12.6, 60 is not
+    assert (row["inside_95"], row["squared_per_dimension"]) == (0.5, 5.5)
+
+
+def test_of_no_ok_frame_nothing_is_said_about_the_covariance() -> None:
+    assert search_rows.consistency([]) == (None, None)
+
+
+def test_the_squared_error_of_a_frame_counts_only_where_it_is_ok() -> None:
+    frame = trial(Row("2 pinhole", 6, 0, 0, 0.99), 1)
+    found = search_rows.outcome(frame)
+    assert found.status == "ok"
+    assert found.first
+    assert found.squared is not None
+    # six degrees of freedom: one in a million is above 40
+    assert 0 < found.squared < 40
+    assert search_rows.outcome(absent(Row("2 pinhole", 6, 0, 0, 0.99), 1)).squared is None
