@@ -36,7 +36,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
-    | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
+    | {"sensors", "body", "extraction", "objective", "search", "estimation", "frames", "session"}
+    | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "estimation", "frames", "session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},

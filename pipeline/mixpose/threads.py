@@ -21,9 +21,9 @@ _LIMITING = Lock()
 def one_blas_thread() -> Iterator[None]:
     """Keep NumPy, SciPy and OpenCV from sharing linear algebra among threads.
 
-    Entering and leaving takes some 20 µs on an idle machine.  The limit is one of the whole process, so where frames
-    are computed in several threads at once only the first sets and restores it: if each did, the
-    last one would restore the limit of another.
+    Entering and leaving takes some 20 µs on an idle machine.  The limit is one of the whole
+    process, so where frames are computed in several threads at once only the first sets and
+    restores it: if each did, the last one would restore the limit of another.
     """
     if not _LIMITING.acquire(blocking=False):
         yield

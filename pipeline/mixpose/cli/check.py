@@ -1,4 +1,4 @@
-"""``mixpose check``: what a session says and its recording holds, without estimating anything."""
+"""``mixpose check``: what a session says and its recording holds, before poses are estimated."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def _say_features(
         count = found.counts[found.numbers.index(number)]
         report.warnings.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
-            f"{expected} are expected: {advice(image, setup.extract, expected, session.folder)}"
+            f"{expected} are expected: {advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
         report.warnings.append(f"{where}: no feature in frame {_numbers(list(found.empty))}")

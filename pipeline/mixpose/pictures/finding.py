@@ -40,6 +40,8 @@ class Expectation:
         Share of the sensor's density that the pose accounts for.
     rms : float or None
         Residual of the met features, sensor units.
+    sure : bool
+        Whether the estimate is "ok": what its features meet are markers then, and not clutter.
     """
 
     y: Floats
@@ -48,6 +50,7 @@ class Expectation:
     unexplained: Mask
     explained: float
     rms: float | None
+    sure: bool
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,8 @@ def _finding(
     points = pattern.points if isinstance(pattern, PointPattern) else None
     count = float(len(points)) if points is not None else _features_worth(view)
     T = estimate.T_world_object
-    expectation = None if T is None else _expect(view, body, T, points)
+    sure = estimate.status == "ok"
+    expectation = None if T is None else _expect(view, body, T, points, sure=sure)
     return Finding(setup, frame, view, points, count, expectation)
 
 
@@ -122,7 +126,7 @@ def _features_worth(view: View) -> float:
     return float(top / energy) if energy > 0 else 0.0
 
 
-def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expectation:
+def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
     nodes, nodes_seen = _nodes(view, body, T)
     meeting = _meeting(view, body, T)
@@ -138,9 +142,8 @@ def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expecta
         reach = 2 * view.observation.sigma * np.sqrt(-np.log(LEAST_SHARE))
         unexplained = away.min(axis=1, initial=np.inf) > reach
     explained = 0.0 if meeting is None else meeting.explained
-    return Expectation(
-        y, seen, met, unexplained, explained, None if meeting is None else meeting.rms
-    )
+    rms = None if meeting is None else meeting.rms
+    return Expectation(y, seen, met, unexplained, explained, rms, sure)
 
 
 def _meeting(view: View, body: Body, T: Floats) -> Meeting | None:
