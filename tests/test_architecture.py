@@ -14,12 +14,13 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection"}
+GROUND = {"errors", "rigid", "records", "selection", "threads"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
     "records": set(),
     "selection": set(),
+    "threads": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,
@@ -35,7 +36,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "session": GROUND | {"sensors", "body", "extraction", "objective", "estimation"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
-    | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
+    | {"sensors", "body", "extraction", "objective", "search", "estimation", "frames", "session"}
+    | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "estimation", "frames", "session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -9,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+import mixpose
 from mixpose.checking.advice import judge
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
+from mixpose.simulation import SimulationOptions, simulate
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -176,6 +179,63 @@ def test_far_too_many_features_name_the_key_that_mends_it(
     report = report_on(recording / "session.toml", capsys, quick=True)
     assert "sensor 'left': too many features" in report
     assert "with min_area = 10 in [extract] it would be" in report
+
+
+def with_lamps(folder: Path, seed: int) -> Path:
+    """A simulated recording of 7 markers with 7 lamps larger than they, and smaller specks."""
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    options = SimulationOptions(frames=6, seed=seed, noise=1.0, brightness=120.0)
+    simulate(session, folder / "lamps", options)
+    rng = np.random.default_rng(seed)
+    for path in sorted((folder / "lamps").glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        for u, v in rng.integers(12, 500, (7, 2)):
+            cv2.circle(image, (int(u), int(v)), 8, 220, -1)
+        for u, v in rng.integers(12, 500, (35, 2)):
+            image[v : v + 3, u : u + 3] = 200
+        cv2.imwrite(str(path), image)
+    return folder / "lamps" / "session.toml"
+
+
+def statuses(session: Path) -> list[str]:
+    return [estimate.status for estimate in mixpose.run(mixpose.load_session(session))]
+
+
+def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = with_lamps(tmp_path, seed=4)
+    advised = re.findall(
+        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in \[extract\] it would be (\d+)",
+        report_on(session, capsys, quick=True),
+    )
+    assert [name for name, *_ in advised] == ["left", "right"]
+    text = session.read_text(encoding="utf-8")
+    for name, key, value, count in advised:
+        # without the specks; 7 would be the lamps alone, as min_area = 100 leaves them
+        assert int(count) > 7
+        line = f'name = "{name}"'
+        text = text.replace(line, f"{line}\nextract = {{ {key} = {value} }}")
+    followed = session.with_name("followed.toml")
+    followed.write_text(text, encoding="utf-8")
+    assert statuses(followed) == ["ok"] * 6
+
+
+def test_no_value_is_advised_that_leaves_as_many_features_but_not_the_body(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # false spots like markers, some brighter: the 7 brightest of 47 are mostly clutter
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    options = SimulationOptions(
+        frames=3, seed=3, clutter=40.0, brightness=120.0, brightness_spread=0.25
+    )
+    simulate(session, tmp_path / "bright", options)
+    report = report_on(tmp_path / "bright" / "session.toml", capsys, quick=True)
+    assert report.count("too many features") == 2
+    assert report.count("none of the values tried leaves what can be the body") == 2
+    assert "it would be" not in report
+    assert statuses(tmp_path / "bright" / "session.toml") == ["ok"] * 3
 
 
 def test_a_look_at_a_few_frames_passes_over_the_others(

@@ -76,7 +76,7 @@ def frames_of(session: Session, setup: SensorSetup) -> list[RawFrame]:
         session.folder,
         "lateration" if setup.model == "lateration" else "camera",
         setup.resolution,
-        None if setup.times is None else setup.times.relative_to(session.folder),
+        setup.times,
         setup.fps,
         setup.range_min,
         setup.bin_size,

@@ -27,6 +27,7 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
     Expectation,
     Track,
@@ -60,6 +61,8 @@ def run(
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
+    The recording is opened at once, its frames are read as estimates are asked for.
+
     Parameters
     ----------
     session : Session
@@ -76,17 +79,18 @@ def run(
         raw frames and the features found in them, while tracking around the body only; its time
         is not in the latency.
 
-    Yields
-    ------
-    Estimate
-        As soon as each frame is done, by ascending frame number.
+    Returns
+    -------
+    generator of Estimate
+        Each as soon as its frame is done, by ascending frame number.
 
     Raises
     ------
     SessionError
         If the session names no source for a sensor.
     RecordingError
-        In place of the first frame that cannot be read.
+        At once, if a recording cannot be opened or its table of times lacks rows; else in place
+        of the first frame that cannot be read.
     """
     tracker, track = begin(session, T_start)
     if opened is None:
@@ -162,7 +166,8 @@ def _estimates(
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            step = _advance(session, tracker, expectation, track, frame_set, tracked)
+            with one_blas_thread():
+                step = _advance(session, tracker, expectation, track, frame_set, tracked)
             track, tracked = step.track, step.convinces
             estimate = _with_silent_sensors(step.estimate, session.sensors)
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))

@@ -23,6 +23,7 @@ _NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
 _FLOODED = 0.02  # share of an image above a threshold that would find everything
 _LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
 _SPECK_PX = 2  # pieces up to this area are noise
+_MOST = 0.8  # of the features in view that must be met to tell what markers look like
 _LISTED = 6  # features that are named one by one
 
 
@@ -195,8 +196,10 @@ def _about_extra(
         peaks.append(float(raw[region].max()))
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
-    if extra.all():
-        return [f"{text}: the pose is wrong, or {_stricter(options)}"]
+    unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
+    if unsure or extra.all():
+        # what looks like clutter may be the markers
+        return [f"{text}; which are markers cannot be told here: look at a frame that is ok"]
     size, peak = np.array(sizes), np.array(peaks)
     own = ~extra
     if size[extra].max() < 0.8 * size[own].min():
@@ -236,7 +239,10 @@ def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
         return lines or [f"too few: {_direction(options, lower=True)}{polarity}"]
     if finding.count > 3 * len(body):
-        return [f"too many: {_stricter(options)}"]
+        return [
+            "too many: look which are markers, and whether they differ from the rest in brightness "
+            "(threshold) or size (min_area, max_area)"
+        ]
     return []
 
 
