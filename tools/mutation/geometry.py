@@ -41,11 +41,11 @@ _RIGID = (
         "the twist between two single poses turns the wrong way",
     ),
     Mutant(
-        "rigid-quaternion-of-either-sign",
+        "rigid-quaternion-real-part-first",
         "rigid.py",
         "as_quat(canonical=True)",
-        "as_quat(canonical=False)",
-        "quaternions jump from w > 0 to w < 0 in a trajectory",
+        "as_quat(canonical=True, scalar_first=True)",
+        "quaternions are (w, x, y, z) where all formats have (x, y, z, w)",
     ),
     Mutant(
         "rigid-mirror-is-rigid",

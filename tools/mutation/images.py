@@ -184,14 +184,6 @@ _SADDLES = (
         (_CORNERS,),
     ),
     Mutant(
-        "extraction-corners-any-number-of-fields",
-        "extraction/corners.py",
-        "crossed &= (crossings == 4) & (symmetry >= LEAST_SYMMETRY)",
-        "crossed &= symmetry >= LEAST_SYMMETRY",
-        "lines count as corners",
-        (_CORNERS,),
-    ),
-    Mutant(
         "extraction-corners-of-any-symmetry",
         "extraction/corners.py",
         "crossed &= (crossings == 4) & (symmetry >= LEAST_SYMMETRY)",
