@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mixpose.checking import placement_lines, placement_warnings
+from mixpose.checking import expected_count, placement_lines, placement_warnings
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
@@ -124,3 +124,23 @@ def test_lengths_in_two_units_are_suspicious(session: Session) -> None:
         T[:3, 3] *= 1000.0
     warnings = placement_warnings(with_poses(session, *far))
     assert any("px wide: are points" in w and "all in mm?" in w for w in warnings)
+
+
+def test_two_cameras_on_one_stand_that_look_apart_are_not_suspicious(session: Session) -> None:
+    T = camera_poses(session)[0]
+    turned = from_rotation_vector([0.0, 0.1, 0.0], [0.0, 0.0, 0.0]) @ T
+    # turned about its own centre by 6 degrees: both still see the body
+    np.testing.assert_allclose(inverse(turned)[:3, 3], inverse(T)[:3, 3], atol=1e-9)
+    warnings = placement_warnings(with_poses(session, T, turned))
+    assert not [warning for warning in warnings if "at one place" in warning]
+
+
+def test_a_body_with_a_back_shows_half_of_its_features_where_nothing_says_how_it_stands(
+    session: Session,
+) -> None:
+    count = len(session.body)
+    unknown = replace(session, start=None)
+    assert expected_count(session.sensors[0], unknown) == count
+    normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    two_sided = replace(unknown, body=replace(session.body, normals=normals))
+    assert expected_count(session.sensors[0], two_sided) == count // 2
