@@ -225,3 +225,16 @@ def test_recordings_without_images_have_no_windows(windows: list[Any]) -> None:
     selection = Selection(0, 3)
     assert [one.status for one in mixpose.run(session, selection=selection)] == ["ok"] * 3
     assert windows == []
+
+
+@pytest.mark.parametrize(
+    ("threshold", "whole"), [("auto", False), (60.0, False), ("otsu", True), ("local", True)]
+)
+def test_rules_that_look_at_all_of_an_image_get_all_of_it(
+    session: Session, windows: list[Any], threshold: str | float, whole: bool
+) -> None:
+    # Otsu's level and the mean of a box about each pixel are others in a part of the image
+    setups = [replace(s, extract=replace(s.extract, threshold=threshold)) for s in session.sensors]
+    for estimate in mixpose.run(replace(session, sensors=tuple(setups)), selection=Selection(0, 4)):
+        assert estimate.status == "ok"
+    assert all(window is None for window in windows) == whole
