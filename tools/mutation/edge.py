@@ -160,7 +160,7 @@ _CHECKING = (
         "checking/placement.py",
         "if near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:",
         "if near:",
-        "two cameras on one stand that look apart are warned about",
+        "cameras in a ring about the origin, which share a translation, are warned about",
     ),
     Mutant(
         "checking-no-small-bodies",
