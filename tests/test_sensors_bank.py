@@ -173,7 +173,7 @@ def test_a_point_at_the_very_place_of_a_range_sensor_has_a_finite_jacobian() -> 
 
 
 def test_cameras_of_all_kinds_side_by_side_are_those_one_by_one() -> None:
-    sensors = [
+    sensors: list[Sensor] = [
         *cameras(None, BARREL),
         FisheyeCamera(K / 1.5, np.array([0.05, -0.01, 2e-3, -3e-4]), (1280, 1024), PLACES[2]),
         ParallelBeam(0.5, np.array([640.0, 512.0]), (1280, 1024), PLACES[1]),
