@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import mixpose
-from mixpose.checking.advice import judge
+from mixpose.checking import Survey, judge
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.simulation import SimulationOptions, simulate
@@ -266,3 +267,10 @@ def test_of_a_stream_only_its_beginning_is_looked_at(
     session = tmp_path / "session.toml"
     session.write_text(text.replace("camera.avi", stream), encoding="utf-8")
     assert "camera.avi; looked at 5" in report_on(session, capsys)
+
+
+def test_the_typical_frame_has_the_median_number_of_features() -> None:
+    seen = Survey(numbers=(4, 5, 6, 7, 8), counts=(0, 9, 3, 40, 7), empty=(4,))
+    # in order the counts are 0, 3, 7, 9, 40
+    assert seen.typical_frame == 8
+    assert replace(seen, counts=None).typical_frame is None

@@ -306,3 +306,27 @@ def test_strided_images_are_taken() -> None:
     np.testing.assert_allclose(blobs(image.T.copy().T), blobs(image))
     mirrored = blobs(image[::-1, ::-1])
     np.testing.assert_allclose(59 - mirrored, blobs(image), atol=0.02)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_spot_is_left_out_whichever_border_cuts_it(turns: int) -> None:
+    light = spot((80, 80), 0.6, 40, 2, 150) + spot((80, 80), 40, 30, 2, 150)
+    found = blobs(np.rot90(photograph(light, 9), turns).copy())
+    # half of the spot is out of the image: its centroid would be off by a px
+    assert len(found) == 1
+    expected = [(40, 30), (30, 39), (39, 49), (49, 40)][turns]
+    assert distances(found, np.array([expected]))[0] < 0.05
+
+
+def test_a_hot_pixel_does_not_hide_spots_that_are_dim_beside_it() -> None:
+    image = photograph(spot((80, 80), 30.4, 40.2, 1.6, 40), 18)
+    image[60, 60] = 255
+    # a fifth of the hot pixel's 235 above the background would be 47, more than the spot has
+    assert distances(blobs(image), np.array([(30.4, 40.2)]))[0] < 0.15
+
+
+def test_whole_grey_values_are_above_the_broken_level_below_them() -> None:
+    image = np.full((40, 40), 20, np.uint8)
+    image[10:15, 20:25] = 101
+    for threshold, count in ((100.0, 1), (100.5, 1), (101.0, 0), (101.5, 0)):
+        assert len(blobs(image, threshold=threshold)) == count, threshold

@@ -71,6 +71,19 @@ def test_intensity_without_features_is_an_empty_pattern() -> None:
     assert pattern.points.shape == (0, 2)
 
 
+def test_a_slope_of_light_below_a_feature_is_taken_out_in_every_window() -> None:
+    v, u = np.mgrid[:200.0, :240.0]
+    image = (20 + 0.3 * u + 0.2 * v).astype(np.float32)
+    image[97:103, 116:124] += 100
+    for u0, v0, u1, v1 in ((0, 0, 240, 200), (85, 70, 240, 200), (110, 90, 130, 110)):
+        options = ExtractOptions(method="intensity")
+        pattern = extract(image, options, window=(u0, v0, u1, v1))
+        assert isinstance(pattern, GridPattern)
+        # from one tile of 40 px to the next the slope rises by 12
+        lit = pattern.values[97 - v0 : 103 - v0, 116 - u0 : 124 - u0]
+        np.testing.assert_allclose(lit, 100, atol=1.0)
+
+
 # Options and images
 
 
