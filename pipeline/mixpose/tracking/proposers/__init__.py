@@ -17,6 +17,7 @@ from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.without_outlier import without_outlier
+from mixpose.tracking.proposers.without_sensor import without_sensor
 
 
 class Proposer(Protocol):
@@ -38,4 +39,4 @@ class Refinement(Protocol):
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, mirrored)
-REFINEMENTS: tuple[Refinement, ...] = (without_outlier, merged_pair)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, without_outlier, merged_pair)
