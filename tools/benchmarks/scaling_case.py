@@ -18,12 +18,13 @@ from benchmarks.search_cases import looking_at
 from benchmarks.timing import PROCESSOR, Task, medians, show, slope
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions, estimate_pose, fit_near
+from mixpose.fit import EstimatorOptions, fit_near
 from mixpose.objective import View
 from mixpose.objective.paper import PaperObjective
 from mixpose.records import PointPattern
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
+from mixpose.tracking import estimate_pose
 
 Floats: TypeAlias = NDArray[np.float64]
 

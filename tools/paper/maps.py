@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import Window, render
-from mixpose.objective.matched import MatchedObjective
-from mixpose.objective.stack import MatchedTerm
-from mixpose.records import GridPattern
+from mixpose.objective import matched_objective
+from mixpose.objective.matched import FINE_STEPS
 from paper.measurements import Measurement, measure
 from paper.runs import views
 from paper.sampled import sampled_objectives
@@ -62,18 +61,12 @@ def paper_map(system: System, scenario: Scenario, seed: int) -> Floats:
 
 def matched_map(system: System, scenario: Scenario, seed: int) -> Floats:
     """The matched objective over w (rows) and φ (columns)."""
-    terms = []
-    for view in views(system, scenario, measured(system, scenario, seed)):
-        pattern = view.observation.pattern
-        assert isinstance(pattern, GridPattern)
-        # a node per pixel: coarser grids, good for climbing, show their own steps on a flat peak
-        window = Window(pattern.origin, pattern.values.shape, pattern.step)
-        matched = render(pattern, scenario.sigma, window, gradient=True)
-        energy = view.observation.energy(scenario.sigma)
-        terms.append(
-            MatchedTerm(view.name, view.sensor, matched, 2 * scenario.sigma**2, energy, 1.0)
-        )
-    objective = MatchedObjective(terms, system.body(scenario))
+    seen = views(system, scenario, measured(system, scenario, seed))
+    # coarser cells, good for climbing, show their own steps on a flat peak
+    drawn = matched_objective(
+        seen, system.body(scenario), [scenario.sigma] * len(seen), steps_per_sigma=FINE_STEPS
+    )
+    objective = replace(drawn, weights=np.ones_like(drawn.weights))
     poses = np.array([[pose(parameters_of_motion(phi, w)) for phi in PHI] for w in W])
     return np.stack([objective.value(row) for row in poses])
 
