@@ -34,7 +34,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
     "frames": GROUND,
     "pictures": GROUND
-    | {"sensors", "body", "density", "extraction", "objective", "fit", "session"},
+    | {"sensors", "body", "density", "extraction", "objective", "session"}
+    | {"fit", "judgement", "tracking"},
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "fit"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
