@@ -14,13 +14,14 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection", "constants"}
+GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
     "records": set(),
     "selection": set(),
     "constants": set(),
+    "threads": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,
@@ -40,7 +41,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "session": GROUND | {"sensors", "body", "extraction", "objective", "fit"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
-    | {"sensors", "body", "extraction", "search", "frames", "session", "simulation", "runner"},
+    | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
+    | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},

@@ -145,3 +145,47 @@ def test_points_at_random_do_not_recur() -> None:
     points = np.random.default_rng(3).normal(scale=50.0, size=(9, 3))
     body = Body("scatter", tuple(PointFeature(point) for point in points))
     assert body.recurrence == pytest.approx(1 / 9)
+
+
+def test_a_corner_moved_beyond_the_tolerance_leaves_the_turns_about_its_diagonal() -> None:
+    marked = CUBE.copy()
+    marked[-1] *= 1 + 0.02 / np.sqrt(3)  # by 0.02 along its diagonal
+    # on average over the eight corners a turn would miss by 0.005 only
+    assert len(symmetries(marked, 0.01)) == 3
+    assert len(symmetries(marked, 0.05)) == 24
+
+
+def test_one_normal_that_differs_forbids_a_symmetry() -> None:
+    square = tuple(PointFeature(np.array([x, y, 0.0])) for x in (-1.0, 1) for y in (-1.0, 1))
+    normals = np.tile([0.0, 0.0, 1.0], (4, 1))
+    assert len(Body("square", square, normals).symmetries) == 4
+    normals[2] = [1.0, 0.0, 0.0]
+    assert len(Body("square", square, normals).symmetries) == 1
+
+
+def test_a_body_looks_alike_where_its_own_spread_hides_the_difference() -> None:
+    bent = CUBE + np.random.default_rng(1).normal(0, 0.03, CUBE.shape)
+    for sigma, order in ((0.0, 1), (0.3, 24)):
+        features = tuple(PointFeature(point, sigma**2 * np.eye(3)) for point in bent)
+        assert len(Body("bent", features).symmetries) == order
+
+
+def test_the_radius_does_not_depend_on_where_the_body_is_measured_from() -> None:
+    corners = tuple(PointFeature(point) for point in CUBE + np.array([100.0, 0, -50]))
+    assert Body("cube", corners).radius == pytest.approx(np.sqrt(3))
+
+
+def test_the_spread_is_that_of_the_widest_direction() -> None:
+    flat = PointFeature(np.zeros(3), np.diag([0.0, 4.0, 1.0]))
+    turned = np.array([[5.0, 4.0, 0], [4.0, 5.0, 0], [0, 0, 0.0]])  # 9 along (1, 1), 1 across
+    assert Body("b", (flat,)).spread == pytest.approx(2.0)
+    assert Body("b", (flat, PointFeature(np.zeros(3), turned))).spread == pytest.approx(3.0)
+
+
+def test_the_displacement_along_gravity_has_nothing_to_do_with_the_place_along_a_line() -> None:
+    line = SegmentFeature(np.zeros(3), np.array([1.0, 0.0, 0.0]))
+    body = Body("b", (line,), gravity=Gravity(np.array([0.0, 0.0, -1.0]), 1.0))
+    along = body.sample(4000)[0, :, 0]
+    down = body.world_offsets(4000)[:, 2]
+    # of 2000 pairs drawn by chance the correlation is 0.02 or so
+    assert abs(np.corrcoef(along, down)[0, 1]) < 0.1

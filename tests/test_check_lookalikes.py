@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.checking import look_alikes, typical_poses
+from mixpose.checking import look_alikes, noise_of, typical_poses, with_image_sizes
 from mixpose.extraction import ExtractOptions
 from mixpose.fit import EstimatorOptions
 from mixpose.rigid import Floats, from_parts, from_rotation_vector
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.session.setup import Unit
 
@@ -110,3 +110,18 @@ def test_typical_poses_are_in_view_at_the_distance_asked_for() -> None:
         depths = [(T[:3, :3] @ middle + T[:3, 3])[2] for T in (T_near, T_far)]
         assert depths[1] == pytest.approx(4 * depths[0])
         assert camera().sensor.project(body.means @ T_near[:3, :3].T + T_near[:3, 3])[1].all()
+
+
+def test_centres_of_spots_are_sharper_than_sigma_and_ranges_are_not() -> None:
+    ranging = RangeSensor(np.zeros(3))
+    ranges = SensorSetup("r", "lateration", ranging, "r.csv", None, None, ExtractOptions(sigma=2.0))
+    assert noise_of(camera(sigma=2.0)) == pytest.approx(0.4)
+    assert noise_of(ranges) == 2.0
+
+
+def test_images_of_unknown_size_are_taken_to_have_the_optical_axis_in_their_middle() -> None:
+    axis = replace(camera(), sensor=PinholeCamera(K), resolution=None)
+    session = Session(Path("x.toml"), "", "mm", body_of(SOLID), None, EstimatorOptions(), (axis,))
+    # from u = -0.5 to 640.5 about cx = 320
+    assert with_image_sizes(session, {}).sensors[0].resolution == (641, 481)
+    assert with_image_sizes(session, {"camera": (600, 400)}).sensors[0].resolution == (600, 400)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mixpose.checking import placement_lines, placement_warnings
+from mixpose.checking import expected_count, placement_lines, placement_warnings
 from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
@@ -124,3 +124,21 @@ def test_lengths_in_two_units_are_suspicious(session: Session) -> None:
         T[:3, 3] *= 1000.0
     warnings = placement_warnings(with_poses(session, *far))
     assert any("px wide: are points" in w and "all in mm?" in w for w in warnings)
+
+
+def test_cameras_in_a_ring_about_the_worlds_origin_are_not_suspicious(session: Session) -> None:
+    # each has the origin 900 mm in front of it: one translation, several places
+    ring = [from_rotation_vector([0.0, angle, 0.0], [0.0, 0.0, 900.0]) for angle in (0.0, 0.7)]
+    warnings = placement_warnings(with_poses(session, *ring))
+    assert not [warning for warning in warnings if "at one place" in warning]
+
+
+def test_a_body_with_a_back_shows_half_of_its_features_where_nothing_says_how_it_stands(
+    session: Session,
+) -> None:
+    count = len(session.body)
+    unknown = replace(session, start=None)
+    assert expected_count(session.sensors[0], unknown) == count
+    normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    two_sided = replace(unknown, body=replace(session.body, normals=normals))
+    assert expected_count(session.sensors[0], two_sided) == count // 2

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from mixpose.checking.advice import judge
+import mixpose
+from mixpose.checking import Survey, judge
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
+from mixpose.simulation import SimulationOptions, simulate
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -147,6 +151,22 @@ def test_too_few_features_name_the_key_that_mends_it(
     assert hint in report
 
 
+def test_markers_out_of_focus_and_faint_name_the_method_that_finds_them(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(0)
+    for path in recording.glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        # spots 3 px wide, 7 to 8 grey values high, in noise of 2
+        light = 0.2 * cv2.GaussianBlur(image.astype(np.float32), (0, 0), 2.7)
+        light += 10 + rng.normal(0, 2, light.shape)
+        cv2.imwrite(str(path), np.clip(np.rint(light), 0, 255).astype(np.uint8))
+    report = report_on(recording / "session.toml", capsys, quick=True)
+    assert "sensor 'left': too few features, 0 in frame" in report
+    assert 'with method = "log" in [extract] it would be' in report
+
+
 def test_far_too_many_features_name_the_key_that_mends_it(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -160,6 +180,63 @@ def test_far_too_many_features_name_the_key_that_mends_it(
     report = report_on(recording / "session.toml", capsys, quick=True)
     assert "sensor 'left': too many features" in report
     assert "with min_area = 10 in [extract] it would be" in report
+
+
+def with_lamps(folder: Path, seed: int) -> Path:
+    """A simulated recording of 7 markers with 7 lamps larger than they, and smaller specks."""
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    options = SimulationOptions(frames=6, seed=seed, noise=1.0, brightness=120.0)
+    simulate(session, folder / "lamps", options)
+    rng = np.random.default_rng(seed)
+    for path in sorted((folder / "lamps").glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        for u, v in rng.integers(12, 500, (7, 2)):
+            cv2.circle(image, (int(u), int(v)), 8, 220, -1)
+        for u, v in rng.integers(12, 500, (35, 2)):
+            image[v : v + 3, u : u + 3] = 200
+        cv2.imwrite(str(path), image)
+    return folder / "lamps" / "session.toml"
+
+
+def statuses(session: Path) -> list[str]:
+    return [estimate.status for estimate in mixpose.run(mixpose.load_session(session))]
+
+
+def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = with_lamps(tmp_path, seed=4)
+    advised = re.findall(
+        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in \[extract\] it would be (\d+)",
+        report_on(session, capsys, quick=True),
+    )
+    assert [name for name, *_ in advised] == ["left", "right"]
+    text = session.read_text(encoding="utf-8")
+    for name, key, value, count in advised:
+        # without the specks; 7 would be the lamps alone, as min_area = 100 leaves them
+        assert int(count) > 7
+        line = f'name = "{name}"'
+        text = text.replace(line, f"{line}\nextract = {{ {key} = {value} }}")
+    followed = session.with_name("followed.toml")
+    followed.write_text(text, encoding="utf-8")
+    assert statuses(followed) == ["ok"] * 6
+
+
+def test_no_value_is_advised_that_leaves_as_many_features_but_not_the_body(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # false spots like markers, some brighter: the 7 brightest of 47 are mostly clutter
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    options = SimulationOptions(
+        frames=3, seed=3, clutter=40.0, brightness=120.0, brightness_spread=0.25
+    )
+    simulate(session, tmp_path / "bright", options)
+    report = report_on(tmp_path / "bright" / "session.toml", capsys, quick=True)
+    assert report.count("too many features") == 2
+    assert report.count("none of the values tried leaves what can be the body") == 2
+    assert "it would be" not in report
+    assert statuses(tmp_path / "bright" / "session.toml") == ["ok"] * 3
 
 
 def test_a_look_at_a_few_frames_passes_over_the_others(
@@ -190,3 +267,10 @@ def test_of_a_stream_only_its_beginning_is_looked_at(
     session = tmp_path / "session.toml"
     session.write_text(text.replace("camera.avi", stream), encoding="utf-8")
     assert "camera.avi; looked at 5" in report_on(session, capsys)
+
+
+def test_the_typical_frame_has_the_median_number_of_features() -> None:
+    seen = Survey(numbers=(4, 5, 6, 7, 8), counts=(0, 9, 3, 40, 7), empty=(4,))
+    # in order the counts are 0, 3, 7, 9, 40
+    assert seen.typical_frame == 8
+    assert replace(seen, counts=None).typical_frame is None

@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from mixpose.extraction import ExtractOptions, extract
+from mixpose.extraction import METHODS, ExtractOptions, extract
+from mixpose.extraction.threshold import RULES
 from mixpose.records import Pattern, PointPattern
 
 Floats = NDArray[np.float64]
@@ -229,7 +230,7 @@ def test_light_from_a_lamp_on_the_floor_is_no_blob_but_a_spot_on_it_is() -> None
 
 
 @pytest.mark.parametrize("value", [0, 37, 255])
-@pytest.mark.parametrize("threshold", ["auto", "otsu", "local", 100.0])
+@pytest.mark.parametrize("threshold", [*RULES, 100.0])
 @pytest.mark.parametrize("polarity", ["bright", "dark"])
 def test_even_frames_hold_no_blobs(value: int, threshold: str | float, polarity: str) -> None:
     image = np.full((50, 70), value, np.uint8)
@@ -244,7 +245,7 @@ def test_noise_alone_holds_no_blobs() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (3, 3), (5, 9)])
 def test_tiny_images_hold_no_blobs(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    for threshold in ("auto", "otsu", "local", 10.0):
+    for threshold in (*RULES, 10.0):
         assert blobs(image, threshold=threshold, min_area=20).shape == (0, 2)
 
 
@@ -292,7 +293,7 @@ def test_window_filled_by_one_disk_knows_the_background_around_it() -> None:
 def test_image_is_left_as_it_was() -> None:
     image = photograph(spot((60, 60), 30, 30, 2, 150) + np.linspace(0, 60, 60), 16)
     before = image.copy()
-    for method in ("blobs", "corners", "intensity"):
+    for method in METHODS:
         for polarity in ("bright", "dark"):
             extract(image, ExtractOptions(method=method, polarity=polarity))
     np.testing.assert_array_equal(image, before)
@@ -305,3 +306,27 @@ def test_strided_images_are_taken() -> None:
     np.testing.assert_allclose(blobs(image.T.copy().T), blobs(image))
     mirrored = blobs(image[::-1, ::-1])
     np.testing.assert_allclose(59 - mirrored, blobs(image), atol=0.02)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_a_spot_is_left_out_whichever_border_cuts_it(turns: int) -> None:
+    light = spot((80, 80), 0.6, 40, 2, 150) + spot((80, 80), 40, 30, 2, 150)
+    found = blobs(np.rot90(photograph(light, 9), turns).copy())
+    # half of the spot is out of the image: its centroid would be off by a px
+    assert len(found) == 1
+    expected = [(40, 30), (30, 39), (39, 49), (49, 40)][turns]
+    assert distances(found, np.array([expected]))[0] < 0.05
+
+
+def test_a_hot_pixel_does_not_hide_spots_that_are_dim_beside_it() -> None:
+    image = photograph(spot((80, 80), 30.4, 40.2, 1.6, 40), 18)
+    image[60, 60] = 255
+    # a fifth of the hot pixel's 235 above the background would be 47, more than the spot has
+    assert distances(blobs(image), np.array([(30.4, 40.2)]))[0] < 0.15
+
+
+def test_whole_grey_values_are_above_the_broken_level_below_them() -> None:
+    image = np.full((40, 40), 20, np.uint8)
+    image[10:15, 20:25] = 101
+    for threshold, count in ((100.0, 1), (100.5, 1), (101.0, 0), (101.5, 0)):
+        assert len(blobs(image, threshold=threshold)) == count, threshold

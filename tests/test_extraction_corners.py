@@ -127,8 +127,21 @@ def test_corners_in_a_window_are_in_pixels_of_the_image() -> None:
     assert np.all((pattern.points >= window[:2]) & (pattern.points < window[2:]))
 
 
-@pytest.mark.parametrize("threshold", ["otsu", "local"])
+@pytest.mark.parametrize("threshold", ["otsu", "local", "li", "triangle", "sauvola"])
 def test_rules_for_grey_levels_do_not_go_with_corners(threshold: str) -> None:
     image, _ = chessboard(8)
     with pytest.raises(SessionError, match=r"extract\.threshold.*corners.*auto"):
         corners_in(image, threshold=threshold)
+
+
+@pytest.mark.parametrize(("second", "count"), [(190, 1), (130, 0)])
+def test_fields_that_touch_at_a_corner_must_be_about_as_bright(second: int, count: int) -> None:
+    image = np.full((80, 80), 40, np.uint8)
+    image[10:40, 10:40] = 200
+    image[40:70, 40:70] = second
+    # after half a turn 0.996 of the pattern is the same with fields of 200 and 190, 0.86 with 130
+    found = corners_in(image)
+    assert len(found) == count
+    if count:
+        # the brighter field draws the saddle by an eighth of a px
+        assert distances(found, np.array([(39.5, 39.5)]))[0] < 0.2

@@ -10,6 +10,7 @@ import pytest
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.extraction import METHODS, ExtractOptions, check_options, extract
+from mixpose.extraction.threshold import RULES
 from mixpose.records import GridPattern, PointPattern
 
 GRADIENT = np.arange(48, dtype=np.uint8).reshape(6, 8)
@@ -24,7 +25,7 @@ def lit_square() -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 # Intensity
 
 
-@pytest.mark.parametrize("threshold", ["auto", "otsu", "local", 60.0])
+@pytest.mark.parametrize("threshold", [*RULES, 60.0])
 def test_intensity_keeps_the_grey_of_features_without_the_background(
     threshold: str | float,
 ) -> None:
@@ -34,9 +35,9 @@ def test_intensity_keeps_the_grey_of_features_without_the_background(
     assert pattern.values.shape == (100, 120)
     assert pattern.step == 1.0
     np.testing.assert_array_equal(pattern.origin, [0, 0])
-    # "local" takes the square itself for part of the background: of the box that it takes the
-    # mean of, the square fills up to all.
-    if threshold != "local":
+    # "local" and "sauvola" take the square itself for part of the background: of the box that
+    # they take the mean of, the square fills up to all.
+    if threshold not in ("local", "sauvola"):
         np.testing.assert_allclose(pattern.values[40:50, 60:75], 100, atol=1.5)
     assert pattern.values[40:50, 60:75].any()
     outside = pattern.values.copy()
@@ -70,6 +71,19 @@ def test_intensity_without_features_is_an_empty_pattern() -> None:
     assert pattern.points.shape == (0, 2)
 
 
+def test_a_slope_of_light_below_a_feature_is_taken_out_in_every_window() -> None:
+    v, u = np.mgrid[:200.0, :240.0]
+    image = (20 + 0.3 * u + 0.2 * v).astype(np.float32)
+    image[97:103, 116:124] += 100
+    for u0, v0, u1, v1 in ((0, 0, 240, 200), (85, 70, 240, 200), (110, 90, 130, 110)):
+        options = ExtractOptions(method="intensity")
+        pattern = extract(image, options, window=(u0, v0, u1, v1))
+        assert isinstance(pattern, GridPattern)
+        # from one tile of 40 px to the next the slope rises by 12
+        lit = pattern.values[97 - v0 : 103 - v0, 116 - u0 : 124 - u0]
+        np.testing.assert_allclose(lit, 100, atol=1.0)
+
+
 # Options and images
 
 
@@ -79,7 +93,10 @@ def test_intensity_without_features_is_an_empty_pattern() -> None:
         (ExtractOptions(method="blob"), "extract.method: 'blob' .*did you mean 'blobs'"),
         (ExtractOptions(method="sift"), "extract.method: 'sift' .*'module:function'"),
         (ExtractOptions(polarity="white"), "extract.polarity: 'white'.*dark"),  # type: ignore[arg-type]
-        (ExtractOptions(threshold="adaptive"), "extract.threshold: 'adaptive'.*'local'"),
+        (
+            ExtractOptions(threshold="adaptive"),
+            "extract.threshold: 'adaptive'.*'local', 'li', 'triangle', 'sauvola' and a grey level",
+        ),
         (ExtractOptions(threshold=float("nan")), "extract.threshold: nan"),
         (ExtractOptions(threshold=True), "extract.threshold: True"),
         (ExtractOptions(min_area=-1), "extract.min_area: -1"),
@@ -110,7 +127,7 @@ def test_other_images_are_refused(image: np.ndarray[tuple[int, ...], np.dtype[np
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("method", ["blobs", "corners", "intensity"])
+@pytest.mark.parametrize("method", METHODS)
 def test_values_that_are_no_numbers_are_refused(value: float, method: str) -> None:
     image = np.zeros((40, 50), np.float32)
     image[20, 30] = value

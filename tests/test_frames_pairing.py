@@ -43,6 +43,9 @@ class Recorded:
     def caution(self) -> str | None:
         return None
 
+    def check_times(self, wanted: range) -> None:
+        pass
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

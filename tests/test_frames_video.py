@@ -259,3 +259,20 @@ def test_decoders_print_nothing_about_broken_files(tmp_path: Path) -> None:
     )
     assert done.stdout.split() == ["told"] * len(files)
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("bgr", "grey"), [((0, 0, 200), 60), ((0, 200, 0), 117), ((200, 0, 0), 23)]
+)
+def test_colours_of_a_video_become_as_grey_as_they_look(
+    tmp_path: Path, bgr: tuple[int, int, int], grey: int
+) -> None:
+    path = tmp_path / "clip.mkv"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), FPS, (96, 64))
+    for _ in range(3):
+        writer.write(np.full((64, 96, 3), bgr, np.uint8))
+    writer.release()
+    (frame, *_), error = read(path)
+    assert error == ""
+    # 0.299 of red, 0.587 of green and 0.114 of blue; the codec's colours round by a grey level
+    np.testing.assert_allclose(pixels(frame), grey, atol=2)

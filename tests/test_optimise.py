@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,3 +72,60 @@ def test_running_out_of_iterations_is_told() -> None:
         hill, lambda x, s: x + s, start, np.ones(2, dtype=np.bool_), NewtonOptions(iterations=2)
     )
     assert not ascent.converged
+
+
+def bowl(claimed: float, hessian: float | None = None) -> Callable[[Floats], Model]:
+    """Value 10 - 50 x², whose curvature is 100, with another curvature claimed for it."""
+
+    def model(x: Floats) -> Model:
+        known = None if hessian is None else np.array([[hessian]])
+        value = 10.0 - 50.0 * float(x[0] ** 2)
+        return Model(value, -100.0 * x, np.array([[claimed]]), known)
+
+    return model
+
+
+ONE = np.ones(1, dtype=np.bool_)
+
+
+def test_damping_grows_until_a_step_that_is_far_too_long_becomes_short_enough() -> None:
+    # by the curvature claimed the first step is a hundred times too long
+    ascent = ascend(bowl(1.0), lambda x, step: x + step, np.array([0.3]), ONE)
+    assert ascent.converged
+    assert ascent.state[0] == pytest.approx(0.0, abs=1e-5)
+    assert ascent.value == pytest.approx(10.0)
+
+
+def test_the_last_step_is_taken_and_its_gain_counted_though_it_is_not_looked_at() -> None:
+    # 0.5 of 9.5 is to be gained, less than the tenth that the tolerance asks for
+    start = np.array([0.1])
+    ascent = ascend(
+        bowl(100.0), lambda x, s: x + s, start, ONE, NewtonOptions(tolerance=0.1, damping=1e-6)
+    )
+    assert (ascent.converged, ascent.iterations) == (True, 1)
+    assert ascent.state[0] == pytest.approx(0.0, abs=1e-6)
+    assert ascent.value == pytest.approx(10.0, abs=1e-6)
+
+
+def test_a_definite_hessian_is_used_in_place_of_a_curvature_that_is_too_large() -> None:
+    start, options = np.array([0.3]), NewtonOptions(iterations=12)
+    slow = ascend(bowl(300.0), lambda x, s: x + s, start, ONE, options)
+    fast = ascend(bowl(300.0, hessian=100.0), lambda x, s: x + s, start, ONE, options)
+    # steps of a third of the way leave (2/3)^11 = 0.01 of it, Newton's leave the damping's 1e-4
+    assert not slow.converged
+    assert fast.converged
+    assert fast.iterations <= 4
+    assert fast.state[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_hessian_that_is_not_definite_does_not_lead_to_the_valley_between_two_hills() -> None:
+    def hills(x: Floats) -> Model:
+        """Hills of height 2 at -1 and 1; at the start the second derivative is positive."""
+        x0 = float(x[0])
+        gradient = np.array([x0 - x0**3])
+        hessian = np.array([[3 * x0**2 - 1]])
+        return Model(2 - (x0**2 - 1) ** 2 / 4, gradient, np.array([[3 * x0**2 + 1]]), hessian)
+
+    ascent = ascend(hills, lambda x, s: x + s, np.array([0.1]), ONE)
+    assert ascent.converged
+    assert ascent.state[0] == pytest.approx(1.0, abs=1e-5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from pathlib import Path
@@ -11,12 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 TOOLS = Path(__file__).resolve().parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
 from paper import runs  # noqa: E402
-from paper.bounds import cramer_rao, oracle  # noqa: E402
+from paper.bounds import cramer_rao  # noqa: E402
+from paper.deformation import deformed_run  # noqa: E402
 from paper.measurements import measure  # noqa: E402
 from paper.runs import DEGREES, START_UNCERTAINTY, Errors, views  # noqa: E402
 from paper.sampled import sampled_objectives  # noqa: E402
@@ -33,10 +36,7 @@ from paper.systems import (  # noqa: E402
 )
 from paper.table import COLUMNS, rms_table  # noqa: E402
 
-from mixpose.density import Density, Window  # noqa: E402
 from mixpose.fit import EstimatorOptions, Fit, fit_near  # noqa: E402
-from mixpose.objective import IndependentObjective, PaperObjective  # noqa: E402
-from mixpose.objective.paper import SampledTerm  # noqa: E402
 from mixpose.rigid import transform  # noqa: E402
 
 Floats = NDArray[np.float64]
@@ -100,27 +100,41 @@ def test_noise_is_twice_the_peak_of_one_feature(name: str) -> None:
     assert (one.values - one.clean).std() == pytest.approx(2 * peak, rel=0.1)
 
 
+def coordinates(name: str, x: Floats) -> list[Floats]:
+    """p(x, γ_l) of points (S, 3): beams at 0° and 90° (S, 2), or distances to sources (S, 1)."""
+    if name == "3":
+        sources = np.array([[0, -1000.0, 0], [1000.0, 0, 0], [0, 0, 1000.0]])
+        return [np.linalg.norm(x - source, axis=1)[:, None] for source in sources]
+    return [x[:, [0, 2]], x[:, [1, 2]]]
+
+
+def interpolated(g: Floats, at: Floats) -> Floats:
+    """Values (S,) of an image or a profile at its indices (S, m), linear in each of them."""
+    whole = np.floor(at).astype(int)
+    total = np.zeros(len(at))
+    for corner in itertools.product((0, 1), repeat=at.shape[1]):
+        share = np.prod(np.where(corner, at - whole, 1 - (at - whole)), axis=1)
+        total += share * g[tuple((whole + corner)[:, ::-1].T)]  # the last index counts along u
+    return total
+
+
 @pytest.mark.parametrize("name", ["1", "2", "3"])
-def test_fast_objectives_are_those_of_mixpose(name: str) -> None:
+def test_fast_objectives_are_formula_4_written_down(name: str) -> None:
     system, scenario = SYSTEMS[name], BY_NAME["I"]
     truth, start = draw(np.random.default_rng(1))
     measurements = measure(system, scenario, truth, np.random.default_rng(0))
     samples = system.body(scenario).sample(200, antithetic=False)
-    terms = [
-        SampledTerm(
-            sensor, Density(m.values / m.values.sum(), Window(m.origin, m.values.shape, 1.0), 5.0)
-        )
-        for sensor, m in zip(system.sensors, measurements, strict=True)
-    ]
     paper, independent = sampled_objectives(system, measurements, samples)
     for beta in (truth, start):
+        x = (samples.reshape(-1, 3) + beta[3:]) @ Rotation.from_euler("xyz", beta[:3]).as_matrix().T
+        g = []
+        for y, sensor, m in zip(coordinates(name, x), system.sensors, measurements, strict=True):
+            first = m.origin - getattr(sensor, "principal_point", 0.0)
+            values = m.values[0] if name == "3" else m.values
+            g.append(interpolated(values / values.sum(dtype=np.float64), y - first))
         # single-precision coordinates: 1e-4 units of 5 at the farthest
-        assert paper(beta) == pytest.approx(
-            float(PaperObjective(terms, samples).value(pose(beta))), rel=2e-5
-        )
-        assert independent(beta) == pytest.approx(
-            float(IndependentObjective(terms, samples).value(pose(beta))), rel=2e-5
-        )
+        assert paper(beta) == pytest.approx(float(np.prod(g, axis=0).mean()), rel=2e-5)
+        assert independent(beta) == pytest.approx(float(np.prod(np.mean(g, axis=1))), rel=2e-5)
 
 
 @pytest.mark.parametrize("name", ["1", "2", "3"])
@@ -157,15 +171,22 @@ def test_the_matched_estimate_is_exact_without_noise(
         assert np.abs(error).max() < bound
 
 
-def test_a_deformed_body_is_fitted_like_known_correspondences() -> None:
-    system, scenario = SYSTEMS["1"], BY_NAME["III"]
-    for number in range(3):
-        truth, _ = draw(np.random.default_rng([7, number]))
-        fit, error = matched(system, scenario, number)
-        known = (oracle(system, scenario, system.body(scenario), truth) - truth) * DEGREES
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_a_deformed_body_is_fitted_like_known_correspondences(times: float) -> None:
+    for number in range(2):
+        fit, error, known = deformed_run(SYSTEMS["1"], times, 7, number)
         assert fit.freed
-        assert np.abs(known).max() > 5  # the deformation moves any estimate by that much
-        assert error == pytest.approx(known, abs=1e-3)
+        assert np.abs(known).max() > 5 * times  # the deformation moves any estimate by that much
+        # places of bilinear gradients err by 0.2 % of a quarter of σ: 0.003 units, on arms of 100
+        assert error == pytest.approx(known, abs=1e-2)
+
+
+@pytest.mark.parametrize("times", [0.5, 1.0, 2.0])
+def test_echoes_that_overlap_are_not_freed(times: float) -> None:
+    for number in range(2):
+        fit, error, _ = deformed_run(SYSTEMS["3"], times, 7, number)
+        assert not fit.freed
+        assert np.abs(error).max() < 25
 
 
 def test_noise_is_not_taken_for_a_deformed_body() -> None:
@@ -181,11 +202,26 @@ def test_under_noise_the_matched_estimate_is_near_the_cramer_rao_bound() -> None
     for number in range(5):
         truth, _ = draw(np.random.default_rng([7, number]))
         measurements = measure(system, scenario, truth, np.random.default_rng(number))
-        bound = cramer_rao(system, scenario, measurements, truth) * DEGREES**2
+        bound = cramer_rao(system, scenario, measurements, truth)[0] * DEGREES**2
         _, error = matched(system, scenario, number)
         ratios.append(error**2 / bound)
     # the mean of 30 dependent ratios has expectation 1 and a standard deviation of about 0.35
     assert 0.2 < np.mean(ratios) < 2.5
+
+
+def test_with_a_start_the_matched_estimate_is_better_than_starts_and_likelihood() -> None:
+    system, scenario = SYSTEMS["3"], BY_NAME["IV"]
+    ratios = []
+    for number in range(12):
+        truth, start = draw(np.random.default_rng([7, number]))
+        measurements = measure(system, scenario, truth, np.random.default_rng(number))
+        bound = cramer_rao(system, scenario, measurements, truth)[1] * DEGREES**2
+        _, error = matched(system, scenario, number)
+        ratios.append([error**2 / bound, ((start - truth) * DEGREES) ** 2 / bound])
+    estimate, begun = np.mean(ratios, axis=(0, 2))
+    # over 300 runs 1.3 and 2.1; the mean of 72 has a standard deviation of about a fifth of that
+    assert estimate < 2.0
+    assert estimate < begun
 
 
 def test_a_run_fills_every_cell(one_run: Errors) -> None:
@@ -199,7 +235,8 @@ def test_a_run_fills_every_cell(one_run: Errors) -> None:
                 values: Any = row[column]
                 assert len(values) == 6
                 assert np.all(np.isfinite(values))
-            assert (row["crlb"] is None) == (name != "IV")
+            for column in ("starts", "crlb", "crlb_prior"):
+                assert (row[column] is None) == (name != "IV")
             assert (row["published"] is None) == (name == "III")
 
 

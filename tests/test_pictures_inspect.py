@@ -23,7 +23,8 @@ from mixpose.pictures.advice import describe
 from mixpose.pictures.finding import Finding, find
 from mixpose.pictures.signature import write_png
 from mixpose.pictures.slices import objective_around
-from mixpose.records import Estimate, PointPattern
+from mixpose.records import Estimate, PointPattern, Status
+from mixpose.rigid import transform
 from mixpose.runner import begin, observe, open_sources, run
 from mixpose.selection import Selection
 from mixpose.sensors import ParallelBeam
@@ -57,12 +58,14 @@ def with_options(recording: Path, lines: str) -> Path:
     return session
 
 
-def advice_for(session_file: Path, frame: int, truth: NDArray[np.float64] | None) -> str:
-    """What is said about the first sensor of a frame with a known pose."""
+def advice_for(
+    session_file: Path, frame: int, truth: NDArray[np.float64] | None, status: Status = "ok"
+) -> str:
+    """What is said about the first sensor of a frame with a known pose, or a lost one."""
     session = mixpose.load_session(session_file)
     frame_set = next(pair(open_sources(session, {}), frame, frame + 1))
-    status = "lost" if truth is None else "ok"
-    estimate = Estimate(frame, None, "tracker", status, truth, None, 1.0, {})  # type: ignore[arg-type]
+    status = "lost" if truth is None else status
+    estimate = Estimate(frame, None, "tracker", status, truth, None, 1.0, {})
     views = observe(session, frame_set)
     findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
     return "\n".join(describe(findings[0], session.body, session.unit))
@@ -210,6 +213,29 @@ def test_for_dark_features_the_threshold_goes_the_other_way(
     assert "raise it: threshold = 184" in advice_for(session, 6, pose_of_frame_6)
 
 
+@pytest.mark.parametrize(
+    ("threshold", "words"),
+    [
+        ('"auto"', "clear of the noise, and a fifth of the clearest spot"),
+        ("1000.0", "hidden, or lower threshold = 1000"),
+    ],
+)
+def test_unsharp_spots_are_told_by_their_height(
+    threshold: str, words: str, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    lines = f'method = "log"\nspot_sigma = 1.5\nthreshold = {threshold}'
+    assert words in advice_for(with_options(recording, lines), 6, pose_of_frame_6)
+
+
+def test_unsharp_spots_have_a_picture_of_the_response(recording: Path, tmp_path: Path) -> None:
+    session = with_options(recording, 'method = "log"\nspot_sigma = 1.5')
+    assert command("inspect", session, "--frame", 6, "-o", tmp_path / "seen") == 0
+    shown = cv2.imread(str(tmp_path / "seen" / "left_threshold.png"))
+    assert shown is not None
+    # black but for markers and the noise: half of the noise is below zero
+    assert (shown.max(axis=-1) < 30).mean() > 0.9
+
+
 def test_small_clutter_is_told_by_its_area(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:
@@ -223,6 +249,38 @@ def test_small_clutter_is_told_by_its_area(
     # specks of 9 px and markers of about 40: their geometric mean lies between
     assert "10 found belong to no feature, all smaller" in text
     assert re.search("raise min_area to 1[0-9]$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("status", "hidden"), [("ambiguous", 0), ("ok", 2)])
+def test_where_markers_are_not_told_for_sure_no_size_is_advised(
+    status: Status, hidden: int, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    # a pose that may be wrong, or one that misses two of seven markers
+    path = recording / "left0006.png"
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    session = mixpose.load_session(recording / "session.toml")
+    y, _ = session.sensors[0].sensor.project(transform(pose_of_frame_6, session.body.means))
+    for u, v in y[:hidden].round().astype(int).tolist():
+        image[v - 8 : v + 9, u - 8 : u + 9] = 0
+    for u in range(30, 600, 60):
+        image[30:33, u : u + 3] = 150
+    cv2.imwrite(str(path), image)
+    text = advice_for(recording / "session.toml", 6, pose_of_frame_6, status)
+    assert "10 found belong to no feature; which are markers cannot be told here" in text
+    assert "min_area" not in text
+
+
+def test_without_a_pose_too_many_features_are_not_told_apart(recording: Path) -> None:
+    path = recording / "left0006.png"
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    assert image is not None
+    for u in range(30, 600, 25):
+        image[30:33, u : u + 3] = 150
+    cv2.imwrite(str(path), image)
+    text = advice_for(recording / "session.toml", 6, None)
+    assert "too many: look which are markers" in text
+    assert "raise min_area" not in text
 
 
 def test_without_a_pose_the_number_of_features_tells(recording: Path) -> None:

@@ -110,6 +110,14 @@ def test_a_symmetric_board_measured_from_its_corner_may_be_half_a_turn_off() -> 
     assert np.linalg.norm(blind.twist[3:]) > 3.0
 
 
+def test_the_truth_itself_is_right_where_a_file_names_the_half_turn_alone() -> None:
+    T = a_pose()
+    poses = file_of(line(0, T), symmetries={"board": half_turn_about((96.0, 60.0, 0.0))[None]})
+    outcome = evaluate(poses, file_of(line(0, T)))
+    assert outcome.rotation_deg is not None
+    assert outcome.rotation_deg.max == pytest.approx(0.0, abs=1e-5)
+
+
 def test_a_symmetry_axis_through_the_origin_is_told_by_rotation_alone() -> None:
     # Cube corners: all answers share one position, so only rotation tells them apart.
     turns = np.stack([turned_about_z(np.eye(4), deg) for deg in (0, 120, 240)])

@@ -12,7 +12,7 @@ import pytest
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import JsonlWriter, read_poses
+from mixpose.poses.jsonl import JsonlWriter, read_poses, read_unfinished_poses
 from mixpose.records import Estimate, Hypothesis, SensorReport
 
 EYE: list[list[float]] = np.eye(4).tolist()
@@ -176,3 +176,27 @@ def test_truth_files_of_recordings_are_read() -> None:
         truth = read_poses(path)
         assert truth.unit in ("m", "mm")
         assert truth.poses
+
+
+def test_three_errors_cannot_each_go_against_the_other_two(tmp_path: Path) -> None:
+    covariance = np.eye(6)
+    for sign, refused in ((0.9, False), (-0.9, True)):
+        # correlations below 1 all of them; with -0.9 the sum x + y + z has the variance -2.4
+        covariance[:3, :3] = np.where(np.eye(3, dtype=bool), 1.0, sign)
+        path = file_of(tmp_path, {**MINIMAL, "covariance": covariance.tolist()})
+        if refused:
+            with pytest.raises(
+                RecordingError, match=":1: covariance is not symmetric and positive"
+            ):
+                read_poses(path)
+        else:
+            np.testing.assert_array_equal(read_poses(path).poses[0].covariance, covariance)
+
+
+def test_a_file_that_a_run_still_writes_is_read_up_to_its_last_whole_line(tmp_path: Path) -> None:
+    path = file_of(tmp_path, HEADER, MINIMAL, {**MINIMAL, "frame": 4})
+    whole = path.read_bytes()
+    for missing, frames, cut in ((0, [3, 4], False), (1, [3, 4], False), (5, [3], True)):
+        path.write_bytes(whole[: len(whole) - missing])
+        poses, was_cut = read_unfinished_poses(path)
+        assert ([pose.frame for pose in poses.poses], was_cut) == (frames, cut)

@@ -131,17 +131,18 @@ def test_a_chessboard_carried_about_is_followed_without_slipping_by_a_square(
         assert shift < 2.0
 
 
-def test_a_flat_body_in_one_view_is_ambiguous_with_the_right_pose_listed(recordings: Path) -> None:
+def test_four_leds_in_one_view_are_ambiguous_with_the_right_pose_first(recordings: Path) -> None:
     folder = recordings / "led_tee"
     session = mixpose.load_session(folder / "session.toml")
     T_true = truth_of(folder / "truth.jsonl")[10]
     estimate = found_from_nothing(session, 10)
-    assert estimate.status in ("ok", "ambiguous")
+    # eight coordinates for six numbers: too little to spare to be sure of
+    assert estimate.status == "ambiguous"
     assert estimate.T_world_object is not None
-    poses = [estimate.T_world_object, *(h.T_world_object for h in estimate.hypotheses)]
-    found = [nearest_error(T, T_true @ session.body.symmetries) for T in poses]
-    # within 3° and 2 % of the distance of 1.5 m; seen 0.16° and 0.8 mm
-    assert any(angle < 3 and shift < 0.03 for angle, shift in found)
+    angle, shift = nearest_error(estimate.T_world_object, T_true @ session.body.symmetries)
+    # seen 0.16° and 0.8 mm at 1.5 m
+    assert angle < 1
+    assert shift < 0.005
 
 
 def test_a_trolley_is_followed_through_unlabelled_ranges(recordings: Path) -> None:

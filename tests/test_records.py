@@ -7,7 +7,7 @@ import pytest
 
 import mixpose
 from mixpose.body import Body, PointFeature
-from mixpose.records import PointPattern
+from mixpose.records import Estimate, PointPattern, SensorReport
 from mixpose.sensors import PinholeCamera
 
 POINTS = np.array([[10.0, 20.0], [30.0, 40.0]])
@@ -49,3 +49,12 @@ def test_a_single_estimate_refuses_a_start_views_and_a_width_that_cannot_be_mean
         mixpose.estimate_pose([mixpose.View("camera", camera, ranges)], body)
     with pytest.raises(ValueError, match="sigma: found 0"):
         mixpose.Observation(pattern, sigma=0)
+
+
+def test_estimates_that_took_another_time_are_the_same() -> None:
+    def lost(latency_ms: float, score: float = 0.1) -> Estimate:
+        sensors = {"left": SensorReport(True, 0.1)}
+        return Estimate(3, 0.12, "wand", "lost", None, None, score, sensors, latency_ms=latency_ms)
+
+    assert lost(1.0) == lost(2.0)
+    assert lost(1.0) != lost(1.0, score=0.2)

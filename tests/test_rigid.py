@@ -83,3 +83,17 @@ def test_rounded_matrices_are_mended_and_mirrors_are_refused() -> None:
     mirror = np.diag([1.0, 1.0, -1.0, 1.0])
     assert not is_rigid(mirror)
     assert not is_rigid(np.full((4, 4), np.nan))
+
+
+def test_one_pose_has_the_twist_that_it_has_among_many() -> None:
+    # single poses take a way of their own, for speed; angles stay below a half-turn
+    twists = np.random.default_rng(5).uniform(-1, 1, (25, 6)) * [10, 10, 10, 1, 1, 1]
+    moved = perturb(POSES[:25], twists)
+    for T, twist, T_moved in zip(POSES, twists, moved, strict=False):
+        np.testing.assert_allclose(perturb(T, twist), T_moved, atol=1e-12)
+        np.testing.assert_allclose(twist_between(T, T_moved), twist, atol=1e-9)
+
+
+def test_a_shift_is_no_turn() -> None:
+    moved = perturb(POSES, np.tile([30.0, -40.0, 5.0, 0.0, 0.1, 0.0], (50, 1)))
+    np.testing.assert_allclose(rotation_angle_deg(POSES, moved), np.degrees(0.1), atol=1e-6)

@@ -16,6 +16,7 @@ import mixpose
 from mixpose import runner
 from mixpose.extraction import ExtractOptions, extract
 from mixpose.frames import Source
+from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
 from mixpose.selection import Selection
@@ -46,6 +47,9 @@ class Rearranged:
 
     def describe(self) -> str:
         return "rearranged"
+
+    def check_times(self, wanted: range) -> None:
+        pass
 
     def caution(self) -> None:
         return None
@@ -182,6 +186,20 @@ def test_a_reflection_far_from_the_body_does_not_hide_it(
     assert min(one.sensors["left"].explained or 0.0 for one in found[1:]) > 0.8
 
 
+@pytest.mark.parametrize("threshold", ["otsu", "local", "li", "triangle", "sauvola"])
+def test_rules_that_depend_on_the_whole_frame_are_not_used_in_windows(
+    session: Session, windows: list[Any], threshold: str
+) -> None:
+    sensors = [
+        replace(setup, extract=replace(setup.extract, threshold=threshold))
+        for setup in session.sensors
+    ]
+    found = tracked(replace(session, sensors=tuple(sensors)), range(3))
+    assert [one.status for one in found] == ["ok"] * 3
+    # Three frames of two cameras, each looked at once.
+    assert windows == [None] * 6
+
+
 def test_a_spot_near_the_border_of_a_window_is_found_like_in_the_whole_frame(
     session: Session,
 ) -> None:
@@ -224,3 +242,40 @@ def test_recordings_without_images_have_no_windows(windows: list[Any]) -> None:
     selection = Selection(0, 3)
     assert [one.status for one in mixpose.run(session, selection=selection)] == ["ok"] * 3
     assert windows == []
+
+
+def test_a_feature_that_is_gone_is_looked_for_in_all_of_the_frame_though_clutter_took_its_place(
+    session: Session, windows: list[Any]
+) -> None:
+    truth = read_poses(SYNTHETIC / "two_cameras" / "truth.jsonl").poses
+    T = truth[3].T_world_object
+    assert T is not None
+    left = session.sensors[0].sensor
+    u, v = np.rint(left.project(transform(T, session.body.means))[0][0]).astype(int)
+
+    def moved_spot(name: str, number: int, image: NDArray[np.uint8]) -> None:
+        """Put the spot of the first feature in the left camera 24 px aside, in frame 3 alone."""
+        if (name, number) == ("left", 3):
+            rows, columns = np.s_[v - 9 : v + 10], np.s_[u - 9 : u + 10]
+            spot = image[rows, columns].copy()
+            image[rows, columns] = np.median(image).astype(np.uint8)
+            image[rows, u - 33 : u - 14] = spot
+
+    tracked(session, range(4), moved_spot)
+    # There are as many detections as before, but one feature less is met: after the first frame
+    # it is the last one that both cameras look at as a whole, having looked in windows.
+    whole = [window is None for window in windows]
+    assert whole == [True] * 2 + [False] * 6 + [True] * 2
+
+
+@pytest.mark.parametrize(
+    ("threshold", "whole"), [("auto", False), (60.0, False), ("otsu", True), ("local", True)]
+)
+def test_rules_that_look_at_all_of_an_image_get_all_of_it(
+    session: Session, windows: list[Any], threshold: str | float, whole: bool
+) -> None:
+    # Otsu's level and the mean of a box about each pixel are others in a part of the image
+    setups = [replace(s, extract=replace(s.extract, threshold=threshold)) for s in session.sensors]
+    for estimate in mixpose.run(replace(session, sensors=tuple(setups)), selection=Selection(0, 4)):
+        assert estimate.status == "ok"
+    assert all(window is None for window in windows) == whole

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.rigid import from_rotation_vector
+from mixpose.rigid import from_rotation_vector, transform
 from mixpose.sensors import (
     OUTSIDE,
     SENSOR_MODELS,
@@ -16,6 +16,7 @@ from mixpose.sensors import (
     PinholeCamera,
     RangeSensor,
     Sensor,
+    moved_against,
 )
 
 K = np.array([[820.0, 0.4, 633.0], [0, 815.0, 507.0], [0, 0, 1]])
@@ -170,3 +171,88 @@ def test_the_direction_to_the_sensor_is_the_one_along_which_nothing_moves(name: 
     if name != "lateration":
         depth = towards @ sensor.T_sensor_world[2, :3]  # type: ignore[attr-defined]
         assert (depth < 0).all()
+
+
+@pytest.mark.parametrize("name", ["pinhole0", "fisheye", "parallel"])
+def test_an_image_reaches_half_a_pixel_beyond_the_centres_of_its_outermost_pixels(
+    name: str,
+) -> None:
+    kinds: dict[str, Sensor] = {
+        "pinhole0": PinholeCamera(np.eye(3), resolution=(20, 10)),
+        "fisheye": FisheyeCamera(np.eye(3) * 20, resolution=(20, 10)),
+        "parallel": ParallelBeam(1.0, np.zeros(2), (20, 10)),
+    }
+    sensor = kinds[name]
+    scale = 20.0 if name == "fisheye" else 1.0
+    for u, v, seen in [
+        (-0.49, -0.49, True),
+        (19.49, 9.49, True),
+        (-0.51, 5.0, False),
+        (5.0, -0.51, False),
+        (19.51, 5.0, False),
+        (5.0, 9.51, False),
+    ]:
+        radius = np.hypot(u, v) / scale
+        # a fisheye without coefficients shows the angle as the radius
+        depth = radius / np.tan(radius) if name == "fisheye" else 1.0
+        point = np.array([[u / scale, v / scale, depth]])
+        assert sensor.project(point)[1].tolist() == [seen], (u, v)
+
+
+def test_a_parallel_beam_has_its_pixel_size_and_the_origin_at_the_principal_point() -> None:
+    sensor = ParallelBeam(0.5, np.array([640.0, 512.0]))
+    y, J, _ = sensor.linearise(np.array([[0.0, 0.0, 70.0], [3.0, -1.0, 900.0]]))
+    # half a unit of length to a pixel: 3 units are 6 px
+    np.testing.assert_array_equal(y, [[640.0, 512.0], [646.0, 510.0]])
+    np.testing.assert_array_equal(J[0], [[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]])
+
+
+STRONG_FISHEYE = np.array([0.05, -0.03, 0.02, -0.01])
+
+
+def wide_angles() -> NDArray[np.float64]:
+    """Points 20 to 70 degrees off the axis, where all four coefficients count."""
+    theta, phi = np.meshgrid(np.radians(np.linspace(20, 70, 11)), np.linspace(0, 6, 7))
+    away = np.stack([np.cos(phi) * np.sin(theta), np.sin(phi) * np.sin(theta), np.cos(theta)], -1)
+    return 500.0 * away.reshape(-1, 3)
+
+
+def test_fisheye_agrees_with_opencv_at_wide_angles() -> None:
+    points, still = wide_angles(), np.zeros(3)
+    y, visible = FisheyeCamera(np.eye(3), STRONG_FISHEYE).project(points)
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], still, still, np.eye(3), STRONG_FISHEYE
+    )
+    assert visible.all()
+    # at 70 degrees the last coefficient alone moves the image by 0.06
+    np.testing.assert_allclose(y, expected[:, 0], atol=1e-12)
+
+
+def test_fisheye_jacobian_agrees_with_central_differences_at_wide_angles() -> None:
+    sensor, points, step = FisheyeCamera(K, STRONG_FISHEYE), wide_angles(), 1e-3
+    _, J, visible = sensor.linearise(points)
+    assert visible.all()
+    for axis, shift in enumerate(step * np.eye(3)):
+        numerical = (sensor.project(points + shift)[0] - sensor.project(points - shift)[0]) / (
+            2 * step
+        )
+        np.testing.assert_allclose(J[..., axis], numerical, atol=1e-6)
+
+
+def test_a_point_beyond_the_turning_angle_of_a_fisheye_is_hidden() -> None:
+    # θ (1 - 0.3 θ²) turns at θ = 1.054, which is 60.4 degrees
+    sensor = FisheyeCamera(K, np.array([-0.3, 0, 0, 0]))
+    angles = np.radians([59.0, 62.0, 85.0])
+    points = np.stack([np.sin(angles), 0 * angles, np.cos(angles)], axis=-1)
+    assert sensor.project(points)[1].tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_sensor_moved_against_a_motion_measures_what_it_would_of_moved_points(name: str) -> None:
+    sensor, points = SENSORS[name], points_in_view(20)
+    motion = from_rotation_vector([0.3, -0.2, 0.15], [20.0, 5.0, -40.0])
+    expected, seen = sensor.project(transform(motion, points))
+    y, visible = moved_against(sensor, motion).project(points)
+    np.testing.assert_array_equal(visible, seen)
+    np.testing.assert_allclose(y, expected, atol=1e-8)
+    assert np.abs(expected - sensor.project(points)[0]).max() > 5.0

@@ -130,6 +130,17 @@ def test_opencv_files_of_every_dialect_and_usual_name(
     assert setup.resolution == (1280, 1024)
 
 
+def test_a_named_node_goes_before_one_of_a_usual_name(tmp_path: Path) -> None:
+    right = K + np.diag([10.0, 10.0, 0.0])
+    nodes = {"K": K, "D": np.zeros((1, 5)), "K2": right, "D2": np.full((1, 5), 0.25)}
+    file_storage(tmp_path / "stereo.yml", **nodes)
+    keys = 'calibration = { file = "stereo.yml", camera_matrix = "K2", distortion = "D2" }'
+    camera = load(tmp_path, keys).sensor
+    assert isinstance(camera, PinholeCamera)
+    np.testing.assert_array_equal(camera.camera_matrix, right)
+    np.testing.assert_array_equal(camera.distortion, [0.25] * 5)
+
+
 def test_named_nodes_of_a_stereo_file(tmp_path: Path) -> None:
     right = K + np.diag([10.0, 10.0, 0.0])
     nodes = {"M1": K, "D1": np.zeros((1, 5)), "M2": right, "D2": np.zeros((14, 1)), "R": np.eye(3)}

@@ -148,7 +148,7 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"extract": '[extract]\npolarity = "drak"'}, ["extract.polarity", 'did you mean "dark"?']),
     (
         {"extract": '[extract]\nthreshold = "outs"'},
-        ["extract.threshold", "a grey level", '"otsu"?'],
+        ["extract.threshold", '"local", "li", "triangle", "sauvola" or a grey level', '"otsu"?'],
     ),
     ({"extract": "[extract]\nthreshold = nan"}, ["extract.threshold: found nan"]),
     ({"extract": "[extract]\nthreshold = true"}, ["extract.threshold: found true"]),

@@ -302,3 +302,29 @@ def test_the_sessions_of_real_recordings_are_read() -> None:
         "uwb_trolley/session.toml": 3,
     }
     assert known.items() <= features.items()
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 0.01), ("mm", 1e-3), ("um", 1e-6)])
+def test_every_unit_has_its_length_in_metres(tmp_path: Path, unit: str, metres: float) -> None:
+    session = read(tmp_path, (OBJECT + CAMERA).replace('"mm"', f'"{unit}"'))
+    assert session.metres_per_unit == metres
+
+
+def test_each_of_points_and_segments_has_the_spread_of_its_place_in_the_list(
+    tmp_path: Path,
+) -> None:
+    lines = """points = [[5, 0, 0], [6, 0, 0]]
+    segments = [[[0, 0, 0], [0, 0, 2]], [[0, 1, 0], [0, 1, 2]]]
+    sigma = [1, 2, 3, 4]"""
+    body = read_object(tmp_path, lines).body
+    assert [covariance[0, 0] for covariance in body.covariances] == [1.0, 4.0, 9.0, 16.0]
+
+
+def test_a_range_sensor_has_no_bias_and_no_profile_unless_told(tmp_path: Path) -> None:
+    sensor = '[[sensor]]\nname = "r"\nmodel = "lateration"\nposition = [0, 0, 9]\n'
+    (setup,) = read(tmp_path, OBJECT + sensor).sensors
+    assert isinstance(setup.sensor, RangeSensor)
+    assert setup.sensor.range_bias == 0.0
+    assert (setup.range_min, setup.bin_size) == (None, None)
+    # a point 9 away measures 9
+    assert setup.sensor.project(np.zeros((1, 3)))[0].tolist() == [[9.0]]

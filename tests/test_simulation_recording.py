@@ -76,7 +76,7 @@ def frames_of(session: Session, setup: SensorSetup) -> list[RawFrame]:
         session.folder,
         "lateration" if setup.model == "lateration" else "camera",
         setup.resolution,
-        None if setup.times is None else setup.times.relative_to(session.folder),
+        setup.times,
         setup.fps,
         setup.range_min,
         setup.bin_size,
@@ -126,6 +126,15 @@ def test_the_truth_has_times_and_says_what_it_belongs_to(tmp_path: Path) -> None
     assert {pose.object for pose in truth.poses} == {"body"}
     times = [frame.time_s for frame in frames_of(session, session.sensors[0])]
     assert times == [0.0, 0.02, 0.04, 0.06]
+
+
+def test_the_motion_begins_with_the_first_frame_whatever_its_number(tmp_path: Path) -> None:
+    few = replace(FEW, frames=2)
+    late = recorded(tmp_path / "late", camera(source='["b13.png", "a12.png"]'), options=few)
+    early = recorded(tmp_path / "early", camera(), options=few)
+    assert list(truth_of(late)) == [12, 13]
+    for number, T in truth_of(early).items():
+        np.testing.assert_array_equal(truth_of(late)[12 + number], T)
 
 
 def test_a_table_of_times_is_written_for_a_sensor_that_names_one(tmp_path: Path) -> None:

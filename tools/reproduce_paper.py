@@ -1,7 +1,7 @@
 """Reproduce the paper's accuracy table and objective maps, beside those of mixpose.
 
     python tools/reproduce_paper.py [--runs 300] [--seed 0] [--json FILE] [--figures DIR]
-                                    [--markdown FILE] [--experiments]
+                                    [--markdown FILE] [--experiments] [--deformation 0.5 1 2]
 
 `docs/paper.md` says what is compared and why some of it differs.
 """
@@ -32,14 +32,27 @@ def main() -> None:
     parser.add_argument(
         "--experiments", action="store_true", help="show where printed rows come from, too"
     )
+    parser.add_argument(
+        "--deformation",
+        type=float,
+        nargs="+",
+        default=[],
+        metavar="TIMES",
+        help="scenario III at so many times the paper's deformation, too",
+    )
     options = parser.parse_args()
     complain(parser, options)
     console = Console(width=None if Console().is_terminal else 110)
     table = rms_table(collect(options.runs, options.seed))
     show(table, options.runs, console)
+    result = as_json(table, options.runs, options.seed)
+    if options.deformation:
+        from paper.deformation import deformation_rows, show_deformation  # noqa: PLC0415
+
+        result["deformation"] = deformation_rows(options.deformation, options.runs, options.seed)
+        show_deformation(result["deformation"], options.runs, console)
     if options.json is not None:
-        text = json.dumps(as_json(table, options.runs, options.seed), indent=2)
-        options.json.write_text(text + "\n", encoding="utf-8")
+        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     if options.markdown is not None:
         options.markdown.write_text(as_markdown(table), encoding="utf-8")
     if options.experiments:

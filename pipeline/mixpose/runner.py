@@ -27,6 +27,7 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
     Expectation,
     Track,
@@ -60,6 +61,8 @@ def run(
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
+    The recording is opened at once, its frames are read as estimates are asked for.
+
     Parameters
     ----------
     session : Session
@@ -76,17 +79,18 @@ def run(
         raw frames and the features found in them, while tracking around the body only; its time
         is not in the latency.
 
-    Yields
-    ------
-    Estimate
-        As soon as each frame is done, by ascending frame number.
+    Returns
+    -------
+    generator of Estimate
+        Each as soon as its frame is done, by ascending frame number.
 
     Raises
     ------
     SessionError
         If the session names no source for a sensor.
     RecordingError
-        In place of the first frame that cannot be read.
+        At once, if a recording cannot be opened or its table of times lacks rows; else in place
+        of the first frame that cannot be read.
     """
     tracker, track = begin(session, T_start)
     if opened is None:
@@ -162,7 +166,8 @@ def _estimates(
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            step = _advance(session, tracker, expectation, track, frame_set, tracked)
+            with one_blas_thread():
+                step = _advance(session, tracker, expectation, track, frame_set, tracked)
             track, tracked = step.track, step.convinces
             estimate = _with_silent_sensors(step.estimate, session.sensors)
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
@@ -172,13 +177,17 @@ def _estimates(
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
-    """Cameras whose features in a part of the frame are those of the whole frame."""
+    """Cameras whose features in a part of the frame are those of the whole frame.
+
+    The other rules for a threshold depend on all that is in the image: on its histogram, or on
+    its size.
+    """
     return {
         setup.name: setup.sensor
         for setup in session.sensors
         if setup.model != "lateration"
         and setup.extract.method == "blobs"
-        and setup.extract.threshold not in ("otsu", "local")
+        and (setup.extract.threshold == "auto" or not isinstance(setup.extract.threshold, str))
     }
 
 

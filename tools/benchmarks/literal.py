@@ -76,11 +76,14 @@ class LiteralObjective:
 
 
 def samples_of(points: Floats, spread: float, count: int, seed: int) -> Floats:
-    """Gaussian Latin hypercube samples (N·R, 3) of every feature (N, 3), as by ``lhsnorm``."""
-    rng = np.random.default_rng(seed)
-    drawn = [norm.ppf(qmc.LatinHypercube(3, rng=rng).random(count)) for _ in points]
-    each = [point + spread * offsets for point, offsets in zip(points, drawn, strict=True)]
-    return np.concatenate(each)
+    """Gaussian Latin hypercube samples (N·R, 3) of every feature (N, 3), as by ``lhsnorm``.
+
+    All features have the same offsets, in mirrored pairs: errors of sampling neither deform the
+    body nor shift it, which makes the method's estimates several times more accurate.
+    """
+    half = norm.ppf(qmc.LatinHypercube(3, rng=np.random.default_rng(seed)).random(count // 2))
+    offsets = spread * np.concatenate([half, -half])
+    return np.concatenate([point + offsets for point in points])
 
 
 def _look_up(g: Floats, interpolation: Interpolation) -> LookUp:

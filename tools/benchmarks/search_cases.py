@@ -41,7 +41,7 @@ class Row:
         Markers of the body; markers that a view misses; false detections per view, every other
         one anywhere in the image and the rest within the body's bounding box in it.
     wanted : float
-        Share of successes aimed at.
+        Share of frames aimed at whose pose, the first hypothesis, is right.
     """
 
     sensors: str

@@ -12,9 +12,12 @@ from scipy import optimize
 from mixpose.body import Body
 from mixpose.rigid import transform
 from paper.measurements import Measurement, grid_axes, sum_of_gaussians
-from paper.systems import POINTS, Scenario, System, deformed, pose
+from paper.systems import POINTS, START_ANGLE, START_SHIFT, Scenario, System, pose
 
 Floats: TypeAlias = NDArray[np.float64]
+
+START_INFORMATION = 3.0 / np.array([START_ANGLE] * 3 + [START_SHIFT] * 3) ** 2
+"""Inverse variances of the starts (6,), radians and units: those of uniform distributions."""
 
 _STEP = np.array([1e-5] * 3 + [1e-3] * 3)  # of central differences, radians and units
 
@@ -36,10 +39,11 @@ def oracle(system: System, scenario: Scenario, body: Body, truth: Floats) -> Flo
 
 def cramer_rao(
     system: System, scenario: Scenario, measurements: Sequence[Measurement], truth: Floats
-) -> Floats:
-    """Least variances (6,) of unbiased estimates under pixel noise, radians² and units².
+) -> tuple[Floats, Floats]:
+    """Least variances (6,) under pixel noise, radians² and units²: unbiased, and with the start.
 
-    The amplitude of each sensor is unknown, as it is to the matched objective.
+    The amplitude of each sensor is unknown, as it is to the matched objective.  The start counts as
+    a normal prior with the variances that starts have.
     """
     information = np.zeros((6, 6))
     for k, measurement in enumerate(measurements):
@@ -51,11 +55,12 @@ def cramer_rao(
         D = np.array(columns)
         along = D @ h
         information += (D @ D.T - np.outer(along, along) / (h @ h)) / measurement.noise**2
-    return np.asarray(np.diag(np.linalg.inv(information)))
+    unbiased = np.diag(np.linalg.inv(information))
+    return unbiased, np.diag(np.linalg.inv(information + np.diag(START_INFORMATION)))
 
 
 def _projections(system: System, scenario: Scenario, beta: Floats) -> list[Floats]:
-    points = transform(pose(beta), deformed(POINTS) if scenario.deformed else POINTS)
+    points = transform(pose(beta), scenario.observed(POINTS))
     return [sensor.project(points)[0] for sensor in system.sensors]
 
 

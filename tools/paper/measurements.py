@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
-from paper.systems import POINTS, RANGE_LIMITS, Scenario, System, deformed, pose
+from paper.systems import POINTS, RANGE_LIMITS, Scenario, System, pose
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def measure(
 
     `snr` is the peak of one feature over the standard deviation of the noise, where there is any.
     """
-    points = transform(pose(truth), deformed(POINTS) if scenario.deformed else POINTS)
+    points = transform(pose(truth), scenario.observed(POINTS))
     return [_measure_one(sensor, scenario, points, rng, snr) for sensor in system.sensors]
 
 

@@ -42,7 +42,7 @@ DEGREES = np.array([180 / np.pi] * 3 + [1.0] * 3)
 def run(seed: int, number: int) -> Errors:
     """Errors (6,) in degrees and units of run `number`, by system and scenario, by estimator.
 
-    "crlb" holds variances instead.
+    "crlb" and "crlb_prior" hold variances instead.
     """
     cv2.setNumThreads(1)
     truth, start = draw(np.random.default_rng([seed, number]))
@@ -65,8 +65,9 @@ def run(seed: int, number: int) -> Errors:
             cell["oracle"] = oracle(system, scenario, body, truth)
             cell = {name: (beta - truth) * DEGREES for name, beta in cell.items()}
             if scenario.noisy:
-                variances = cramer_rao(system, scenario, measurements, truth)
-                cell["crlb"] = variances * DEGREES**2
+                bounds = cramer_rao(system, scenario, measurements, truth)
+                cell["starts"] = (start - truth) * DEGREES
+                cell["crlb"], cell["crlb_prior"] = (one * DEGREES**2 for one in bounds)
             errors[system.name, scenario.name] = cell
     return errors
 

@@ -31,6 +31,10 @@ POINTS = np.array(
 IMAGE_U = (-260, 340)
 IMAGE_V = (-210, 240)
 RANGE_LIMITS = (700.0, 1260.0)
+START_ANGLE = math.radians(2.5)
+START_SHIFT = 5.0
+"""Starts are uniform within so much of the truth, to either side."""
+
 RANGE_SOURCES = np.array([[0, -1000.0, 0], [1000.0, 0, 0], [0, 0, 1000.0]])
 
 STRETCH = np.array([0.8, 1.0, 1.2])
@@ -47,6 +51,8 @@ class Scenario:
         σ_ε, standard deviation of a feature in the measurement.
     deformed : bool
         Whether the object is stretched before it is observed.
+    times : float
+        How much more it is stretched than in the paper.
     model_deformed : bool
         Whether the model knows.
     noisy : bool
@@ -58,6 +64,11 @@ class Scenario:
     deformed: bool = False
     model_deformed: bool = False
     noisy: bool = False
+    times: float = 1.0
+
+    def observed(self, points: Floats) -> Floats:
+        """The points (N, 3) of the object as it is observed."""
+        return deformed(points, self.times) if self.deformed else points
 
 
 SCENARIOS = (
@@ -109,10 +120,10 @@ def systems(spread: float = 5.0) -> tuple[System, ...]:
     return System("1", cameras, 0.0), System("2", cameras, spread), System("3", ranges, spread)
 
 
-def deformed(points: Floats) -> Floats:
+def deformed(points: Floats, times: float = 1.0) -> Floats:
     """Scenario III: stretched about the centre of the features."""
     centre = points.mean(axis=0)
-    return np.asarray(centre + STRETCH * (points - centre))
+    return np.asarray(centre + (1 + times * (STRETCH - 1)) * (points - centre))
 
 
 def pose(beta: Floats) -> Floats:
@@ -150,5 +161,6 @@ def draw(rng: np.random.Generator) -> tuple[Floats, Floats]:
     five = np.pi / 36
     truth = np.concatenate([rng.uniform(-five, five, 3), rng.uniform(35, 45, 3)])
     truth[2] -= np.pi / 3
-    off = np.concatenate([rng.uniform(-five / 2, five / 2, 3), rng.uniform(-5, 5, 3)])
+    turn, shift = START_ANGLE, START_SHIFT
+    off = np.concatenate([rng.uniform(-turn, turn, 3), rng.uniform(-shift, shift, 3)])
     return truth, truth + off

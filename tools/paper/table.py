@@ -20,7 +20,17 @@ from paper.systems import SCENARIOS, systems
 Row: TypeAlias = list[float] | None
 Cells: TypeAlias = dict[str, dict[str, dict[str, Row]]]
 
-COLUMNS = ("paper", "published", "independent", "matched", "oracle", "crlb", "ml-from-truth")
+COLUMNS = (
+    "starts",
+    "paper",
+    "published",
+    "independent",
+    "matched",
+    "oracle",
+    "crlb",
+    "crlb_prior",
+    "ml-from-truth",
+)
 NUMBERS = ("φ1 °", "φ2 °", "φ3 °", "w1", "w2", "w3")
 
 
@@ -52,7 +62,7 @@ def rms_table(results: Sequence[Errors]) -> Cells:
             row: dict[str, Row] = dict.fromkeys(COLUMNS)
             for name in cells[0]:
                 values = np.array([cell[name] for cell in cells if name in cell])
-                squares = values if name == "crlb" else values**2
+                squares = values if name in ("crlb", "crlb_prior") else values**2
                 row[name] = [float(x) for x in np.sqrt(squares.mean(axis=0))]
             published = PUBLISHED[system.name].get(scenario.name)
             row["published"] = None if published is None else list(published)

@@ -1,9 +1,9 @@
-"""What can be said of a session before anything is estimated.
+"""What can be said of a session before its poses are estimated.
 
 `recordings` reads every frame and counts features, `advice` says which key to change where the
-count is off, `sensor_keys` doubts calibrations and widths, `placement` looks at where sensors
-stand and the body starts, `lookalikes` finds poses that the sensors could not tell apart, `typical`
-poses where the session names no start.
+count is off and the body is found with that change, `sensor_keys` doubts calibrations and widths,
+`placement` looks at where sensors stand and the body starts, `lookalikes` finds poses that the
+sensors could not tell apart, `typical` poses where the session names no start.
 """
 
 from __future__ import annotations

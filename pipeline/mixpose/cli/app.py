@@ -117,7 +117,7 @@ def check(
         bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
     ] = False,
 ) -> None:
-    """Read every frame, estimate nothing: features found, placement, accuracy to expect."""
+    """Read every frame before any run: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
     check_session(session, quick=quick)

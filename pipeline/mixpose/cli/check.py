@@ -1,4 +1,4 @@
-"""``mixpose check``: what a session says and its recording holds, without estimating anything."""
+"""``mixpose check``: what a session says and its recording holds, before poses are estimated."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from mixpose.checking import (
 )
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
+from mixpose.frames import ALL_NUMBERS, Source
 from mixpose.judgement import expected_covariance
-from mixpose.frames import Source
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.runner import open_sources
 from mixpose.session import SensorSetup, Session, load_session
@@ -76,10 +76,13 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     SessionError
         As ``mixpose run`` would before its first frame.
     RecordingError
-        If a recording cannot be opened, or, after all has been printed, if a frame is damaged.
+        If a recording cannot be opened or its table of times lacks rows, or, after all has been
+        printed, if a frame is damaged.
     """
     session = load_session(path)
     sources = open_sources(session, {})
+    for source in sources.values():
+        source.check_times(ALL_NUMBERS)
     report = _Report()
     report.say("session", f"{session.path}, lengths in {session.unit}")
     _say_object(report, session)
@@ -191,7 +194,7 @@ def _say_features(
         count = found.counts[found.numbers.index(number)]
         report.warnings.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
-            f"{expected} are expected: {advice(image, setup.extract, expected, session.folder)}"
+            f"{expected} are expected: {advice(session, setup, number, image, expected)}"
         )
     elif found.empty:
         report.warnings.append(f"{where}: no feature in frame {_numbers(list(found.empty))}")

@@ -7,7 +7,7 @@ are not drawn share an empty one.  One `cv2.remap` looks all sensors up, values 
 together, at any place.
 
 Arrays have a leading axis L over sensors.  A sensor of one coordinate has 0 as its second, and its
-pages have one row.
+pages have equal rows.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -29,16 +29,19 @@ Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 Indices: TypeAlias = NDArray[np.intp]
 
-PAGE = 16
-"""Cells along the side of a page; one more is drawn, so that pages join without a seam."""
+MIN_PAGE = 18
+"""Cells along the side of a page, at least; one more is drawn, so that pages join without a seam.
+A page is as wide as what a detection fills, so that each lies on two pages along an axis; pages of
+grey values alone are small."""
 
 REACH = 3.0
 """Standard deviations around a detection that are drawn: 1 % of its peak is left there."""
 
-MOST_PAGES = 400_000
-"""Pages along which the table of a sensor may reach; detections beyond are left out."""
+MAX_PAGES = 400_000
+"""Pages of a sensor's plane; detections that are too far from their middle for it are left out."""
 
-_ROWS = 1900  # pages in a column of the array: cv2.remap takes less than 32767 rows
+_ROWS = 32000  # of the array: cv2.remap takes less than 32767
+_CORNERS = np.array([[0, 0], [1, 0], [0, 1], [1, 1]])
 
 
 @dataclass(frozen=True)
@@ -48,82 +51,74 @@ class Atlas:
     Attributes
     ----------
     values : (rows, columns, 3) float32
-        Pages of (PAGE + 1)² cells: density in 1/unit^m, then its gradient in 1/unit^(m+1).
-    table : (cells,) int
-        Page of each square of each sensor's plane, 0 where nothing is drawn.
+        Pages of (page + 1)² cells: density in 1/unit^m, then its gradient in 1/unit^(m+1).
+    table : (L · planes,) int
+        Number of each square's page, plane after plane and row by row; 0 where nothing is drawn.
     corners : (pages, 2) float64
         Column and row of each page's first cell in `values`.
-    origins : (L, 1, 1, 2) float64
-        Sensor coordinates of the first cell of each plane.
     per_unit : (L, 1, 1, 2) float64
         Cells per sensor unit; 0 for the missing coordinate of ranges.
-    limits : (L, 1, 1, 2) float64
-        Largest index within each plane, whose outermost pages are empty.
-    strides : (L, 1, 1) int
-        Pages in a row of each plane.
-    offsets : (L, 1, 1) int
+    origin : (2,) float64
+        Of all planes, in cells.
+    shape : (int, int)
+        Pages of a plane along u and v; the outermost are empty.
+    limit : (2,) float64
+        Largest index within a plane.
+    planes : (L, 1, 1) int
         Where the plane of each sensor begins in the table.
+    page : int
+        Cells along the side of a page.
     """
 
     values: Singles
     table: Indices
     corners: Floats
-    origins: Floats
     per_unit: Floats
-    limits: Floats
-    strides: Indices
-    offsets: Indices
+    origin: Floats
+    shape: tuple[int, int]
+    limit: Floats
+    planes: Indices
+    page: int
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2); 0 where nothing is drawn."""
-        index = (y - self.origins) * self.per_unit
+        index = y * self.per_unit
+        index -= self.origin
         np.maximum(index, 0.0, out=index)
-        np.minimum(index, self.limits, out=index)
-        page = (index * (1.0 / PAGE)).astype(np.intp)
-        drawn = self.table[page[..., 0] + page[..., 1] * self.strides + self.offsets]
-        page *= PAGE
-        index -= page
-        index += self.corners[drawn]
+        np.minimum(index, self.limit, out=index)
+        square = (index * (1.0 / self.page)).astype(np.intp)
+        number = self.table[square[..., 0] + self.shape[0] * square[..., 1] + self.planes]
+        square *= self.page
+        index -= square
+        index += self.corners[number]
         maps = index.reshape(-1, 2).astype(np.float32)
         sampled = remap(self.values, maps[:, 0], maps[:, 1])
         return sampled.reshape(*y.shape[:-1], 3).astype(np.float64)
 
-    def dense(self, sensor: int) -> tuple[Singles, Floats, float]:
-        """The plane of one sensor as an array (H, W, 3), its first cell's place, and its step."""
-        columns = int(self.strides[sensor, 0, 0])
-        rows = int(self.limits[sensor, 0, 0, 1] // PAGE) + 1
-        begin = int(self.offsets[sensor, 0, 0])
-        pages = self.table[begin : begin + rows * columns].reshape(rows, columns)
-        plane = np.zeros((rows * PAGE, columns * PAGE, 3), dtype=np.float32)
-        for row, column in zip(*np.nonzero(pages), strict=True):
-            left, top = self.corners[pages[row, column]].astype(int)
-            part = self.values[top : top + PAGE, left : left + PAGE]
-            plane[row * PAGE : (row + 1) * PAGE, column * PAGE : (column + 1) * PAGE] = part
-        step = 1 / float(self.per_unit[sensor, 0, 0, 0])
-        flat = self.per_unit[sensor, 0, 0, 1] == 0
-        return plane[:1] if flat else plane, self.origins[sensor, 0, 0], step
 
+class _Grid(NamedTuple):
+    """The planes of all sensors: their common origin in cells, pages along u and v, and a page.
 
-@dataclass(frozen=True)
-class _Planes:
-    """Where the planes of L sensors lie, in cells and in the table."""
-
-    steps: Floats  # (L,)
-    origins: Floats  # (L, 2)
-    shapes: Indices  # (L, 2), pages along u and v
-    offsets: Indices  # (L,)
-    two: NDArray[np.bool_]  # (L,), whether the sensor has two coordinates
-
-
-@dataclass(frozen=True)
-class _Pages:
-    """Squares that are drawn, as places in the table, and layers (3, 1 + S, side, side).
-
-    The first page of the layers is empty.
+    `is_cut` where some places are too far away for a table.
     """
 
-    cells: Indices
-    layers: Singles
+    origin: Floats
+    shape: tuple[int, int]
+    page: int
+    is_cut: bool = False
+
+    @property
+    def squares(self) -> int:
+        """Of one plane."""
+        return self.shape[0] * self.shape[1]
+
+    def around(self, q: Floats, half: float) -> tuple[Indices, Floats]:
+        """Squares (K, 4) that places (K, 2) in cells fill, and their first cells (K, 4, 2)."""
+        first = ((q - half) * (1.0 / self.page)).astype(np.intp)
+        both = first[:, None] + _CORNERS
+        limit = np.array(self.shape) - 2
+        both = np.minimum(np.maximum(both, 1), limit)
+        return both[..., 0] + self.shape[0] * both[..., 1], (self.page * both).astype(np.float64)
 
 
 def draw(
@@ -131,6 +126,7 @@ def draw(
     sigmas: Sequence[float],
     steps_per_sigma: float,
     near: Sequence[Floats | None],
+    around: float = REACH,
 ) -> Atlas:
     """Draw patterns, blurred and normalised.
 
@@ -144,60 +140,44 @@ def draw(
         Cells per standard deviation.  The zero of the looked-up gradient errs by 5e-4 standard
         deviations at 3, 2e-4 at 4 and 3e-5 at 8.
     near : sequence of (n, m) array or None
-        Places of predicted features, about which alone a sensor's density is wanted (within
-        2 `REACH` standard deviations); None: wherever it is not zero.
+        Places of predicted features, about which alone a sensor's density is wanted; None:
+        wherever it is not zero.
+    around : float
+        Standard deviations about predicted features within which grey values are drawn.
     """
     steps = np.asarray(sigmas, dtype=np.float64) / steps_per_sigma
     reach = REACH * steps_per_sigma
     # looking up linearly is one more blur by a triangle, averaged over the places within a cell
     narrowed = steps * math.sqrt(steps_per_sigma**2 - 1 / 6)
-    bounds = [_bounds(one, places, 6 * REACH * s) for one, places, s in zip(patterns, near, sigmas)]
-    points = [places for places, _ in bounds]
-    planes = _planes(points, [_dimension(pattern) for pattern in patterns], steps, reach)
-    drawn = []
+    parts = [
+        _cells(pattern, places, step, 6 * reach)
+        for pattern, places, step in zip(patterns, near, steps.tolist(), strict=True)
+    ]
+    grid = _grid([q for q, _ in parts], reach, any(len(weights) for _, weights in parts))
+    table = np.zeros(len(patterns) * grid.squares, dtype=np.intp)
     detected = [k for k, pattern in enumerate(patterns) if isinstance(pattern, PointPattern)]
+    drawn = []
     if detected:
-        some = [bounds[k] for k in detected]
-        drawn.append(_pages_of_points(some, np.array(detected), planes, narrowed, reach))
+        drawn.append(_draw_points(parts, detected, patterns, narrowed, grid, reach, table))
     for k, pattern in enumerate(patterns):
         if isinstance(pattern, GridPattern):
-            drawn.append(_pages_of_grid(pattern, k, planes, float(narrowed[k]), reach, near[k]))
-    count = 1 + sum(len(pages.cells) for pages in drawn)
-    table = np.zeros(int(planes.offsets[-1] + planes.shapes[-1].prod()), dtype=np.intp)
-    first = 1
-    for pages in drawn:
-        table[pages.cells] = np.arange(first, first + len(pages.cells))
-        first += len(pages.cells)
-    values, corners = _packed(drawn, count)
-    per_unit = np.stack([1 / steps, planes.two / steps], axis=1)
+            q = None if near[k] is None else parts[k][0]
+            first = 1 + sum(layers.shape[1] - 1 for layers in drawn)
+            step, sigma = float(steps[k]), float(narrowed[k])
+            drawn.append(_draw_grid(pattern, k, step, sigma, grid, q, around * steps_per_sigma, table, first))
+    values, corners = _packed(drawn, grid.page + 1)
+    two = np.array([float(_dimension(pattern) == 2) for pattern in patterns])
     return Atlas(
         values=values,
         table=table,
         corners=corners,
-        origins=planes.origins[:, None, None],
-        per_unit=per_unit[:, None, None],
-        limits=(planes.shapes * PAGE - 1e-3)[:, None, None],
-        strides=planes.shapes[:, 0, None, None],
-        offsets=planes.offsets[:, None, None],
+        per_unit=np.stack([1 / steps, two / steps], axis=1)[:, None, None],
+        origin=grid.origin,
+        shape=grid.shape,
+        limit=np.array(grid.shape) * grid.page - 1e-3,
+        planes=(grid.squares * np.arange(len(patterns)))[:, None, None],
+        page=grid.page,
     )
-
-
-def _packed(drawn: Sequence[_Pages], count: int) -> tuple[Singles, Floats]:
-    """All pages in one array, below one another, in several columns where they are many."""
-    side = PAGE + 1
-    columns = -(-count // _ROWS)
-    rows = -(-count // columns)
-    if len(drawn) == columns == 1:
-        layers = drawn[0].layers.reshape(3, -1, side)
-    else:
-        stacked = np.zeros((3, columns, rows * side, side), dtype=np.float32)
-        parts = [pages.layers[:, 1:] for pages in drawn]
-        stacked.reshape(3, -1, side, side)[:, 1:count] = np.concatenate(parts, axis=1)
-        layers = stacked.swapaxes(1, 2).reshape(3, rows * side, columns * side)
-    number = np.arange(rows * columns)
-    corners = np.zeros((rows * columns, 2))
-    corners[:, 0], corners[:, 1] = side * (number // rows), side * (number % rows)
-    return np.asarray(cv2.merge(list(layers)), dtype=np.float32), corners
 
 
 def _dimension(pattern: Pattern) -> int:
@@ -206,167 +186,163 @@ def _dimension(pattern: Pattern) -> int:
     return len(pattern.origin)
 
 
-def _bounds(pattern: Pattern, near: Floats | None, margin: float) -> tuple[Floats, Floats]:
-    """Detections with normalised weights, in the box of predicted features; corners of a grid."""
-    if isinstance(pattern, GridPattern):
+def _cells(
+    pattern: Pattern, near: Floats | None, step: float, margin: float
+) -> tuple[Floats, Floats]:
+    """What a plane has to hold, in cells (K, 2), and the weights (K,) of detections.
+
+    Detections in the box of predicted features; predicted features; or the corners of a grid.
+    """
+    if isinstance(pattern, PointPattern):
+        points, weights = pattern.points / step, pattern.weights / pattern.weights.sum()
+        if near is not None and len(near):
+            lower, upper = near.min(axis=0) / step - margin, near.max(axis=0) / step + margin
+            kept = ((points >= lower) & (points <= upper)).all(axis=1)
+            points, weights = points[kept], weights[kept]
+    elif near is not None and len(near):
+        points, weights = near / step, np.zeros(0)
+    else:
         size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
-        return np.array([pattern.origin, pattern.origin + size * pattern.step]), np.zeros(2)
-    points, weights = pattern.points, pattern.weights / pattern.weights.sum()
-    if near is not None and len(near):
-        lower, upper = near.min(axis=0) - margin, near.max(axis=0) + margin
-        kept = ((points >= lower) & (points <= upper)).all(axis=1)
-        kept[:1] |= not kept.any()  # a plane lies somewhere
-        points, weights = points[kept], weights[kept]
+        ends = np.array([pattern.origin, pattern.origin + size * pattern.step])
+        points, weights = ends / step, np.zeros(0)
+    if points.shape[1] == 1:
+        points = np.concatenate([points, np.zeros_like(points)], axis=1)
     return points, weights
 
 
-def _together(points: Sequence[Floats]) -> tuple[Floats, Indices, Indices]:
-    """Places (K, 2) of all sensors, how many each has, and where each begins."""
-    counts = np.array([len(each) for each in points])
-    begins = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    if all(each.shape[1] == 2 for each in points):
-        return np.concatenate(points), counts, begins
-    places = np.zeros((int(counts.sum()), 2))
-    for each, begin in zip(points, begins.tolist(), strict=True):
-        places[begin : begin + len(each), : each.shape[1]] = each
-    return places, counts, begins
+def _grid(parts: Sequence[Floats], reach: float, detected: bool) -> _Grid:
+    """One grid of pages for all planes, with a ring of pages that are never drawn."""
+    q = np.concatenate([np.zeros((0, 2)), *parts])
+    page = max(math.ceil(2 * reach), MIN_PAGE) if detected else MIN_PAGE
+    if not len(q):
+        return _Grid(np.zeros(2), (3, 3), page)
+    lower, upper = q.min(axis=0), q.max(axis=0)
+    is_cut = math.prod(((upper - lower) / page + 4).tolist()) > MAX_PAGES
+    if is_cut:
+        middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
+        lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
+    columns, rows = ((upper - lower + 2 * reach) / page).tolist()
+    return _Grid(lower - (reach + page), (int(columns) + 4, int(rows) + 4), page, is_cut)
 
 
-def _planes(
-    points: Sequence[Floats], dimensions: Sequence[int], steps: Floats, reach: float
-) -> _Planes:
-    """Planes around places (K, m) of each sensor, with a ring of pages that are never drawn.
-
-    What is too far from the middle of its places for a table of `MOST_PAGES` is outside.
-    """
-    two = np.array(dimensions) == 2
-    places, _, begins = _together(points)
-    lower = np.minimum.reduceat(places, begins)
-    upper = np.maximum.reduceat(places, begins)
-    pages = PAGE * steps[:, None]
-    crowded = ((upper - lower) / pages + 2).prod(axis=1) > MOST_PAGES
-    for k in np.flatnonzero(crowded).tolist():
-        half = float(pages[k, 0]) * MOST_PAGES ** (1 / dimensions[k]) / 2.5
-        middle = np.zeros(2)
-        middle[: dimensions[k]] = np.median(points[k], axis=0)
-        lower[k], upper[k] = np.maximum(lower[k], middle - half), np.minimum(upper[k], middle + half)
-    shapes = (((upper - lower) / pages + (2 * reach / PAGE + 3)) + 1).astype(np.intp)
-    origins = lower - (reach + PAGE) * steps[:, None]
-    shapes[~two, 1], origins[~two, 1] = 1, 0.0
-    offsets = np.concatenate([[0], np.cumsum(shapes.prod(axis=1))[:-1]])
-    return _Planes(steps, origins, shapes, offsets, two)
-
-
-def _squares(
-    q: Floats, shapes: Indices, two: NDArray[np.bool_], reach: float
-) -> tuple[Indices, Indices, Indices]:
-    """Columns and rows of the pages within reach of places (K, 2) in cells, and whose they are."""
-    first = np.maximum((q - reach) * (1 / PAGE), 1.0).astype(np.intp)
-    last = np.minimum(np.floor((q + reach) * (1 / PAGE)), shapes - 2).astype(np.intp)
-    first[~two, 1] = last[~two, 1] = 0
-    spans = np.arange(max(int((last - first).max(initial=0)), 0) + 1)
-    each = first[:, :, None] + spans
-    inside = each <= last[:, :, None]
-    source, iv, iu = np.nonzero(inside[:, 1, :, None] & inside[:, 0, None])
-    return each[source, 0, iu], each[source, 1, iv], source
-
-
-def _pages_of_points(
-    detections: Sequence[tuple[Floats, Floats]],
-    chosen: Indices,
-    planes: _Planes,
+def _draw_points(
+    parts: Sequence[tuple[Floats, Floats]],
+    chosen: Sequence[int],
+    patterns: Sequence[Pattern],
     sigmas: Floats,
+    grid: _Grid,
     reach: float,
-) -> _Pages:
-    """Pages within reach of detections, which are drawn as exact Gaussians."""
-    places, counts, _ = _together([points for points, _ in detections])
-    weights = np.concatenate([weights for _, weights in detections])
-    sensor = np.repeat(chosen, counts)
-    two, step, sigma = planes.two[sensor], planes.steps[sensor], sigmas[sensor]
-    q = (places - planes.origins[sensor]) / step[:, None]
-    u, v, source = _squares(q, planes.shapes[sensor], two, reach)
-    cells = planes.offsets[sensor][source] + v * planes.shapes[sensor, 0][source] + u
-    order = np.argsort(cells, kind="stable")
-    cells, source = cells[order], source[order]
-    first = PAGE * np.stack([u[order], v[order]], axis=1) - q[source]
-    scale = (step / sigma)[source]
-    away = (first * scale[:, None]).astype(np.float32)[:, :, None]
-    away = away + scale.astype(np.float32)[:, None, None] * np.arange(PAGE + 1, dtype=np.float32)
-    bells = np.exp(np.float32(-0.5) * away * away)
-    height = weights / (np.sqrt(2 * np.pi) * sigma) ** (1 + two)
-    bells[:, 0] *= height.astype(np.float32)[source, None]
-    slopes = bells * away
-    slopes *= (-1 / sigma).astype(np.float32)[source, None, None]
-    if not two.all():  # one row, which does not change across
-        flat = ~two[source]
-        bells[flat, 1], slopes[flat, 1] = 1.0, 0.0
-    is_new = np.empty(len(cells), dtype=np.bool_)
-    is_new[:1], is_new[1:] = True, cells[1:] > cells[:-1]
-    layers = _summed(bells, slopes, is_new)
-    return _Pages(cells[is_new], layers)
+    table: Indices,
+) -> Singles:
+    """Layers (3, 1 + S, side, side) of the pages around detections, which are exact Gaussians.
 
-
-def _summed(bells: Singles, slopes: Singles, is_new: NDArray[np.bool_]) -> Singles:
-    """Layers (3, 1 + S, side, side): products of rows and columns, summed over those of a page.
-
-    Parameters
-    ----------
-    bells, slopes : (K, 2, side) array
-        Gaussians along u and v, and their derivatives, by ascending page.
-    is_new : (K,) bool
-        Where a page begins.
+    The pages are numbered in the table; the first of the layers is empty.
     """
-    side = bells.shape[2]
-    page = np.cumsum(is_new)
-    layers = np.empty((3, int(page[-1]) + 1 if len(page) else 1, side, side), dtype=np.float32)
+    q = np.concatenate([parts[k][0] for k in chosen]) - grid.origin
+    weights = np.concatenate([parts[k][1] for k in chosen])
+    sensor = np.repeat(chosen, [len(parts[k][0]) for k in chosen])
+    if grid.is_cut:
+        inside = ((q > grid.page) & (q < grid.page * (np.array(grid.shape) - 1.0))).all(axis=1)
+        q, weights, sensor = q[inside], weights[inside], sensor[inside]
+    squares, corner = grid.around(q, reach)
+    cells = (squares + grid.squares * sensor[:, None]).ravel()
+    sigma = sigmas[sensor]
+    # cells per standard deviation are alike in all sensors
+    per_sigma = np.float32(1 / math.sqrt((reach / REACH) ** 2 - 1 / 6))
+    side = np.arange(grid.page + 1, dtype=np.float32)
+    away = (corner - q[:, None]).astype(np.float32)[..., None] + side
+    away *= per_sigma
+    bells = np.exp(np.float32(-0.5) * away * away)
+    two = np.array([_dimension(pattern) == 2 for pattern in patterns])[sensor]
+    height = (weights / (np.sqrt(2 * np.pi) * sigma) ** (1 + two)).astype(np.float32)
+    bells[:, :, 0] *= height[:, None, None]
+    slopes = bells * away
+    slopes *= (-1 / sigma).astype(np.float32)[:, None, None, None]
+    if not two.all():  # rows that are all alike
+        bells[~two, :, 1], slopes[~two, :, 1] = 1.0, 0.0
+    K = len(cells)
+    bells, slopes = bells.reshape(K, 2, -1), slopes.reshape(K, 2, -1)
+    layers = np.empty((3, 1 + K, len(side), len(side)), dtype=np.float32)
     layers[:, 0] = 0.0
-    begins = np.flatnonzero(is_new)
-    alone = len(begins) == len(is_new)
-    rank = np.zeros(1) if alone else np.arange(len(is_new)) - begins[page - 1]
-    for k in range(int(rank.max()) + 1):
-        chosen = slice(None) if alone else np.flatnonzero(rank == k)
-        bell, slope = bells[chosen], slopes[chosen]
-        u, v = bell[:, 0, None], bell[:, 1, :, None]
-        products = ((v, u), (v, slope[:, 0, None]), (slope[:, 1, :, None], u))
-        for layer, (rows, columns) in zip(layers, products, strict=True):
-            if k == 0:
-                np.multiply(rows, columns, out=layer[1:])
-            else:
-                layer[page[chosen]] += rows * columns
+    u, v = bells[:, 0, None], bells[:, 1, :, None]
+    np.multiply(v, u, out=layers[0, 1:])
+    np.multiply(v, slopes[:, 0, None], out=layers[1, 1:])
+    np.multiply(slopes[:, 1, :, None], u, out=layers[2, 1:])
+    numbers = np.arange(1, 1 + K)
+    table[cells] = numbers
+    kept = table[cells]  # of several on one page, one page is kept, and the others are added to it
+    for extra in np.flatnonzero(kept != numbers).tolist():
+        layers[:, kept[extra]] += layers[:, 1 + extra]
     return layers
 
 
-def _pages_of_grid(
-    pattern: GridPattern, k: int, planes: _Planes, sigma: float, reach: float, near: Floats | None
-) -> _Pages:
-    """Pages about predicted features, or all, summed over the points of a grid."""
-    origin, step, shape = planes.origins[k], float(planes.steps[k]), planes.shapes[k]
-    two, side = bool(planes.two[k]), PAGE + 1
-    if near is None or not len(near):
-        inner = np.arange(1, shape[1] - 1) if two else np.zeros(1, dtype=np.intp)
-        cells = (inner[:, None] * shape[0] + np.arange(1, shape[0] - 1)).ravel()
-    else:
-        q = np.zeros((len(near), 2))
-        q[:, : near.shape[1]] = near
-        q = (q - origin) / step
-        u, v, _ = _squares(q, shape[None], np.full(len(q), two), 2 * reach)
-        cells = np.unique(v * shape[0] + u)
-    columns, iu = np.unique(cells % shape[0], return_inverse=True)
-    rows, iv = np.unique(cells // shape[0], return_inverse=True)
-    places = [
-        origin[axis] + step * (PAGE * pages[:, None] + np.arange(side)).ravel()
-        for axis, pages in enumerate((columns, rows))
-    ]
+def _draw_grid(
+    pattern: GridPattern,
+    k: int,
+    step: float,
+    sigma: float,
+    grid: _Grid,
+    q: Floats | None,
+    half: float,
+    table: Indices,
+    first: int,
+) -> Singles:
+    """As `_draw_points`, of pages about places in cells, or all, summed over the points of a grid.
+
+    The pages are numbered from `first` on.
+    """
     small, left_over = reduced(pattern, sigma)
-    made = factors(small, left_over, places[0], places[1] if two else None)
-    along = [each.reshape(len(each), len(columns), side) for each in made[2:]]
-    layers = np.zeros((3, 1 + len(cells), side, side), dtype=np.float32)
-    if not two:
-        layers[0, 1:, 0], layers[1, 1:, 0] = along[0][0, iu], along[1][0, iu]
-        return _Pages(planes.offsets[k] + cells, layers)
-    across = [each.reshape(len(each), len(rows), side) for each in made[:2]]
-    U = [np.ascontiguousarray(each[:, iu].swapaxes(0, 1)) for each in along]
-    V = [np.ascontiguousarray(each[:, iv].transpose(1, 2, 0)) for each in across]
-    for layer, rows_, columns_ in zip(layers, (V[0], V[0], V[1]), (U[0], U[1], U[0]), strict=True):
-        layer[1:] = rows_ @ columns_
-    return _Pages(planes.offsets[k] + cells, layers)
+    page, side = grid.page, grid.page + 1
+    pages = [np.zeros((3, side, side), dtype=np.float32)]
+    for low, high in _rectangles(grid, q, half):
+        u, v = (
+            step * (grid.origin[axis] + page * low[axis] + np.arange(page * (b - a + 1) + 1))
+            for axis, (a, b) in enumerate(zip(low, high, strict=True))
+        )
+        made = factors(small, left_over, u, v if len(pattern.origin) == 2 else None)
+        layers = np.zeros((3, len(v), len(u)), dtype=np.float32)
+        layers[: 1 + len(pattern.origin)] = made.layers(gradient=True)[: 1 + len(pattern.origin)]
+        for row in range(low[1], high[1] + 1):
+            for column in range(low[0], high[0] + 1):
+                cell = k * grid.squares + row * grid.shape[0] + column
+                if table[cell] == 0:
+                    top, left = page * (row - low[1]), page * (column - low[0])
+                    table[cell] = first + len(pages) - 1
+                    pages.append(layers[:, top : top + side, left : left + side])
+    return np.stack(pages, axis=1)
+
+
+def _rectangles(
+    grid: _Grid, q: Floats | None, half: float
+) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """First and last pages, columns and rows, about each of some places, or all but the rim."""
+    last = grid.shape[0] - 2, grid.shape[1] - 2
+    if q is None:
+        return [((1, 1), last)]
+    ends = []
+    for u, v in (q - grid.origin).tolist():
+        low = (max(int((u - half) / grid.page), 1), max(int((v - half) / grid.page), 1))
+        high = int((u + half) / grid.page), int((v + half) / grid.page)
+        high = min(high[0], last[0]), min(high[1], last[1])
+        if low[0] <= high[0] and low[1] <= high[1]:
+            ends.append((low, high))
+    return ends
+
+
+def _packed(drawn: Sequence[Singles], side: int) -> tuple[Singles, Floats]:
+    """All pages in one array, below one another, in several columns where they are many."""
+    layers = drawn[0] if len(drawn) == 1 else np.concatenate(
+        [drawn[0], *(each[:, 1:] for each in drawn[1:])], axis=1
+    )
+    count = layers.shape[1]
+    columns = -(-count * side // _ROWS)
+    rows = -(-count // columns)
+    if columns > 1:
+        padded = np.zeros((3, columns * rows, side, side), dtype=np.float32)
+        padded[:, :count] = layers
+        layers = padded.reshape(3, columns, rows * side, side).swapaxes(1, 2)
+    number = np.arange(columns * rows)
+    corners = np.empty((columns * rows, 2))
+    corners[:, 0], corners[:, 1] = side * (number // rows), side * (number % rows)
+    flat = layers.reshape(3, rows * side, columns * side)
+    return np.asarray(cv2.merge(list(flat)), dtype=np.float32), corners

@@ -20,8 +20,8 @@ from mixpose.records import GridPattern, Pattern, PointPattern
 Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 
-CUT = 6.0
-"""Standard deviations at which sums over a grid end: the tail holds 2e-9."""
+CUT = 5.0
+"""Standard deviations at which sums over a grid end: the tail holds 6e-7."""
 
 _SAMPLES_PER_SIGMA = 4.0  # of a grid that is averaged before a wide blur: sums err by 1e-30
 _HAT = 0.3  # of a grid's step: a narrower blur is linear interpolation

@@ -18,6 +18,7 @@ from mixpose.extraction.blobs import extract_blobs
 from mixpose.extraction.corners import extract_corners
 from mixpose.extraction.custom import extract_custom, load_function
 from mixpose.extraction.intensity import extract_intensity
+from mixpose.extraction.laplacian import extract_log
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.threshold import RULES, Window
 from mixpose.records import Image, Pattern, PointPattern
@@ -28,6 +29,7 @@ METHODS: dict[str, Callable[[Image, ExtractOptions, Window], Pattern]] = {
     "blobs": extract_blobs,
     "corners": extract_corners,
     "intensity": extract_intensity,
+    "log": extract_log,
 }
 
 IMAGE_TYPES = (np.uint8, np.uint16, np.float32)
@@ -124,7 +126,7 @@ def _check_custom(method: str, base: Path | None) -> None:
 
 def _check_threshold(options: ExtractOptions) -> None:
     threshold = options.threshold
-    rules = ("auto",) if options.method == "corners" else RULES
+    rules = ("auto",) if options.method in ("corners", "log") else RULES
     if isinstance(threshold, str) and threshold not in rules:
         raise SessionError(
             f"extract.threshold: {threshold!r} with method {options.method!r}; allowed are"

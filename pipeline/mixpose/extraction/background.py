@@ -45,7 +45,8 @@ def background_tiles(image: Grey) -> Grey:
     tile = tile_side(image)
     rows, v = _sample_places(image.shape[0], tile)
     columns, u = _sample_places(image.shape[1], tile)
-    # First rows, then columns: several times as fast as both at once.
+    # First rows, then columns: several times as fast as both at once, and two to three times as
+    # fast as `skimage.measure.block_reduce` of the same samples (0.03 to 0.11 ms).
     places = image[v][:, u].reshape(rows, v.size // rows, columns, u.size // columns)
     tiles = _median(places.swapaxes(1, 2).reshape(rows, columns, -1))
     # A feature that fills tiles must not become background.  Too low a background only lets

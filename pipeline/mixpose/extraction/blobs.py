@@ -6,9 +6,9 @@ another shape by their outline.  A blob that the border of the window cuts is le
 enough of its rim is seen: where its centre is nobody knows, and to the density a wrong point
 does more harm than a missing one.
 
-With the threshold "auto" (or "local") a blob has to stand out.  What is above the detection
-level but has no shape, as a lit floor, is searched again at higher levels, so that blobs are
-found on it too.  With a grey level (or "otsu") all that is above it is a blob.
+With a grey level (or "otsu") all that is above it is a blob.  With the other thresholds a blob
+has to stand out: what is above the detection level but has no shape, as a lit floor, is searched
+again at higher levels, so that blobs are found on it too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,13 @@
 """Centres of large features: an ellipse through the edge, wherever there is an edge.
 
 A disk stays an ellipse when part of its rim is hidden, when it has a hole, or when its light
-is uneven: so the rim is looked for where it is, and what does not lie on the ellipse is left
-out.
+is uneven: so the rim is looked for where it is, and what does not lie on the ellipse is left out.
+
+`skimage.measure` beside it: `EllipseModel` fits as well, but ten times slower (0.13 to 0.013 ms of
+72 points), its distances are 300 times slower (4.1 to 0.012 ms), and `ransac` triples the error
+where a straight edge cuts a disk (0.17 to 0.05 px).  `find_contours` has one level for all of the
+rim: a disk half in shadow is off by 0.32 px instead of 0.01, and disks behind cables or broken by
+their hole are not found.
 """
 
 from __future__ import annotations

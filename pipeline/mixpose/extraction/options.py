@@ -13,11 +13,12 @@ class ExtractOptions:
     Attributes
     ----------
     method : str
-        "blobs", "corners", "intensity", or "module:function" for the user's own.
+        "blobs", "corners", "intensity", "log", or "module:function" for the user's own.
     polarity : {"bright", "dark"}
         Whether features are brighter or darker than their surroundings.
     threshold : str or float
-        "auto", "otsu", "local", or a grey level in the units of the image.
+        "auto", "otsu", "local", "li", "triangle", "sauvola", or a grey level in the units of the
+        image.
     min_area, max_area : float
         Limits of a blob's area in px; `max_area` None means no limit.
     sigma : float
@@ -25,7 +26,8 @@ class ExtractOptions:
         lateration.
     spot_sigma : float
         Standard deviation that a feature has already in grey values ("intensity") and in range
-        profiles, same units as `sigma`; 0 where it is much smaller than `sigma`.
+        profiles, same units as `sigma`; 0 where it is much smaller than `sigma`.  Width of the
+        spots that "log" looks for, in px; 0 for 3 px.
     """
 
     method: str = "blobs"

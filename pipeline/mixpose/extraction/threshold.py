@@ -19,7 +19,7 @@ from mixpose.records import Image
 
 Window: TypeAlias = tuple[int, int, int, int]
 
-RULES = ("auto", "otsu", "local")
+RULES = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 
 # How much is looked at around a window to know its background.
 LEAST_MARGIN_PX = 64
@@ -37,8 +37,16 @@ FAINT_SHARE = 0.08
 PEAK_NOISE_FACTOR = 8.0
 PEAK_SHARE = 0.2
 
-# "local" compares with the mean of a box of this share of the shorter side of the window.
+# "local" and "sauvola" compare with a box of this share of the shorter side of the window.
 LOCAL_BOX_SHARE = 1 / 8
+
+# How far Sauvola's level is from the local mean where all is even, as a share of what is left
+# up to the brightest pixel.  0.2 to 0.5 are in use (Sauvola and Pietikäinen, Pattern
+# Recognition 33, 2000); the lower one finds more of what is dim.
+SAUVOLA_K = 0.2
+
+# Floats are sorted into so many steps for the rules that look at a histogram.
+STEPS = 65535
 
 
 @dataclass(frozen=True)
@@ -61,8 +69,8 @@ class Foreground:
     least_peak : float
         Signal that a small feature must reach to count.
     judged : bool
-        Whether features must stand out to count.  False where the level is the user's (or
-        Otsu's): then all that is above it counts.
+        Whether features must stand out to count.  False where the level is the user's, or
+        Otsu's: then all that is above it counts.
     tops : (H,) array of the type of `grey`
         Highest grey value of each row: most rows of a frame have nothing to look for.
     """
@@ -101,16 +109,25 @@ def foreground(image: Image, options: ExtractOptions, window: Window) -> Foregro
     """
     bright, inner, threshold = _bright(image, options, window)
     noise = noise_of(bright)
-    if threshold in ("auto", "local"):
-        grey, zero = _without_background(bright, inner, noise, local=threshold == "local")
-        tops = grey.max(axis=1)
-        peak = _peak(grey, tops) - zero
-        level = max(NOISE_FACTOR * noise, FAINT_SHARE * peak)
-        least_peak = max(PEAK_NOISE_FACTOR * noise, PEAK_SHARE * peak)
+    if threshold == "otsu" or not isinstance(threshold, str):
+        grey = bright[inner]
+        level = _otsu(grey) if isinstance(threshold, str) else threshold
+        return Foreground(grey, 0.0, level, noise, 0.0, judged=False, tops=grey.max(axis=1))
+    grey, zero = _without_background(bright, inner, noise, local=threshold in ("local", "sauvola"))
+    tops = grey.max(axis=1)
+    if threshold in ("li", "triangle"):
+        level = max(NOISE_FACTOR * noise, _histogram_level(grey, threshold) - zero)
+        least_peak = max(PEAK_NOISE_FACTOR * noise, level)
         return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
-    grey = bright[inner]
-    level = _otsu(grey) if isinstance(threshold, str) else threshold
-    return Foreground(grey, 0.0, level, noise, 0.0, judged=False, tops=grey.max(axis=1))
+    peak = _peak(grey, tops) - zero
+    level = max(NOISE_FACTOR * noise, FAINT_SHARE * peak)
+    least_peak = max(PEAK_NOISE_FACTOR * noise, PEAK_SHARE * peak)
+    if threshold == "sauvola":
+        # What Sauvola's level takes off beyond the detection level.
+        beyond = np.maximum(_sauvola_above_mean(bright)[inner] - np.float32(level), 0)
+        grey = grey.astype(np.float32) - beyond
+        tops = grey.max(axis=1)
+    return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
 
 
 def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDArray[np.float32]:
@@ -172,7 +189,7 @@ def _without_background(
 ) -> tuple[Grey, float]:
     """Grey values of the inner part with an even background, and the grey value of that."""
     if local:
-        side = max(round(min(bright.shape) * LOCAL_BOX_SHARE), 3) // 2 * 2 + 1
+        side = _local_box(bright)
         return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side)))[inner], 0.0
     tiles = background_tiles(bright)
     ascending = np.sort(tiles, axis=None)
@@ -204,12 +221,57 @@ def _shared(rows: Grey) -> np.number[Any]:
     return cast("np.number[Any]", cv2.min(rows[:, :-1], rows[:, 1:]).max())
 
 
-def _otsu(bright: Grey) -> float:
-    if bright.dtype != np.float32:
-        return float(cv2.threshold(bright, 0, 1, cv2.THRESH_OTSU)[0])
-    # OpenCV has Otsu's rule for integers: 65536 steps are as good as floats.
+def _local_box(bright: Grey) -> int:
+    """Side in px of the box that a pixel is compared with."""
+    shorter = int(min(bright.shape))
+    return max(round(shorter * LOCAL_BOX_SHARE), 3) // 2 * 2 + 1
+
+
+def _sauvola_above_mean(bright: Grey) -> Grey:
+    """By how much the level of Sauvola and Pietikäinen is above the local mean, per pixel.
+
+    Their rule is for dark print: ``m (1 + k (s / r - 1))`` with the mean m and the standard
+    deviation s of the surroundings and half the range r.  So the image is turned over, and
+    counted from its brightest pixel.
+    """
+    from skimage.filters import threshold_sauvola  # noqa: PLC0415 (0.04 s to import)
+
     low, high = float(bright.min()), float(bright.max())
     if low == high:
-        return high
-    step = (high - low) / 65535
-    return low + step * _otsu(((bright - np.float32(low)) / np.float32(step)).astype(np.uint16))
+        return np.zeros(bright.shape, np.float32)
+    turned = np.float32(high) - bright.astype(np.float32)
+    side = _local_box(bright)
+    level = threshold_sauvola(turned, side, k=SAUVOLA_K, r=(high - low) / 2)
+    return np.asarray(cv2.boxFilter(turned, -1, (side, side)) - level, dtype=np.float32)
+
+
+def _histogram_level(bright: Grey, rule: str) -> float:
+    """Level by the rule of Li (least cross entropy) or the triangle of Zack et al."""
+    from skimage.filters import threshold_li, threshold_triangle  # noqa: PLC0415 (0.04 s to import)
+
+    whole, low, step = _whole_numbers(bright)
+    choose = threshold_li if rule == "li" else threshold_triangle
+    return low + step * float(choose(whole))
+
+
+def _otsu(bright: Grey) -> float:
+    # The level of `skimage.filters.threshold_otsu`, in a third of its time or less (0.8 to
+    # 2.9 ms of 1600 x 1200 bytes).
+    whole, low, step = _whole_numbers(bright)
+    return low + step * float(cv2.threshold(whole, 0, 1, cv2.THRESH_OTSU)[0])
+
+
+def _whole_numbers(bright: Grey) -> tuple[Grey, float, float]:
+    """Grey values for a histogram: whole numbers, and what 0 and a step of 1 stand for.
+
+    OpenCV has Otsu's rule for integers only, and Li's is 30 times faster for them (8 to 243 ms
+    of 1600 x 1200 px).
+    """
+    if bright.dtype != np.float32:
+        return bright, 0.0, 1.0
+    low, high = float(bright.min()), float(bright.max())
+    step = (high - low) / STEPS
+    # A range too small for steps has one value, as far as a histogram tells.
+    if not np.float32(step) > 0:
+        return np.zeros(bright.shape, np.uint16), high, 0.0
+    return ((bright - np.float32(low)) / np.float32(step)).astype(np.uint16), low, step

@@ -5,7 +5,7 @@ deformed body only features that fit count.  Each feature's own place is a peak 
 whatever the pose.  Places go to features so that the sum of squared distances is least, the pose is
 fitted to them by least squares, and so on until nothing changes.  This is trusted where
 
-* what the body leaves at its features is more than noise, by χ²;
+* what the body leaves at its features is more than noise (`mixpose.fit.misfit`);
 * each feature has a peak of its own, above half of a feature's height, and no other peak is as
   high: at half, presence and absence are equally likely, whatever the noise;
 * half a height is above √(2 ln K) standard deviations of the noise, which the largest of K normal
@@ -17,98 +17,61 @@ fitted to them by least squares, and so on until nothing changes.  This is trust
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import combinations
-from typing import Any, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import linear_sum_assignment
-from scipy.special import chdtri
 
-from mixpose.density import peak
-from mixpose.body import Body
-from mixpose.fit.prior import Prior, likelihood_near
-from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective, pose_jacobian, project_body
+from mixpose.fit.misfit import SensorDensity
+from mixpose.objective import Quadratic, pose_jacobian
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, transform
-from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
-Sampler: TypeAlias = Callable[[Floats], NDArray[Any]]
 Labels: TypeAlias = tuple[tuple[int, ...], ...]
 
-_BELIEVED = 0.99  # probability of χ² up to which a misfit is taken for noise
-_ROUNDING = float(np.sqrt(np.finfo(np.float32).eps))  # of a height: half of the digits it has
 _STEPS = 30  # peaks two widths apart, the least, draw each other by 0.4 of a step: 0.4³⁰ = 1e-12
 
 
-@dataclass(frozen=True)
-class Sight:
-    """What one sensor sees.
-
-    Attributes
-    ----------
-    sensor : Sensor
-    extent : (m,) and (m,) float64
-        Smallest and largest coordinates observed.
-    density, at_body : callable
-        Matched density and gradient (n, 1 + m) at places (n, m): anywhere, and exact at the body's.
-    variance : float
-        2σ², that of a feature in the matched density, in squared sensor units.
-    cell_variance : float
-        Variance of the noise of a cell times the size of a cell.
-    """
-
-    sensor: Sensor
-    extent: tuple[Floats, Floats]
-    density: Sampler
-    at_body: Sampler
-    variance: float
-    cell_variance: float
-
-    @property
-    def top(self) -> float:
-        """Peak of a feature of unit mass."""
-        return peak(self.variance, self.sensor.dimension)
-
-    def left(self, density: Sampler, y: Floats) -> tuple[Floats, float]:
-        """What equal features (n, m) leave of density and gradient there; their amplitude."""
-        away = y[:, None] - y
-        bells = self.top * np.exp(-0.5 / self.variance * (away * away).sum(axis=2))
-        slopes = -(away * bells[..., None]).sum(axis=1) / self.variance
-        here = density(y).astype(np.float64)
-        amplitude = float(here[:, 0].sum() / bells.sum())
-        return here - amplitude * np.column_stack([bells.sum(axis=1), slopes]), amplitude
-
-    def own_peaks(self, count: int) -> Floats | None:
-        """Where each of `count` features (n, m) explains most, if each has a peak of its own."""
-        step = np.sqrt(self.variance / 8)  # half of σ
-        limits = zip(*self.extent, strict=True)
-        grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in limits)), axis=-1)
-        heights = self.density(grid.reshape(-1, grid.shape[-1]))[:, 0].reshape(grid.shape[:-1])
-        peaks = (heights == maximum_filter(heights, size=3)) & (heights > 0)
-        order = np.argsort(-heights[peaks])
-        if len(order) < count:
+def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
+    """Where each of `count` features (n, m) explains most, if each has a peak of its own."""
+    step = np.sqrt(sensor.variance / 8)  # half of σ
+    limits = zip(*sensor.extent, strict=True)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in limits)), axis=-1)
+    heights = sensor.density(grid.reshape(-1, grid.shape[-1]))[:, 0].reshape(grid.shape[:-1])
+    peaks = (heights == maximum_filter(heights, size=3)) & (heights > 0)
+    order = np.argsort(-heights[peaks])
+    if len(order) < count:
+        return None
+    y = grid[peaks][order[:count]]
+    for _ in range(_STEPS):
+        rest, height = sensor.left(y)
+        if height <= 0:
             return None
-        y = grid[peaks][order[:count]]
-        for _ in range(_STEPS):
-            rest, amplitude = self.left(self.density, y)
-            y = y + self.variance / (max(amplitude, 0.0) * self.top + 1e-300) * rest[:, 1:]
-        half = 0.5 * amplitude * self.top
-        noise = np.sqrt(2 * np.log(heights.size) * self.cell_variance * self.top)
-        others = heights[peaks][order[count:]].max(initial=noise)
-        return y if others < half < self.density(y)[:, 0].min() else None
+        y = y + np.sqrt(sensor.variance) / height * rest[:, 1:]
+    chance = sensor.noise() * np.sqrt(2 * np.log(heights.size))
+    others = heights[peaks][order[count:]].max(initial=chance)
+    return y if others < 0.5 * height < sensor.density(y)[:, 0].min() else None
+
+
+class Matched(NamedTuple):
+    """A pose, the place of each feature per sensor, and the sum of squares."""
+
+    T: Floats
+    labels: Labels
+    squares: float
 
 
 @dataclass(frozen=True)
 class Matching:
     """Features (n, 3), and places (n, m) per sensor that are theirs in unknown order."""
 
-    sights: Sequence[Sight]
+    densities: Sequence[SensorDensity]
     points: Floats
     places: Sequence[Floats]
     free: NDArray[np.bool_]
@@ -116,24 +79,25 @@ class Matching:
     def offsets(self, T: Floats, labels: Labels) -> tuple[Floats, Floats]:
         """Places less projections (Σnm,) in units of √2 σ, and Jacobians (Σnm, 6) of these."""
         rests, jacobians = [], []
-        for sight, place, own in zip(self.sights, self.places, labels, strict=True):
-            y, by_world, _ = sight.sensor.linearise(transform(T, self.points))
-            scale = 1 / np.sqrt(sight.variance)
+        for sensor, place, own in zip(self.densities, self.places, labels, strict=True):
+            y, by_world, _ = sensor.geometry.linearise(transform(T, self.points))
+            arms = self.points @ T[:3, :3].T
+            scale = 1 / np.sqrt(sensor.variance)
             rests.append(scale * (place[list(own)] - y).ravel())
-            jacobians.append(scale * pose_jacobian(by_world, self.points @ T[:3, :3].T).reshape(-1, 6))
+            jacobians.append(scale * pose_jacobian(by_world, arms).reshape(-1, 6))
         return np.concatenate(rests), np.concatenate(jacobians)
 
     def nearest(self, T: Floats) -> Labels:
         """The place of each feature, per sensor, with the least sum of squares at a pose."""
         labels = []
-        for sight, place in zip(self.sights, self.places, strict=True):
-            y, _ = sight.sensor.project(transform(T, self.points))
+        for sensor, place in zip(self.densities, self.places, strict=True):
+            y, _ = sensor.geometry.project(transform(T, self.points))
             costs = ((y[:, None] - place) ** 2).sum(axis=2)
             labels.append(tuple(linear_sum_assignment(costs)[1].tolist()))
         return tuple(labels)
 
-    def fit(self, T: Floats) -> tuple[Floats, Labels, float]:
-        """Pose, labels and sum of squares that are reached from a pose (4, 4)."""
+    def fit(self, T: Floats) -> Matched:
+        """What is reached from a pose (4, 4)."""
         labels, tried = self.nearest(T), set[Labels]()
         while labels not in tried:
             tried.add(labels)
@@ -144,94 +108,50 @@ class Matching:
 
             found = ascend(model, perturb, T, self.free, NewtonOptions(60, tolerance=1e-13))
             T, last, labels = found.state, labels, self.nearest(found.state)
-        return T, last, -found.value
+        return Matched(T, last, -found.value)
 
-    def swapped(self, T: Floats, labels: Labels) -> list[float]:
+    def swapped(self, best: Matched) -> list[float]:
         """Sums of squares, to first order, once two features of a sensor change their places."""
-        Q, _ = np.linalg.qr(self.offsets(T, labels)[1][:, self.free])
+        Q, _ = np.linalg.qr(self.offsets(best.T, best.labels)[1][:, self.free])
         squares = []
-        for k, own in enumerate(labels):
+        for k, own in enumerate(best.labels):
             for i, j in combinations(range(len(own)), 2):
                 other = list(own)
                 other[i], other[j] = own[j], own[i]
-                rest, _ = self.offsets(T, (*labels[:k], tuple(other), *labels[k + 1 :]))
+                rest, _ = self.offsets(
+                    best.T, (*best.labels[:k], tuple(other), *best.labels[k + 1 :])
+                )
                 squares.append(float(rest @ rest) - float(np.sum((rest @ Q) ** 2)))
         return squares
 
 
-def fits(sights: Sequence[Sight], points_world: Floats) -> bool:
-    """Whether what a body leaves unexplained at its features (n, 3) may be noise."""
-    statistic, freedom = 0.0, 0
-    for sight in sights:
-        rest, amplitude = sight.left(sight.at_body, sight.sensor.project(points_world)[0])
-        rest[:, 1:] *= np.sqrt(sight.variance)
-        noise = sight.cell_variance * sight.top + (_ROUNDING * amplitude * sight.top) ** 2
-        statistic += float((rest * rest).sum()) / noise
-        freedom += rest.size
-    return statistic < float(chdtri(freedom, 1 - _BELIEVED))
-
-
 def fit_freed(
-    sights: Sequence[Sight], points: Floats, starts: Sequence[Floats], free: NDArray[np.bool_]
+    densities: Sequence[SensorDensity], points: Floats, starts: Sequence[Floats], free: NDArray[np.bool_]
 ) -> Floats | None:
-    """Fit the pose to freed features by least squares, where the body does not fit.
+    """Fit the pose to freed features by least squares.
 
     Parameters
     ----------
-    sights : sequence of Sight
+    densities : sequence of SensorDensity
     points : (n, 3) array
         The body's features, all of one weight and seen by all sensors.
     starts : sequence of (4, 4) array
-        Poses from which correspondences are sought; the first is the estimate so far.
+        Poses from which correspondences are sought.
     free : (6,) bool
 
     Returns
     -------
     (4, 4) array or None
-        None where the body fits, or where it is not known which place is whose.
+        None where it is not known which place is whose.
     """
-    redundant = sum(sight.sensor.dimension for sight in sights) * len(points) - int(free.sum())
-    if redundant <= 0 or fits(sights, transform(starts[0], points)):
-        return None
-    found = [sight.own_peaks(len(points)) for sight in sights]
+    redundant = sum(sensor.geometry.dimension for sensor in densities) * len(points) - int(free.sum())
+    found = [own_peaks(sensor, len(points)) for sensor in densities]
     places = [one for one in found if one is not None]
-    if len(places) < len(sights):
+    if redundant <= 0 or len(places) < len(densities):
         return None
-    matching = Matching(sights, points, places, free)
-    ends = {labels: (square, T) for T, labels, square in map(matching.fit, starts)}
-    best = min(ends, key=lambda labels: ends[labels][0])
-    least, T = ends.pop(best)
-    others = np.array([square for square, _ in ends.values()] + matching.swapped(T, best))
-    return T if ((others / least) ** (-0.5 * redundant)).sum() < 1 else None
-
-
-def freed(views: Sequence[View], body: Body, T: Floats, prior: Prior) -> Floats | None:
-    """The fit to freed features, where all sensors see all of them and the body does not fit."""
-    seen = project_body(tuple(view.sensor for view in views), body).project(T[None]).seen
-    if not seen.all() or len(body.nodes.points) != len(body):
-        return None
-    likelihood = likelihood_near(views, body, T, fine=True)
-
-    @cache
-    def everywhere() -> MatchedObjective:
-        return matched_objective(views, body, [view.observation.sigma for view in views])
-
-    sights = [
-        Sight(
-            view.sensor,
-            view.observation.extent,
-            lambda y, k=k: _sampled(everywhere(), k, y),
-            lambda y, k=k: _sampled(likelihood.objective, k, y),
-            float(likelihood.objective.variances[k, 0]),
-            float(likelihood.noise[k]),
-        )
-        for k, view in enumerate(views)
-    ]
-    return fit_freed(sights, body.nodes.points, [T, *prior.points()], prior.free)
-
-
-def _sampled(objective: MatchedObjective, sensor: int, y: Floats) -> Floats:
-    """C and its gradient (n, 1 + m) in one sensor at places (n, m)."""
-    padded = np.zeros((len(objective.views), 1, len(y), 2))
-    padded[sensor, 0, :, : y.shape[1]] = y
-    return objective.atlas.look_up(padded)[sensor, 0, :, : 1 + y.shape[1]]
+    matching = Matching(densities, points, places, free)
+    fitted = sorted((matching.fit(T) for T in starts), key=lambda one: one.squares)
+    best = fitted[0]
+    rivals = {one.labels: one.squares for one in fitted if one.labels != best.labels}
+    others = np.array([*rivals.values(), *matching.swapped(best)])
+    return best.T if ((others / best.squares) ** (-0.5 * redundant)).sum() < 1 else None

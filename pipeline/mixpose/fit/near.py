@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
-from mixpose.fit.free_features import freed
+from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import Prior, has_likelihood, most_probable
+from mixpose.fit.prior import Prior, has_likelihood
 from mixpose.objective import MatchedObjective, View, build_objective, matched_objective
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.optimise import Ascent, NewtonOptions, ascend
@@ -34,8 +34,8 @@ def _value_error(steps_per_sigma: float) -> float:
 
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_value_error(STEPS_PER_SIGMA))
-# after a step that gains 1e-6, 1e-5 σ are left to go
-SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=_value_error(STEPS_PER_SIGMA))
+# after a step that gains 1e-5, 0.005 σ long, 3e-5 σ are left to go
+SHARP = NewtonOptions(iterations=40, tolerance=1e-5, value_error=_value_error(STEPS_PER_SIGMA))
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_value_error(FINE_STEPS))
 
 
@@ -120,10 +120,7 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, rules)
     T, is_freed = ascent.state, False
     if matched and has_likelihood(views):
-        prior = Prior(T_start, uncertainty, free)
-        T = most_probable(views, body, T, prior)
-        T_freed = freed(views, body, T, prior)
-        T, is_freed = (T, False) if T_freed is None else (T_freed, True)
+        T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free))
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
 
 

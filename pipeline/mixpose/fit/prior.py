@@ -20,11 +20,18 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.density.atlas import REACH
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Scale: TypeAlias = tuple[float, float]
+
+COARSE: Scale = (STEPS_PER_SIGMA, REACH)
+FINE: Scale = (FINE_STEPS, REACH)
+CLOSE: Scale = (ZOOM_STEPS, ZOOM)
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
@@ -95,24 +102,55 @@ def has_likelihood(views: Sequence[View]) -> bool:
 
 
 def likelihood_near(
-    views: Sequence[View], body: Body, T_world_object: Floats, *, fine: bool
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    *,
+    scale: Scale = FINE,
+    misfit: float = 1.0,
 ) -> Likelihood:
-    """Make the log-likelihood at σ_ε around a pose; what that pose leaves is taken for noise."""
+    """Make the log-likelihood at σ_ε around a pose; what that pose leaves is taken for noise.
+
+    `misfit` is a factor on the variance of the noise: χ² per degree of freedom of a body that does
+    not fit.  `scale` says how finely densities are drawn.
+    """
     sigmas = [view.observation.sigma for view in views]
-    steps = FINE_STEPS if fine else STEPS_PER_SIGMA
-    objective = matched_objective(views, body, sigmas, T_world_object, steps_per_sigma=steps)
+    steps, around = scale
+    objective = matched_objective(
+        views, body, sigmas, T_world_object, steps_per_sigma=steps, around=around
+    )
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
     cells = np.array([view.observation.cells for view in views])
-    energies = objective.energies[:, 0]
-    # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
-    noise = np.maximum(1 - shares, 1e-9) * energies / cells
-    weights = (0.5 * energies / noise)[:, None]
+    noise = cell_variances(objective.energies[:, 0], shares, cells)
+    weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
 
+def cell_variances(
+    energies: Floats, shares: Floats, cells: NDArray[np.intp]
+) -> Floats:
+    """Variance of a cell's noise times the size of a cell (L,), from the energy left unexplained.
+
+    Parameters
+    ----------
+    energies : (L,) array
+        ⟨g, g⟩, the integral of g² over all cells.
+    shares : (L,) array
+        Of it, explained.
+    cells : (L,) int
+        Their number.
+    """
+    # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
+    return np.asarray(np.maximum(1 - shares, 1e-9) * energies / cells)
+
+
 def most_probable(
-    views: Sequence[View], body: Body, T_world_object: Floats, prior: Prior
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    prior: Prior,
+    misfit: float = 1.0,
 ) -> Floats:
     """Maximise likelihood and prior.
 
@@ -124,21 +162,23 @@ def most_probable(
     T_world_object : (4, 4) array
         A maximum of the likelihood.
     prior : Prior
+    misfit : float
+        As `likelihood_near` has it.
 
     Returns
     -------
     (4, 4) array
     """
     T = T_world_object
-    likelihood = likelihood_near(views, body, T, fine=True)
+    likelihood = likelihood_near(views, body, T, misfit=misfit)
     if not likelihood.is_alone:
-        wide = likelihood_near(views, body, T, fine=False)
+        wide = likelihood_near(views, body, T, scale=COARSE, misfit=misfit)
         T = _highest(wide, prior, [T, *prior.points()], _ROUGH)
-        likelihood = likelihood_near(views, body, T, fine=True)
-    for _ in range(2):  # the second is drawn around the maximum and knows the noise there
-        T = _highest(likelihood, prior, [T], _NATS)
-        likelihood = likelihood_near(views, body, T, fine=True)
-    return T
+        likelihood = likelihood_near(views, body, T, misfit=misfit)
+    T = _highest(likelihood, prior, [T], _NATS)
+    # once more, drawn close to the maximum and with the noise that it leaves
+    likelihood = likelihood_near(views, body, T, scale=CLOSE, misfit=misfit)
+    return _highest(likelihood, prior, [T], _NATS)
 
 
 def _highest(
@@ -150,12 +190,10 @@ def _highest(
     def posterior(T: Floats) -> Quadratic:
         one = likelihood.objective.linearise(T)
         away = twist_between(prior.T_world_object, T)
-        assert one.hessian is not None
         return Quadratic(
             one.value - 0.5 * float(away @ (information * away)),
             one.gradient - information * away,
             one.curvature + np.diag(information),
-            one.hessian + np.diag(information),
         )
 
     ends = []

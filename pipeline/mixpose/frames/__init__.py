@@ -7,6 +7,6 @@ from mixpose.frames.images import read_image
 from mixpose.frames.opening import open_source
 from mixpose.frames.pairing import pair
 from mixpose.frames.prefetch import prefetch
-from mixpose.frames.source import Source, SourceSpec
+from mixpose.frames.source import ALL_NUMBERS, Source, SourceSpec
 
-__all__ = ["Source", "SourceSpec", "open_source", "pair", "prefetch", "read_image"]
+__all__ = ["ALL_NUMBERS", "Source", "SourceSpec", "open_source", "pair", "prefetch", "read_image"]

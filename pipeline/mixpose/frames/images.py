@@ -15,7 +15,7 @@ import numpy as np
 from mixpose.errors import RecordingError
 from mixpose.frames.quiet import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock
+from mixpose.frames.times import Clock, require_times
 from mixpose.records import Image, RawFrame
 
 _RASTERS = {".bmp", ".dib", ".pbm", ".pfm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
@@ -90,6 +90,10 @@ class ImageSequence:
                 "leave one out of the source"
             )
         return None
+
+    def check_times(self, wanted: range) -> None:
+        """See that each image in the range has a time."""
+        require_times(self.clock, (number for number in self.numbers if number in wanted))
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1

@@ -75,6 +75,9 @@ class LiveSource:
         """Nothing to say before it is opened."""
         return None
 
+    def check_times(self, wanted: range) -> None:
+        """Nothing to look for: nobody knows which frames will come."""
+
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1
     ) -> Generator[RawFrame, None, None]:

@@ -41,7 +41,8 @@ def pair(
     SessionError
         At once, if `step` is less than 1, or live sources and recordings are mixed.
     RecordingError
-        In place of the first set that a source cannot be read for.
+        At once, if a table of times lacks rows for frames of that range; else in place of the
+        first set that a source cannot be read for.
     """
     live = {sensor: source for sensor, source in sources.items() if isinstance(source, LiveSource)}
     if live and len(live) < len(sources):
@@ -54,7 +55,10 @@ def pair(
         return join_live(live, selection(start, stop, step, 0))
     firsts = [source.first for source in sources.values()]
     first = min((number for number in firsts if number is not None), default=0)
-    return _join(sources, selection(start, stop, step, first))
+    wanted = selection(start, stop, step, first)
+    for source in sources.values():
+        source.check_times(wanted)
+    return _join(sources, wanted)
 
 
 def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, None, None]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.csv_rows import csv_rows, finite
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock
+from mixpose.frames.times import Clock, require_times
 from mixpose.records import GridPattern, RawFrame
 
 
@@ -72,6 +72,10 @@ class RangeProfiles:
     def caution(self) -> str | None:
         """Nothing to say of it: only images can be misnumbered."""
         return None
+
+    def check_times(self, wanted: range) -> None:
+        """See that each profile in the range has a time."""
+        require_times(self.clock, (number for number in range(self.length) if number in wanted))
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1

@@ -16,6 +16,9 @@ SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profil
 # Frame numbers come from file names, which hold at most 255 digits.
 _BEYOND_ALL_NUMBERS = 10**256
 
+ALL_NUMBERS = range(-_BEYOND_ALL_NUMBERS, _BEYOND_ALL_NUMBERS)
+"""The numbers of all frames that there may be."""
+
 
 @dataclass(frozen=True)
 class SourceSpec:
@@ -29,13 +32,14 @@ class SourceSpec:
         A glob, a folder, a file, a pipe, a stream's address (with ``://``) or ``camera:0``; or a
         list of images.
     base : Path
-        Folder that relative paths start from.
+        Folder that a relative `source` starts from.
     kind : {"camera", "lateration"}
         What the sensor measures.
     resolution : (width, height) or None
         Size of every image in px; None means like the first one.
     times : Path or None
-        Table ``frame,time_s`` that gives frames their times.
+        Table ``frame,time_s`` that gives frames their times; as it is opened, `base` is not put
+        before it.
     fps : float or None
         Frames per second: the time of frame n is n / fps.
     range_min, bin_size : float or None
@@ -77,6 +81,15 @@ class Source(Protocol):
 
     def caution(self) -> str | None:
         """What is odd about the recording though it can be read; None if nothing is."""
+
+    def check_times(self, wanted: range) -> None:
+        """Look for a time for each frame in a range of numbers, without decoding frames.
+
+        Raises
+        ------
+        RecordingError
+            If the table of times lacks rows, as far as the frame numbers are known in advance.
+        """
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1

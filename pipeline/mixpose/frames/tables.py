@@ -17,7 +17,7 @@ import numpy as np
 from mixpose.errors import RecordingError
 from mixpose.frames.csv_rows import csv_rows, finite, header, whole
 from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock
+from mixpose.frames.times import Clock, FrameTimes, require_times
 from mixpose.records import Floats, PointPattern, RawFrame
 
 _COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
@@ -93,6 +93,20 @@ class DetectionTable:
     def caution(self) -> str | None:
         """Nothing to say of it: only images can be misnumbered."""
         return None
+
+    def check_times(self, wanted: range) -> None:
+        """See that each frame in the range has a time; reads the table once more."""
+        if isinstance(self.clock, FrameTimes):
+            require_times(self.clock, (number for number in self._numbers() if number in wanted))
+
+    def _numbers(self) -> list[int]:
+        """Frame numbers, ascending, up to the first row that cannot be read."""
+        if not self._is_numbered:
+            return list(range(self.length))
+        numbers: set[int] = set()
+        with suppress(RecordingError):  # `frames` comes to it too
+            numbers.update(int(key) for key, _, _ in self._rows())
+        return sorted(numbers)
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -15,6 +15,7 @@ from mixpose.frames.source import SourceSpec
 Clock: TypeAlias = Callable[[int], float]
 
 _COLUMNS = ["frame", "time_s"]
+_LISTED = 5  # frame numbers that a message names
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,33 @@ def read_times(path: Path) -> FrameTimes:
     return FrameTimes(path, times)
 
 
+def untimed(clock: Clock | None, numbers: Iterable[int]) -> list[int]:
+    """Those of some frame numbers that a table of times has no row for; a rate has them all."""
+    if not isinstance(clock, FrameTimes):
+        return []
+    return [number for number in numbers if number not in clock.seconds]
+
+
+def require_times(clock: Clock | None, numbers: Iterable[int]) -> None:
+    """Refuse a table of times that lacks a row for one of some frames.
+
+    Raises
+    ------
+    RecordingError
+        In one line: the table, which frames it lacks and what is allowed.
+    """
+    missing = untimed(clock, numbers)
+    if not missing:
+        return
+    assert isinstance(clock, FrameTimes), "rates lack nothing"
+    named = ", ".join(map(str, missing[:_LISTED]))
+    more = f", ... ({len(missing)} frames)" if len(missing) > _LISTED else ""
+    raise RecordingError(
+        f"{clock.path}: no row for frame{'s' * (len(missing) > 1)} {named}{more}; allowed is a "
+        "table with a row for each frame of the recording, or fps in place of times"
+    )
+
+
 def clock_of(spec: SourceSpec) -> Clock | None:
     """What gives the frames of a source their times; None where the session does not say.
 
@@ -78,7 +106,7 @@ def clock_of(spec: SourceSpec) -> Clock | None:
     if spec.times is not None and spec.fps is not None:
         raise SessionError(f"sensor {spec.sensor!r}: found times and fps, only one is allowed")
     if spec.times is not None:
-        return read_times(spec.base / spec.times)
+        return read_times(spec.times)
     if spec.fps is None:
         return None
     fps = spec.fps

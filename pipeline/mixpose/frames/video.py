@@ -15,7 +15,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames.capture import NotOpenedError, grab, is_stream, opened, retrieve
 from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
-from mixpose.frames.times import Clock
+from mixpose.frames.times import Clock, require_times, untimed
 from mixpose.records import RawFrame
 
 
@@ -67,6 +67,25 @@ class Video:
     def caution(self) -> str | None:
         """Nothing to say of it: only images can be misnumbered."""
         return None
+
+    def check_times(self, wanted: range) -> None:
+        """See that each frame in the range has a time.
+
+        Containers may promise more frames than there are, so where rows are missing the frames
+        are counted.
+        """
+        promised = [number for number in range(self.promised or 0) if number in wanted]
+        if untimed(self.clock, promised):
+            there = self._count(min(promised[-1] + 1, wanted.stop))
+            require_times(self.clock, [number for number in promised if number < there])
+
+    def _count(self, enough: int) -> int:
+        """Number of frames that can be read, counted up to a number that is enough."""
+        with _opened(self.address) as capture:
+            count = 0
+            while count < enough and grab(capture, self.address):
+                count += 1
+        return count
 
     def frames(
         self, start: int | None = None, stop: int | None = None, step: int = 1

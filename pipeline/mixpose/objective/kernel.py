@@ -3,17 +3,15 @@
 With c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
 amplitude a = c / n that fits h to g best,
 
-    S = c a,     ∇S = 2 a (∇c − a ∇n / 2),
-    −∇²S = −2 a ∇²c + a² ∇²n − (2 / n) (∇c − a ∇n) (∇c − a ∇n)ᵀ.
+    S = c a,     ∇S = 2 a (∇c − a ∇n / 2).
 
-Second derivatives of the projection are left out; they act on residuals only.
-
-Where predicted features lie apart, n does not change, and the second derivatives of C follow from
-its value and gradient, as C is a Gaussian around a feature: −∇²C = C I / v − ∇C ∇Cᵀ / C.  The
-curvature that is never negative is that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v: every feature
-is drawn to where the detections around it lie, and one that meets none does not hold the others
-back.  Where they overlap their pulls are not their own, and the curvature is Gauss-Newton's of the
-residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n), which stands for the Hessian, too.
+Steps are taken by curvatures that are never negative.  Where predicted features lie apart it is
+that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has
+∇C = C (y_i − p_i) / v, so that the step is that of least squares to the detections around the
+features, with weights C_i: it gets there at once from any distance, and a feature that meets none
+does not hold the others back.  (Newton's step, with C I / v − ∇C ∇Cᵀ / C in place of C I / v,
+shrinks with the distance.)  Where features overlap their pulls are not their own, and the curvature
+is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
 
 from __future__ import annotations
@@ -30,7 +28,6 @@ Floats: TypeAlias = NDArray[np.float64]
 
 _NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
 _FEW = 24  # features up to which all pairs are looked at first
-_NOTHING = 1e-12  # of a feature's peak: less is no detection
 _NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
 
 
@@ -55,15 +52,11 @@ class Matched(NamedTuple):
 
 
 class Slopes(NamedTuple):
-    """Σ_l s_l c_l² / n_l at H poses: value (H,), gradient (H, 6), curvature and Hessian (H, 6, 6).
-
-    `hessian` is minus the second derivative.
-    """
+    """Σ_l s_l c_l² / n_l at H poses: value (H,), gradient (H, 6) and curvature (H, 6, 6)."""
 
     value: Floats
     gradient: Floats
     curvature: Floats
-    hessian: Floats
 
 
 class Overlaps(NamedTuple):
@@ -96,9 +89,10 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     variances, tops : (L, 1) array
         v, and the peak of a Gaussian of that variance.
     """
-    norm = tops * (weights * weights).sum(axis=2)
+    norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
     if _are_apart(y, variances):
-        return Overlaps(np.where(norm > 0, norm, 1.0), _NO_PAIRS, norm, norm)
+        norm[norm == 0] = 1.0
+        return Overlaps(norm, _NO_PAIRS, norm, norm)
     pairs = _pairs(y, variances)
     away = y[:, :, pairs[:, 0]] - y[:, :, pairs[:, 1]]
     exponents = (away * away).sum(axis=3) * (-0.5 / variances)[..., None]
@@ -142,7 +136,7 @@ def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
 
 def inner_products(C: Floats, over: Overlaps) -> Matched:
     """⟨g, h⟩ and ⟨h, h⟩ from weighted densities C (L, H, n) at the predicted features."""
-    return Matched(C.sum(axis=2), over.norm)
+    return Matched(C @ np.ones(C.shape[2]), over.norm)
 
 
 def slopes(
@@ -161,27 +155,21 @@ def slopes(
     """
     C = sampled[..., 0] * at.weights
     pull = sampled[..., 1:] * at.weights[..., None]
-    by_feature = pull[..., 0, None] * at.J[..., 0, :] + pull[..., 1, None] * at.J[..., 1, :]
+    by_feature = (pull[..., None, :] @ at.J)[..., 0, :]
     matched = inner_products(C, over)
     amplitude = matched.amplitude
     strength = 2 * scales * amplitude
     value = (scales * matched.product * amplitude).sum(axis=0)
-    rest = by_feature.sum(axis=2)
+    rest = np.ones(C.shape[2]) @ by_feature
     if len(over.pairs):
         half, gram = _pair_terms(at, over, variances, tops)
         gradient = (strength[..., None] * (rest - amplitude[..., None] * half)).sum(axis=0)
         outer = half[..., :, None] * half[..., None, :] / over.norm[..., None, None]
         level = (2 * scales * amplitude**2)[..., None, None]
-        curvature = (level * (gram - outer)).sum(axis=0)
-        return Slopes(value, gradient, curvature, curvature)
-    strength = strength[..., None]
-    drawn = (strength / variances[..., None] * C)[..., None, None] * at.J
-    curvature = _by_pose(at.J).swapaxes(1, 2) @ _by_pose(drawn)
-    bent = (strength / np.maximum(C, _NOTHING * tops[..., None]))[..., None] * by_feature
-    across = (2 * scales / matched.norm)[..., None] * rest
-    hessian = curvature - _by_pose(by_feature).swapaxes(1, 2) @ _by_pose(bent)
-    hessian -= rest.transpose(1, 2, 0) @ across.swapaxes(0, 1)
-    return Slopes(value, (strength * rest).sum(axis=0), curvature, hessian)
+        return Slopes(value, gradient, (level * (gram - outer)).sum(axis=0))
+    drawn = (strength / variances)[..., None] * C
+    curvature = _by_pose(at.J).swapaxes(1, 2) @ _by_pose(drawn[..., None, None] * at.J)
+    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature)
 
 
 def _by_pose(rows: Floats) -> Floats:

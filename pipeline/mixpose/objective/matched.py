@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
+from mixpose.density.atlas import REACH
 from mixpose.objective.base import Quadratic, View
 from mixpose.objective.kernel import Matched, Overlaps, Slopes, inner_products, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, Projected, project_body
@@ -31,7 +32,11 @@ STEPS_PER_SIGMA = 3.0
 """Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
 
 FINE_STEPS = 8.0
-"""The same where the last digits of grey values count, which have no detection noise."""
+"""The same where grey values are judged, which have no detection noise."""
+
+ZOOM_STEPS, ZOOM = 256.0, 0.0625
+"""The same for the last digits, and how far around features, in standard deviations of C: where
+features overlap, gradients are looked up beside their zeros and err by the square of a cell."""
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
@@ -96,19 +101,22 @@ class MatchedObjective:
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
+        if len(poses) == 1:
+            return self._slopes(poses)
+        parts = [self._slopes(some) for some in self._blocks(poses)]
+        return Slopes(*map(np.concatenate, zip(*parts)))
+
+    def _slopes(self, poses: Floats) -> Slopes:
+        at = self.projection.project(poses)
+        sampled = self.atlas.look_up(at.y)
+        over = overlaps(at.y, at.weights, self.variances, self.tops)
         scales = self.weights / self.energies
-        parts = []
-        for some in self._blocks(poses):
-            at = self.projection.project(some)
-            sampled = self.atlas.look_up(at.y)
-            over = overlaps(at.y, at.weights, self.variances, self.tops)
-            parts.append(slopes(at, sampled, over, self.variances, self.tops, scales))
-        return parts[0] if len(parts) == 1 else Slopes(*map(np.concatenate, zip(*parts)))
+        return slopes(at, sampled, over, self.variances, self.tops, scales)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient, curvature and Hessian at one pose (4, 4)."""
-        value, gradient, curvature, hessian = self.slopes(T_world_object[None])
-        return Quadratic(float(value[0]), gradient[0], curvature[0], hessian[0])
+        """Value, gradient and curvature at one pose (4, 4)."""
+        value, gradient, curvature = self.slopes(T_world_object[None])
+        return Quadratic(float(value[0]), gradient[0], curvature[0])
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
@@ -123,6 +131,7 @@ def matched_objective(
     near: Floats | None = None,
     *,
     steps_per_sigma: float = STEPS_PER_SIGMA,
+    around: float = REACH,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -137,6 +146,8 @@ def matched_objective(
         Densities are wanted only around the projection of this pose; None: anywhere.
     steps_per_sigma : float
         Cells per standard deviation of C.
+    around : float
+        Standard deviations of C about the projection within which grey values are drawn.
     """
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
@@ -155,7 +166,7 @@ def matched_objective(
     return MatchedObjective(
         tuple(views),
         projection,
-        matched_atlas(observations, sigmas, steps_per_sigma, places),
+        matched_atlas(observations, sigmas, steps_per_sigma, places, around),
         *columns,
         weights[:, None],
     )

@@ -66,13 +66,13 @@ class BodyProjection:
     def project(self, poses: Floats) -> Projected:
         """Where the sensors see the body at poses (H, 4, 4)."""
         H, n, L = len(poses), len(self._points), len(self.sensors)
-        arms = (self._points @ poses[:, :3, :3].swapaxes(1, 2)).reshape(-1, 3)
-        world = arms + np.repeat(poses[:, :3, 3], n, axis=0)
+        arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
+        world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
         y, by_world, visible = self._batch.linearise(world)
-        J = pose_jacobian(by_world, arms).reshape(L, H, n, 2, 6)
+        J = pose_jacobian(by_world, arms.reshape(-1, 3)).reshape(L, H, n, 2, 6)
         seen = visible.reshape(L, H, n)
         if self._normals is None:
-            faced = np.ones((L, H, n), dtype=np.bool_)
+            faced = np.broadcast_to(True, seen.shape)
         else:
             points = world.reshape(H, n, 3)
             each = [facing(one, poses, points, self._normals) for one in self.sensors]

@@ -23,6 +23,7 @@ _NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for
 _FLOODED = 0.02  # share of an image above a threshold that would find everything
 _LOOSE_RMS = 1.2  # of σ: features that fit worse than the session says
 _SPECK_PX = 2  # pieces up to this area are noise
+_MOST = 0.8  # of the features in view that must be met to tell what markers look like
 _LISTED = 6  # features that are named one by one
 
 
@@ -77,6 +78,10 @@ def _threshold(image: Image, options: ExtractOptions) -> str:
         if isinstance(options.threshold, str):
             return '  threshold "auto": clear of the noise, and a fifth of the clearest corner'
         return f"  threshold {options.threshold:g} grey levels from bright to dark fields"
+    if options.method == "log":
+        if isinstance(options.threshold, str):
+            return '  threshold "auto": clear of the noise, and a fifth of the clearest spot'
+        return f"  threshold {options.threshold:g} grey levels from a spot to what is around it"
     if options.method not in ("blobs", "intensity"):
         return f"  method {options.method} has a threshold of its own"
     scene = _scene(image, options)
@@ -191,8 +196,10 @@ def _about_extra(
         peaks.append(float(raw[region].max()))
     extra = expected.unexplained
     text = f"{int(extra.sum())} found belong to no feature"
-    if extra.all():
-        return [f"{text}: the pose is wrong, or {_stricter(options)}"]
+    unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
+    if unsure or extra.all():
+        # what looks like clutter may be the markers
+        return [f"{text}; which are markers cannot be told here: look at a frame that is ok"]
     size, peak = np.array(sizes), np.array(peaks)
     own = ~extra
     if size[extra].max() < 0.8 * size[own].min():
@@ -232,12 +239,15 @@ def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
         return lines or [f"too few: {_direction(options, lower=True)}{polarity}"]
     if finding.count > 3 * len(body):
-        return [f"too many: {_stricter(options)}"]
+        return [
+            "too many: look which are markers, and whether they differ from the rest in brightness "
+            "(threshold) or size (min_area, max_area)"
+        ]
     return []
 
 
 def _about_others(finding: Finding, body: Body) -> list[str]:
-    """Advice for corners and for the user's own method."""
+    """Advice for corners, unsharp spots and the user's own method."""
     options = finding.setup.extract
     expected = finding.expectation
     if expected is None:
@@ -249,7 +259,7 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
         missing = f"not met: {_some(lost)}" if lost else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
-    if options.method == "corners":
+    if options.method in ("corners", "log"):
         lower, raised = (_direction(options, lower=way) for way in (True, False))
     lines = []
     if few:
@@ -347,7 +357,7 @@ def _stricter(options: ExtractOptions) -> str:
 
 def _direction(options: ExtractOptions, *, lower: bool) -> str:
     """How the threshold is to be moved, which for dark features is the other way round."""
-    down = lower == (options.polarity == "bright" or options.method == "corners")
+    down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
     if isinstance(now, str):
         return f'set threshold to a grey level {"below" if down else "above"} that of "{now}"'

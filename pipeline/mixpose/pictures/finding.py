@@ -41,6 +41,8 @@ class Expectation:
         Share of the sensor's density that the pose accounts for.
     rms : float or None
         Residual of the met features, sensor units.
+    sure : bool
+        Whether the estimate is "ok": what its features meet are markers then, and not clutter.
     """
 
     y: Floats
@@ -49,6 +51,7 @@ class Expectation:
     unexplained: Mask
     explained: float
     rms: float | None
+    sure: bool
 
 
 @dataclass(frozen=True)
@@ -111,7 +114,8 @@ def _finding(
     points = pattern.points if isinstance(pattern, PointPattern) else None
     count = float(len(points)) if points is not None else _features_worth(view)
     T = estimate.T_world_object
-    expectation = None if T is None else _expect(view, body, T, points)
+    sure = estimate.status == "ok"
+    expectation = None if T is None else _expect(view, body, T, points, sure=sure)
     return Finding(setup, frame, view, points, count, expectation)
 
 
@@ -123,7 +127,7 @@ def _features_worth(view: View) -> float:
     return float(top / energy) if energy > 0 else 0.0
 
 
-def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expectation:
+def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: bool) -> Expectation:
     y, _, seen = projected_features(view.sensor, body, T)
     found = _association(view, body, T)
     met = np.zeros(len(body), dtype=np.bool_)
@@ -141,7 +145,8 @@ def _expect(view: View, body: Body, T: Floats, points: Floats | None) -> Expecta
         reach = view.observation.sigma * np.sqrt(2 * AssociationRules().reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
     explained = 0.0 if found is None else found.explained
-    return Expectation(y, seen, met, unexplained, explained, None if found is None else found.rms)
+    rms = None if found is None else found.rms
+    return Expectation(y, seen, met, unexplained, explained, rms, sure)
 
 
 def _association(view: View, body: Body, T: Floats) -> Association | None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.extraction.corners import SIGMA_PX, saddle_strength
+from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.base import region_of_interest
@@ -76,6 +77,10 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         response = np.sqrt(np.maximum(saddle_strength(blurred), 0))
         picture = displayable(_resized(response, size))
         title = "strength of saddles"
+    elif options.method == "log":
+        strength = np.maximum(spot_strength(data, options), 0)
+        picture = displayable(_resized(strength, size))
+        title = "height of spots"
     elif options.method == "intensity":
         picture = displayable(_resized(feature_values(data, options, window), size))
         title = "grey values above the threshold"

@@ -104,7 +104,7 @@ def _source(sensor: Sensor, length: float) -> Floats:
 def _equations(
     detections: Sequence[SensorDetections], points: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Normal equations (H, 3, 3), (H, 3) in length units of the steps that bring means where they are seen."""
+    """Normal equations (H, 3, 3), (H, 3) of steps that bring means to where they are seen."""
     A, b = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     off = np.zeros(len(points))
     for each in detections:

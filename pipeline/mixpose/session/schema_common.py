@@ -68,8 +68,10 @@ class ExtractTable(Table):
     method: Annotated[
         str | None, PlainValidator(read_method), Field(description=METHOD_ALLOWED)
     ] = None
-    """Centres of spots and disks, corners of a chessboard, the grey values themselves, or a
-    function of your own in a module beside the session file.
+    """Centres of spots and disks (`"blobs"`), corners of a chessboard, the grey values themselves,
+    centres of unsharp or faint spots by the Laplacian of Gaussian (`"log"`, which needs
+    `spot_sigma`: about how wide they are), or a function of your own in a module beside the session
+    file.
 
     Example: `method = "corners"`
     """
@@ -83,8 +85,13 @@ class ExtractTable(Table):
     threshold: Annotated[
         str | Number | None, PlainValidator(read_threshold), Field(description=THRESHOLD_ALLOWED)
     ] = None
-    """Grey level that parts features from the background: by the noise of the image, by Otsu's
-    rule, by the surroundings of each pixel, or a level in grey values of the image.
+    """Grey level that parts features from the background. `"auto"` goes by the noise of the image
+    and the brightest feature. `"triangle"` and `"li"` go by the histogram: they keep what is dim
+    beside something much brighter, and more of what is no feature. `"otsu"` parts two classes of
+    about the same size, whatever they are. `"local"` and `"sauvola"` compare each pixel with its
+    surroundings, `"sauvola"` also with how much these vary. A number is a level in grey values of
+    the image: all that is above it counts. `"corners"` and `"log"` take `"auto"` or a number: the
+    least step between fields, or height of a spot.
 
     Example: `threshold = 120`
     """
@@ -114,8 +121,9 @@ class ExtractTable(Table):
         Number | None,
         Field(ge=0, description="at least 0: px for cameras, a length for lateration"),
     ] = None
-    """Width that features have already in grey values (`method = "intensity"`) and in range
-    profiles, in px or in `unit`.
+    """Width (standard deviation) that features have already in grey values
+    (`method = "intensity"`) and in range profiles, in px or in `unit`; with `method = "log"` that
+    of the spots to look for, from 0.7 to 1.5 times the true one, 3 px if it is left out.
 
     Example: `spot_sigma = 5.0`
     """

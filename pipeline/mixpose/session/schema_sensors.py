@@ -78,7 +78,8 @@ class SensorTable(Table):
     Example: `source = "left*.png"`
     """
     times: Annotated[str | None, Field(min_length=1, description="a CSV file: frame,time_s")] = None
-    """When frames were taken, in seconds.
+    """When frames were taken, in seconds: a table with a row for each frame, beside the session
+    file or relative to it.
 
     Example: `times = "times.csv"`
     """

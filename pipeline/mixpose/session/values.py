@@ -13,8 +13,8 @@ from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
 
-EXTRACT_METHODS = ("blobs", "corners", "intensity")
-THRESHOLDS = ("auto", "otsu", "local")
+EXTRACT_METHODS = ("blobs", "corners", "intensity", "log")
+THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 
 _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'

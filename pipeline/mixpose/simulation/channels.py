@@ -66,8 +66,8 @@ def check_setup(session: Session) -> None:
         where = f"{session.path}: sensor {setup.name!r}"
         if setup.extract.method == "corners":
             raise SessionError(
-                f'{where}: extract.method: found "corners"; simulate draws spots, which "blobs" '
-                'and "intensity" find'
+                f'{where}: extract.method: found "corners"; simulate draws spots, which "blobs", '
+                '"log" and "intensity" find'
             )
         if setup.sensor.dimension == 2 and setup.resolution is None:
             raise SessionError(

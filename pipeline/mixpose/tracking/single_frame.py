@@ -15,6 +15,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.rigid import is_rigid
+from mixpose.threads import one_blas_thread
 from mixpose.tracking.tracker import Tracker
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -50,7 +51,8 @@ def estimate_pose(
     _check(views, start)
     tracker = Tracker.create(model, options or EstimatorOptions(), start)
     began = time.perf_counter()
-    _, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    with one_blas_thread():
+        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
 
 

@@ -1,0 +1,127 @@
+"""Unsharp or faint spots, by the Laplacian of Gaussian at one width.
+
+A wide and faint spot has no pixel that stands out from the noise, but all of it together does: the
+filter adds it up (Lindeberg, International Journal of Computer Vision 30, 1998).  To a Gaussian
+spot of width s and height p a filter of the same width responds with p / 2, and to noise of
+standard deviation n with n / (√(2π) s): a spot as high as the noise and 6 px wide has 7.5 times
+the response of noise.
+
+Places are the stationary points of quadratics through the response.  In tests with spots 3 to
+10 px wide they come as close to the truth as noise allows (0.02 px at 75 times the noise, 0.19 px
+at six times); `skimage.feature.blob_log` gives whole pixels (0.4 px) in three times the time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.errors import SessionError
+from mixpose.extraction.background import Grey, noise_of
+from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.quadratic import stationary_points
+from mixpose.extraction.threshold import Window
+from mixpose.records import Floats, Image, PointPattern
+
+# Width of the spots where the user gives none.  From 0.7 to 1.5 times the width of the filter all
+# spots were found; the response to others is lower by 4 s² σ² / (s² + σ²)².
+WIDTH_PX = 3.0
+
+# Six standard deviations: less than one maximum of noise in a hundred frames of 2 megapixels.
+NOISE_FACTOR = 6.0
+# "auto" keeps what has at least this share of the clearest spot's height.
+FAINT_SHARE = 0.2
+# A spot nearer than this to the border is cut by it, in widths.
+MARGIN_WIDTHS = 2.0
+# Samples of the quadratic are apart by this share of the width.
+STEP_SHARE = 1 / 3
+# Curvatures of a spot differ by less than this factor; along an edge there is hardly any.
+MOST_OBLONG = 5.0
+
+
+def extract_log(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
+    """Centres of unsharp or faint spots in a window.
+
+    Parameters
+    ----------
+    image : (H, W) uint8, uint16 or float32
+    options : ExtractOptions
+        `spot_sigma` is the width of the spots in px, 0 for 3 px.  `threshold` is "auto", or the
+        least height of a spot above what surrounds it, in grey values.  Areas do not matter.
+    window : (u0, v0, u1, v1)
+        Non-empty box inside the image, u1 and v1 exclusive.
+
+    Returns
+    -------
+    PointPattern
+        Points in pixels of the whole image, each of weight 1; none where nothing is found.
+
+    Raises
+    ------
+    SessionError
+        If the threshold is neither "auto" nor a number.
+    """
+    threshold = options.threshold
+    if isinstance(threshold, str) and threshold != "auto":
+        raise SessionError(
+            f"extract.threshold: {threshold!r} does not go with method 'log';"
+            ' allowed are "auto" and a grey level, the least height of a spot'
+        )
+    u0, v0, u1, v1 = window
+    spots = _find(image[v0:v1, u0:u1], options)
+    return PointPattern(spots + np.array([u0, v0]), np.ones(len(spots)))
+
+
+def spot_strength(image: Image, options: ExtractOptions) -> Grey:
+    """Height of the Gaussian spot about each pixel that would make the filter's response there.
+
+    Parameters are those of `extract_log`.
+
+    Returns
+    -------
+    (H, W) float32
+        In grey values; of spots of the given polarity positive.
+    """
+    width = _width(options)
+    grey = image.astype(np.float32)
+    blurred = cv2.GaussianBlur(grey, (0, 0), width, borderType=cv2.BORDER_REFLECT)
+    response = cv2.Laplacian(blurred, cv2.CV_32F, ksize=1, borderType=cv2.BORDER_REFLECT)
+    towards = -1 if options.polarity == "bright" else 1
+    return np.asarray(response * np.float32(towards * 2 * width**2))
+
+
+def _width(options: ExtractOptions) -> float:
+    return options.spot_sigma or WIDTH_PX
+
+
+def _find(image: Image, options: ExtractOptions) -> Floats:
+    from skimage.feature import peak_local_max  # noqa: PLC0415 (0.04 s to import)
+
+    width = _width(options)
+    margin = math.ceil(MARGIN_WIDTHS * width)
+    if min(image.shape) <= 2 * margin:
+        return np.empty((0, 2))
+    strength = spot_strength(image, options)
+    least = NOISE_FACTOR * 2 * noise_of(image) / (math.sqrt(2 * math.pi) * width)
+    if not isinstance(options.threshold, str):
+        least = max(least, options.threshold)
+    # A comparison with `cv2.dilate` takes a fifth of the time (7 to 32 ms of 1600 x 1200 px), but
+    # finds spots twice whose two highest pixels are alike: 13 of 200 at a width of 15 px.
+    places = peak_local_max(
+        strength, min_distance=max(round(width), 1), threshold_abs=least, exclude_border=margin
+    )
+    if isinstance(options.threshold, str):
+        heights = strength[places[:, 0], places[:, 1]]
+        places = places[heights >= FAINT_SHARE * heights.max(initial=0)]
+    rough = places[:, ::-1].astype(np.float64)
+    spots, _ = stationary_points(strength, rough, _round, max(STEP_SHARE * width, 1.0))
+    return spots
+
+
+def _round(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
+    """Whether a quadratic has a maximum that is not a ridge."""
+    trace, determinant = uu + vv, uu * vv - uv * uv / 4
+    return (trace < 0) & (trace**2 < (MOST_OBLONG + 1) ** 2 / MOST_OBLONG * determinant)

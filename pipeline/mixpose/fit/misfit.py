@@ -1,0 +1,84 @@
+"""Whether a body fits a density: what its features leave of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from mixpose.density import peak
+from mixpose.objective.matched import FINE_STEPS
+from mixpose.sensors import Sensor
+
+Floats: TypeAlias = NDArray[np.float64]
+
+_BELIEVED = 0.99  # probability of χ² up to which a misfit is taken for noise
+_ROUNDING = 1 / (8 * FINE_STEPS**2)  # of a height: what looking up linearly errs by
+
+
+@dataclass(frozen=True)
+class SensorDensity:
+    """The matched density of one sensor, as a function of places.
+
+    Attributes
+    ----------
+    geometry : Sensor
+    density : callable
+        The matched density and its gradient (n, 1 + m) at places (n, m).
+    variance : float
+        2σ², that of a feature in the matched density, in squared sensor units.
+    cell_variance : float
+        Variance of the noise of a cell times the size of a cell.
+    extent : tuple of (m,) float64
+        Smallest and largest sensor coordinates of the density's cells.
+    """
+
+    geometry: Sensor
+    density: Callable[[Floats], NDArray[Any]]
+    variance: float
+    cell_variance: float
+    extent: tuple[Floats, Floats]
+
+    def left(self, y: Floats) -> tuple[Floats, float]:
+        """What equal features (n, m) leave of the density at their places, and their height.
+
+        Values and gradients (n, 1 + m), the gradients times √2 σ: all have the same noise.
+        """
+        away = (y[:, None] - y) / np.sqrt(self.variance)
+        bells = np.exp(-0.5 * (away * away).sum(axis=2))
+        mixture = np.dstack([bells, -away * bells[..., None]]).sum(axis=1)
+        here = self.density(y).astype(np.float64)
+        here[:, 1:] *= np.sqrt(self.variance)
+        height = float(here[:, 0].sum() / bells.sum())
+        return here - height * mixture, height
+
+    def noise(self) -> float:
+        """Standard deviation of the noise of the matched density."""
+        return float(np.sqrt(self.cell_variance * peak(self.variance, self.geometry.dimension)))
+
+
+def misfit(densities: Sequence[SensorDensity], points_world: Floats, unknowns: int) -> float:
+    """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
+
+    Parameters
+    ----------
+    densities : sequence of SensorDensity
+        Exact at the features.
+    points_world : (n, 3) array
+        The body's features.
+    unknowns : int
+        Numbers of the pose that were fitted; each sensor's amplitude was, too.
+    """
+    statistic, freedom = 0.0, -unknowns
+    for sensor in densities:
+        rest, height = sensor.left(sensor.geometry.project(points_world)[0])
+        noise = np.hypot(sensor.noise(), _ROUNDING * height)
+        statistic += float((rest * rest).sum()) / noise**2
+        freedom += rest.size - 1
+    if freedom <= 0 or statistic < float(chdtri(freedom, 1 - _BELIEVED)):
+        return 1.0
+    return statistic / freedom

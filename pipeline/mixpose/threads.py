@@ -1,0 +1,41 @@
+"""Linear algebra on one thread while a frame is computed, and as before afterwards.
+
+The matrices of a frame are small.  Threads of a BLAS library that share their work wait for each
+other far longer than they compute, above all where other programs keep the processor busy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from threading import Lock
+from typing import Any
+
+from threadpoolctl import ThreadpoolController
+
+_LIMITING = Lock()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keep NumPy, SciPy and OpenCV from sharing linear algebra among threads.
+
+    Entering and leaving takes some 20 µs on an idle machine.  The limit is one of the whole
+    process, so where frames are computed in several threads at once only the first sets and
+    restores it: if each did, the last one would restore the limit of another.
+    """
+    if not _LIMITING.acquire(blocking=False):
+        yield
+        return
+    try:
+        with _libraries().limit(limits=1):
+            yield
+    finally:
+        _LIMITING.release()
+
+
+@cache
+def _libraries() -> Any:
+    """The BLAS libraries that are loaded; looking for them takes milliseconds."""
+    return ThreadpoolController().select(user_api="blas")

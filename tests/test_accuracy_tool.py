@@ -1,0 +1,39 @@
+"""The tool that measures accuracy over many seeds: `tools/accuracy.py`."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from accuracy import FIRST_SEED, Figures, figures_of, summary
+from make_synthetic import RECORDINGS
+
+
+def test_worst_is_the_largest_error_and_the_smallest_share() -> None:
+    seeds = [Figures(0.1 * k, 0.2 * k, 1 - 0.1 * k, 0.9 - 0.1 * k, float(k)) for k in (1, 3, 2)]
+    table = summary(seeds)
+    assert {key: round(each["median"], 9) for key, each in table.items()} == {
+        "rotation_deg": 0.2, "position": 0.4, "ok": 0.8, "inside_95": 0.7, "squared": 2.0,
+    }  # fmt: skip
+    assert {key: round(each["worst"], 9) for key, each in table.items()} == {
+        "rotation_deg": 0.3, "position": 0.6, "ok": 0.7, "inside_95": 0.6, "squared": 3.0,
+    }  # fmt: skip
+
+
+def test_a_seed_without_any_pose_is_the_worst_and_not_left_out() -> None:
+    nan = math.nan
+    table = summary([Figures(0.1, 0.2, 1.0, 0.9, 1.0), Figures(nan, nan, 0.0, nan, nan)])
+    assert [each["worst"] for each in table.values()] == [math.inf, math.inf, 0.0, 0.0, math.inf]
+
+
+def test_a_seed_gives_the_same_figures_again_and_another_one_others() -> None:
+    first, again, other = (
+        figures_of("range_profiles", seed) for seed in (FIRST_SEED, FIRST_SEED, FIRST_SEED + 1)
+    )
+    assert first == again
+    assert first.rotation_deg != other.rotation_deg
+    # the seeds of the recordings themselves would be measured twice
+    assert all(each.options.seed < FIRST_SEED for each in RECORDINGS.values())

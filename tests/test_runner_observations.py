@@ -1,0 +1,89 @@
+"""What the frames of a recording become before a pose is estimated from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mixpose
+from mixpose import runner
+from mixpose.records import FrameSet, GridPattern, PointPattern, RawFrame
+from mixpose.rigid import from_rotation_vector
+from mixpose.selection import Selection
+from mixpose.session import Session
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+NOTHING = PointPattern(np.empty((0, 2)), np.empty(0))
+
+
+@pytest.fixture
+def session() -> Session:
+    return mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+
+
+@pytest.fixture
+def ranges() -> Session:
+    return mixpose.load_session(SYNTHETIC / "range_profiles" / "session.toml")
+
+
+def delays(session: Session, left_s: float | None, right_s: float | None) -> list[float]:
+    """Delays of two cameras in a set whose time is that of the left one."""
+    frames = {"left": RawFrame(4, left_s, NOTHING), "right": RawFrame(4, right_s, NOTHING)}
+    return [view.delay for view in runner.observe(session, FrameSet(4, left_s, frames))]
+
+
+def test_a_sensor_that_is_later_than_the_set_has_a_positive_delay(session: Session) -> None:
+    assert delays(session, 0.5, 0.53) == pytest.approx([0.0, 0.03])
+    assert delays(session, 0.5, 0.48) == pytest.approx([0.0, -0.02])
+
+
+def test_sensors_in_step_or_without_times_have_no_delay(session: Session) -> None:
+    assert delays(session, 0.5, 0.5 + 1e-9) == [0.0, 0.0]
+    assert delays(session, 0.5, None) == [0.0, 0.0]
+    assert delays(session, None, None) == [0.0, 0.0]
+
+
+def test_grey_values_are_as_wide_as_their_spots_and_sigma_together(ranges: Session) -> None:
+    setup = ranges.sensors[0]
+    extract = replace(setup.extract, sigma=3.0, spot_sigma=4.0)
+    profile = GridPattern(np.ones((1, 50), np.float32), np.array([0.0]), 1.0)
+    seen = runner.observation_of(
+        ranges, replace(setup, extract=extract), RawFrame(0, None, profile)
+    )
+    assert seen.sigma == pytest.approx(5.0)  # hypot(3, 4): variances add
+    assert seen.intrinsic == 4.0
+    points = PointPattern(np.array([[10.0]]), np.ones(1))
+    seen = runner.observation_of(ranges, replace(setup, extract=extract), RawFrame(0, None, points))
+    assert seen.sigma == 3.0  # a detection has no spot any more
+
+
+def test_a_source_of_the_session_is_beside_it_and_one_given_instead_is_not(
+    session: Session, ranges: Session
+) -> None:
+    own = runner.source_spec(session, session.sensors[0], None)
+    given = runner.source_spec(session, session.sensors[0], "other/left*.png")
+    assert (own.base, own.source) == (session.folder, session.sensors[0].source)
+    assert (given.base, given.source) == (Path(), "other/left*.png")
+    kinds = [runner.source_spec(ranges, setup, None).kind for setup in ranges.sensors]
+    assert (own.kind, kinds) == ("camera", ["lateration"] * 3)
+
+
+def test_a_run_that_goes_on_begins_at_its_own_pose_and_not_at_start(session: Session) -> None:
+    assert session.start is not None
+    T = from_rotation_vector([0.1, 0.2, 0.3], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(runner.begin(session, T)[0].T_start, T)
+    np.testing.assert_array_equal(runner.begin(session)[0].T_start, session.start.T_world_object)
+
+
+def test_a_sensor_without_frames_is_reported_as_unused_in_the_sessions_order(
+    session: Session, tmp_path: Path
+) -> None:
+    path = tmp_path / "left.csv"
+    path.write_text("frame,u,v\n99,0,0\n", encoding="ascii")
+    found = mixpose.run(session, sources={"left": str(path)}, selection=Selection(0, 2))
+    for estimate in found:
+        assert list(estimate.sensors) == ["left", "right"]
+        assert [report.used for report in estimate.sensors.values()] == [False, True]

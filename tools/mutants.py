@@ -1,0 +1,244 @@
+"""Put small bugs into the code, one at a time, and see that a test falls to each.
+
+python tools/mutants.py [NAME ...] [--room ROOM] [--json FILE] [--keep-going]
+
+Each mutant of `tools/mutation/` goes into a copy of the files that git tracks, and the tests of
+its room run there until the first that fails.  A mutant that no test notices survives: then a test
+is missing.  The exit status is 1 where one survives, 2 where one cannot be tried.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from mutation import MUTANTS
+from mutation.mutant import Mutant, MutationError
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = "pipeline/mixpose"
+
+# Globs below `tests`; what is quick comes first, as the first test that fails ends a trial.
+TESTS: dict[str, tuple[str, ...]] = {
+    "rigid": ("test_rigid.py",),
+    "records": ("test_records.py",),
+    "sensors": ("test_sensors.py", "test_sensors_*.py"),
+    "body": ("test_body.py",),
+    "optimise": ("test_optimise.py",),
+    "extraction": ("test_extraction_*.py",),
+    "frames": (
+        "test_frames_pairing.py",
+        "test_frames_t*.py",
+        "test_frames_images.py",
+        "test_frames_profiles.py",
+        "test_frames_video.py",
+        "test_frames_*.py",
+    ),
+    "session": ("test_session_*.py",),
+    "poses": ("test_poses_*.py",),
+    "simulation": ("test_simulation_*.py",),
+    "checking": ("test_check_*.py",),
+    "runner": ("test_runner_*.py",),
+    "density": ("test_density.py",),
+    "objective": ("test_objective*.py",),
+    "search": ("test_search_*.py",),
+    "estimation": ("test_estimation*.py", "test_runner_*.py"),
+}
+
+# A mutant may make the code go on for ever: then it counts as noticed.
+TIME_LIMIT_S = 300.0
+
+_FAILED = re.compile(r"^(?:FAILED|ERROR) (tests/\S+?::.*?)(?: - .*)?$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a mutant; `killed_by` is the test that fell to it, None where none did."""
+
+    name: str
+    room: str
+    why: str
+    killed_by: str | None
+    seconds: float
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help="mutants; all where left out")
+    parser.add_argument("--room", action="append", default=[], help=", ".join(TESTS))
+    parser.add_argument("--json", type=Path, help="file for the outcomes")
+    parser.add_argument("--keep-going", action="store_true", help="go on after a survivor")
+    options = parser.parse_args(arguments)
+    try:
+        mutants = chosen(MUTANTS, options.names, options.room)
+        outcomes = tried(ROOT, mutants, keep_going=options.keep_going)
+    except MutationError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if options.json:
+        rows = [asdict(outcome) for outcome in outcomes]
+        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    survivors = [outcome.name for outcome in outcomes if outcome.killed_by is None]
+    seconds = sum(outcome.seconds for outcome in outcomes)
+    print(f"{len(outcomes)} mutants, {len(survivors)} survived, {seconds:.0f} s")
+    return 1 if survivors else 0
+
+
+def chosen(
+    mutants: Sequence[Mutant], names: Sequence[str], rooms: Sequence[str]
+) -> tuple[Mutant, ...]:
+    """The mutants of these names and rooms, all of them where none are given."""
+    known = [mutant.name for mutant in mutants]
+    for name in names:
+        if name not in known:
+            raise MutationError(f"no such mutant: {name}; allowed: {', '.join(known)}")
+    for room in rooms:
+        if room not in TESTS:
+            raise MutationError(f"no such room: {room}; allowed: {', '.join(TESTS)}")
+    return tuple(
+        mutant
+        for mutant in mutants
+        if (not names or mutant.name in names) and (not rooms or mutant.room in rooms)
+    )
+
+
+def tried(root: Path, mutants: Sequence[Mutant], *, keep_going: bool) -> list[Outcome]:
+    """Try mutants on a copy of a repository and say of each what became of it."""
+    outcomes: list[Outcome] = []
+    with TemporaryDirectory() as folder:
+        tree = Path(folder) / "sound"
+        copy_tracked(root, tree)
+        check_sound(tree, mutants)
+        for mutant in mutants:
+            outcome = trial(tree, Path(folder) / "mutated", mutant)
+            outcomes.append(outcome)
+            verdict = f"killed by {outcome.killed_by}" if outcome.killed_by else "SURVIVED"
+            print(f"{mutant.name}: {verdict} ({outcome.seconds:.1f} s)", flush=True)
+            if outcome.killed_by is None:
+                print(f"  {mutant.file}: {mutant.why}", flush=True)
+                if not keep_going:
+                    break
+    return outcomes
+
+
+def copy_tracked(root: Path, tree: Path) -> None:
+    """Copy what git tracks, as it stands in the working tree."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=root, check=True, capture_output=True, text=True
+    )
+    for name in filter(None, listed.stdout.split("\0")):
+        if (root / name).is_file():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(root / name, tree / name)
+
+
+def check_sound(tree: Path, mutants: Sequence[Mutant]) -> None:
+    """See that the texts of all mutants are there, and that the tests pass without them.
+
+    Raises
+    ------
+    MutationError
+    """
+    for mutant in mutants:
+        mutant.mutated(_source(tree, mutant).read_text(encoding="utf-8"))
+    imported = subprocess.run(
+        [sys.executable, "-c", "import mixpose; print(mixpose.__file__)"],
+        cwd=tree,
+        env=_environment(tree),
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.strip()
+    if not Path(imported).resolve().is_relative_to(tree.resolve()):
+        raise MutationError(f"{imported} is imported in place of the copy in {tree}")
+    failed = first_failure(tree, _unique(name for each in mutants for name in tests_of(tree, each)))
+    if failed is not None:
+        raise MutationError(f"{failed} fails without any mutant; mend this first")
+
+
+def trial(tree: Path, copy: Path, mutant: Mutant) -> Outcome:
+    """Run the tests of a mutant's room on a copy of a tree with the mutant in it."""
+    began = time.perf_counter()
+    shutil.copytree(tree, copy)
+    try:
+        source = _source(copy, mutant)
+        source.write_text(mutant.mutated(source.read_text(encoding="utf-8")), encoding="utf-8")
+        for compiled in (source.parent / "__pycache__").glob(f"{source.stem}.*.pyc"):
+            compiled.unlink()
+        try:
+            killed_by = first_failure(copy, tests_of(copy, mutant))
+        except MutationError as error:
+            raise MutationError(f"{mutant.name}: {error}") from error
+    finally:
+        shutil.rmtree(copy)
+    return Outcome(mutant.name, mutant.room, mutant.why, killed_by, time.perf_counter() - began)
+
+
+def tests_of(tree: Path, mutant: Mutant) -> list[str]:
+    """Files of tests for a mutant, its own first and then those of its room."""
+    patterns = [*mutant.tests, *TESTS[mutant.room]]
+    found = [path for pattern in patterns for path in sorted((tree / "tests").glob(pattern))]
+    return _unique(f"tests/{path.name}" for path in found)
+
+
+def first_failure(tree: Path, tests: Sequence[str]) -> str | None:
+    """The first test that fails in a tree, None where all pass.
+
+    Raises
+    ------
+    MutationError
+        If the tests cannot be run, as where a module cannot be imported.
+    """
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-x", "-q", "-rfE"]
+    try:
+        done = subprocess.run(
+            [*command, "--tb=no", *tests],
+            cwd=tree,
+            env=_environment(tree),
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=TIME_LIMIT_S,
+        )
+    except subprocess.TimeoutExpired:
+        return f"the time limit of {TIME_LIMIT_S:g} s"
+    if done.returncode == 0:
+        return None
+    failed = _FAILED.search(done.stdout)
+    if done.returncode != 1 or failed is None:
+        last = (done.stderr.strip() or done.stdout.strip()).splitlines()[-3:]
+        raise MutationError(f"the tests do not run: {' / '.join(last)}")
+    return failed[1]
+
+
+def _source(tree: Path, mutant: Mutant) -> Path:
+    return tree / PACKAGE / mutant.file
+
+
+def _environment(tree: Path) -> dict[str, str]:
+    """That of this process, with the package of the tree and without what differs by machine."""
+    environment = {k: v for k, v in os.environ.items() if k != "MIXPOSE_RECORDINGS"}
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    return environment | threads | {"PYTHONPATH": str(tree / "pipeline")}
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,268 @@
+"""Mutants of `simulation`, `checking` and `runner`."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_SIMULATION = (
+    Mutant(
+        "simulation-averted-features-are-seen",
+        "simulation/sighting.py",
+        "* sensor.towards(points)).sum(axis=-1) > 0)",
+        "* sensor.towards(points)).sum(axis=-1) < 0)",
+        "recordings show the back of the body",
+    ),
+    Mutant(
+        "simulation-nothing-hidden-for-certain",
+        "simulation/sighting.py",
+        "hidden[rng.permutation(count)[: options.hidden_count]] = True",
+        "hidden[rng.permutation(count)[:0]] = True",
+        "hidden_count does nothing",
+    ),
+    Mutant(
+        "simulation-deformed-in-world-axes",
+        "simulation/sighting.py",
+        "T[:3, 3] += T[:3, :3] @ offsets[i]",
+        "T[:3, 3] += offsets[i]",
+        "features are displaced by another spread than the body's once it turns",
+    ),
+    Mutant(
+        "simulation-one-generator-for-all-frames",
+        "simulation/draws.py",
+        "[seed, int(purpose), *key]",
+        "[seed, int(purpose)]",
+        "every frame has the same noise",
+    ),
+    Mutant(
+        "simulation-turns-about-the-origin",
+        "simulation/motion.py",
+        "from_parts(R, pivot_world - R @ self.pivot)",
+        "from_parts(R, pivot_world - R_centre @ self.pivot)",
+        "a body measured from afar swings out of view",
+    ),
+    Mutant(
+        "simulation-held-directions-move",
+        "simulation/motion.py",
+        "shift=_swing(translation * is_free[:3], period_s, rng)",
+        "shift=_swing(translation * np.ones(3), period_s, rng)",
+        "directions that are not free change in the truth",
+    ),
+    Mutant(
+        "simulation-pixels-begin-at-their-centre",
+        "simulation/render.py",
+        "np.arange(cells.start, cells.stop + 1) - 0.5",
+        "np.arange(cells.start, cells.stop + 1)",
+        "spots are half a pixel beside their places",
+    ),
+    Mutant(
+        "simulation-spots-of-another-mass",
+        "simulation/render.py",
+        "total = peak * 2 * np.pi * sigma**2",
+        "total = peak * 2 * np.pi * sigma",
+        "spots are brighter the narrower they are",
+    ),
+    Mutant(
+        "simulation-shot-noise-by-variance",
+        "simulation/render.py",
+        "spread = np.sqrt(options.shot_noise * image[lit])",
+        "spread = options.shot_noise * image[lit]",
+        "noise grows with the signal in place of its root",
+    ),
+    Mutant(
+        "simulation-dark-is-bright",
+        "simulation/render.py",
+        'return grey if form.polarity == "bright" else',
+        'return grey if form.polarity != "" else',
+        "recordings of dark features show bright ones",
+    ),
+    Mutant(
+        "simulation-profiles-begin-at-zero",
+        "simulation/render.py",
+        "(sighting.points[:, 0] - form.range_min) / form.bin_size",
+        "sighting.points[:, 0] / form.bin_size",
+        "peaks are beside their ranges by range_min",
+    ),
+    Mutant(
+        "simulation-body-too-far-away",
+        "simulation/central_pose.py",
+        "_SIDE_FILLED = 0.5",
+        "_SIDE_FILLED = 0.2",
+        "simulated bodies are too small to be measured",
+    ),
+    Mutant(
+        "simulation-principal-point-ignored",
+        "simulation/central_pose.py",
+        "sight = np.append((middle - K[:2, 2]) / K.diagonal()[:2], 1.0)",
+        "sight = np.append(0 * middle, 1.0)",
+        "the body is off the middle of a cropped image",
+    ),
+    Mutant(
+        "simulation-false-features-in-one-half",
+        "simulation/sighting.py",
+        "rng.uniform(view.lowest, view.highest,",
+        "rng.uniform(view.lowest, view.highest / 2,",
+        "clutter is thinner where the body is",
+    ),
+    Mutant(
+        "simulation-motion-begins-at-frame-zero",
+        "simulation/recording.py",
+        "moment = (number - plan.numbers[0]) / plan.fps",
+        "moment = number / plan.fps",
+        "the first frame is far from [start] where numbers begin late",
+    ),
+    Mutant(
+        "simulation-weightless-frames-left-out",
+        "simulation/writers.py",
+        "points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)",
+        "points, weights = np.zeros((0, len(self._coordinates))), np.zeros(0)",
+        "a frame without detections is missing from its table",
+    ),
+)
+
+_CHECKING = (
+    Mutant(
+        "checking-symmetries-are-news",
+        "checking/lookalikes.py",
+        "known = T_world_object @ body.symmetries",
+        "known = T_world_object[None]",
+        "a symmetric body is warned about in every session",
+    ),
+    Mutant(
+        "checking-mirrored-tilts-left-out",
+        "checking/lookalikes.py",
+        "turning = np.cross(arms[:, :, None, :], by_world)",
+        "turning = np.cross(by_world, arms[:, :, None, :])",
+        "look-alikes are not found, as the steps turn the wrong way",
+    ),
+    Mutant(
+        "checking-ranges-as-sharp-as-pixels",
+        "checking/lookalikes.py",
+        "share = 1.0 if isinstance(setup.sensor, RangeSensor) else NOISE_OF_SIGMA",
+        "share = NOISE_OF_SIGMA",
+        "look-alikes among ranges are overlooked",
+    ),
+    Mutant(
+        "checking-looks-along-a-column",
+        "checking/placement.py",
+        "{_numbers(sensor.T_sensor_world[2, :3], 3)}",
+        "{_numbers(sensor.T_sensor_world[:3, 2], 3)}",
+        "sensors are said to look the inverse way",
+    ),
+    Mutant(
+        "checking-stands-at-its-translation",
+        "checking/placement.py",
+        "np.asarray(inverse(sensor.T_sensor_world)[:3, 3])",
+        "np.asarray(sensor.T_sensor_world[:3, 3])",
+        "sensors are said to stand elsewhere",
+    ),
+    Mutant(
+        "checking-twins-by-place-alone",
+        "checking/placement.py",
+        "if near and rotation_angle_deg(T_a, T_b) < _SAME_ANGLE_DEG:",
+        "if near:",
+        "cameras in a ring about the origin, which share a translation, are warned about",
+    ),
+    Mutant(
+        "checking-no-small-bodies",
+        "checking/placement.py",
+        "if extent > _SMALL * setup.extract.sigma:",
+        "if extent > 0 * setup.extract.sigma:",
+        "two units of length in one file are not noticed",
+    ),
+    Mutant(
+        "checking-one-of-two-is-too-few",
+        "checking/advice.py",
+        "if count < min(_FEW * expected, expected - 1):",
+        "if count < _FEW * expected:",
+        "a single hidden feature of two is warned about",
+    ),
+    Mutant(
+        "checking-middle-at-the-corner",
+        "checking/sensor_keys.py",
+        "np.abs((cx, cy) - (size - 1) / 2)",
+        "np.abs((cx, cy) - (size - 1))",
+        "every good calibration is doubted",
+    ),
+    Mutant(
+        "checking-typical-frame-is-the-emptiest",
+        "checking/recordings.py",
+        'np.argsort(self.counts, kind="stable")[len(self.counts) // 2]',
+        'np.argsort(self.counts, kind="stable")[0]',
+        "keys are tried on a frame that is worse than most",
+    ),
+    Mutant(
+        "checking-half-of-the-image",
+        "checking/typical.py",
+        "return max(round(2 * u) + 1, 1), max(round(2 * v) + 1, 1)",
+        "return max(round(u) + 1, 1), max(round(v) + 1, 1)",
+        "an image of unknown size is taken for a quarter of it",
+    ),
+    Mutant(
+        "checking-both-sides-are-seen",
+        "checking/placement.py",
+        "return count if session.body.normals is None else max(count // 2, 1)",
+        "return count",
+        "a body with normals seems to lack the features of its back",
+    ),
+)
+
+_RUNNER = (
+    Mutant(
+        "runner-delay-of-the-other-sign",
+        "runner.py",
+        "delay = frame.time_s - frame_set.time_s",
+        "delay = frame_set.time_s - frame.time_s",
+        "sensors out of step are moved the wrong way",
+    ),
+    Mutant(
+        "runner-width-without-the-spot",
+        "runner.py",
+        "width = float(np.hypot(options.sigma, options.spot_sigma))",
+        "width = float(options.sigma)",
+        "grey values count as narrower than they are",
+    ),
+    Mutant(
+        "runner-worse-than-before-convinces",
+        "runner.py",
+        "if step.met is not None and step.met.as_good_as(before):",
+        "if step.met is not None:",
+        "features that left the window are not looked for",
+    ),
+    Mutant(
+        "runner-replaced-source-beside-the-session",
+        "runner.py",
+        "base=session.folder if replaced is None else Path(),",
+        "base=session.folder,",
+        "--source is looked for beside the session file",
+    ),
+    Mutant(
+        "runner-otsu-in-windows",
+        "runner.py",
+        'and setup.extract.threshold not in ("otsu", "local")',
+        'and setup.extract.threshold not in ("otsu",)',
+        "features found by their surroundings change with the window",
+    ),
+    Mutant(
+        "runner-start-of-the-session-wins",
+        "runner.py",
+        "if T_start is None and start is not None:",
+        "if start is not None:",
+        "a run that goes on begins at [start] again",
+    ),
+    Mutant(
+        "runner-silent-sensors-have-no-report",
+        "runner.py",
+        "for s in setups}",
+        "for s in setups if s.name in estimate.sensors}",
+        "a table of poses lacks the columns of a sensor without a frame",
+    ),
+    Mutant(
+        "runner-ranges-are-cameras",
+        "runner.py",
+        'kind="lateration" if setup.model == "lateration" else "camera"',
+        'kind="camera"',
+        "tables of ranges are refused",
+    ),
+)
+
+MUTANTS = (*_SIMULATION, *_CHECKING, *_RUNNER)
