@@ -116,8 +116,6 @@ class _Grid(NamedTuple):
         """Squares (K, 4) that places (K, 2) in cells fill, and their first cells (K, 4, 2)."""
         first = ((q - half) * (1.0 / self.page)).astype(np.intp)
         both = first[:, None] + _CORNERS
-        limit = np.array(self.shape) - 2
-        both = np.minimum(np.maximum(both, 1), limit)
         return both[..., 0] + self.shape[0] * both[..., 1], (self.page * both).astype(np.float64)
 
 
@@ -222,7 +220,9 @@ def _grid(parts: Sequence[Floats], reach: float, detected: bool) -> _Grid:
         middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
         lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
     columns, rows = ((upper - lower + 2 * reach) / page).tolist()
-    return _Grid(lower - (reach + page), (int(columns) + 4, int(rows) + 4), page, is_cut)
+    # half a cell more, lest rounding puts the outermost place on a page of the rim
+    origin = lower - (reach + page + 0.5)
+    return _Grid(origin, (int(columns) + 4, int(rows) + 4), page, is_cut)
 
 
 def _draw_points(
@@ -242,7 +242,8 @@ def _draw_points(
     weights = np.concatenate([parts[k][1] for k in chosen])
     sensor = np.repeat(chosen, [len(parts[k][0]) for k in chosen])
     if grid.is_cut:
-        inside = ((q > grid.page) & (q < grid.page * (np.array(grid.shape) - 1.0))).all(axis=1)
+        first = np.floor((q - reach) * (1.0 / grid.page))
+        inside = ((first >= 1) & (first <= np.array(grid.shape) - 3)).all(axis=1)
         q, weights, sensor = q[inside], weights[inside], sensor[inside]
     squares, corner = grid.around(q, reach)
     cells = (squares + grid.squares * sensor[:, None]).ravel()
@@ -261,7 +262,7 @@ def _draw_points(
     if not two.all():  # rows that are all alike
         bells[~two, :, 1], slopes[~two, :, 1] = 1.0, 0.0
     K = len(cells)
-    bells, slopes = bells.reshape(K, 2, -1), slopes.reshape(K, 2, -1)
+    bells, slopes = bells.reshape(K, 2, len(side)), slopes.reshape(K, 2, len(side))
     layers = np.empty((3, 1 + K, len(side), len(side)), dtype=np.float32)
     layers[:, 0] = 0.0
     u, v = bells[:, 0, None], bells[:, 1, :, None]
