@@ -112,15 +112,15 @@ _BATCH = (
     Mutant(
         "sensors-batch-bias-of-the-other-sign",
         "sensors/batch.py",
-        "y = distance + self._biases",
-        "y = distance - self._biases",
+        "y[..., 0] = distance + self._biases",
+        "y[..., 0] = distance - self._biases",
         "ranges are off by twice the bias",
     ),
     Mutant(
         "sensors-batch-range-without-end",
         "sensors/batch.py",
-        "visible = (y >= self._lower) & (y <= self._upper)",
-        "visible = y >= self._lower",
+        "visible = (y[..., 0] >= self._lower) & (y[..., 0] <= self._upper)",
+        "visible = y[..., 0] >= self._lower",
         "features beyond the reach of a range sensor count as seen",
     ),
     Mutant(
@@ -275,16 +275,16 @@ _SENSORS = (
     ),
     Mutant(
         "sensors-camera-moved-along",
-        "sensors/motion.py",
-        "sensor.T_sensor_world @ motion",
-        "motion @ sensor.T_sensor_world",
+        "sensors/pinhole.py",
+        "self.T_sensor_world @ motion",
+        "motion @ self.T_sensor_world",
         "cameras out of step are moved about their own axes",
     ),
     Mutant(
         "sensors-range-sensor-moved-along",
-        "sensors/motion.py",
-        "motion[:3, :3].T @ (sensor.position - motion[:3, 3])",
-        "motion[:3, :3] @ (sensor.position - motion[:3, 3])",
+        "sensors/lateration.py",
+        "motion[:3, :3].T @ (self.position - motion[:3, 3])",
+        "motion[:3, :3] @ (self.position - motion[:3, 3])",
         "range sensors out of step are turned the wrong way",
     ),
 )

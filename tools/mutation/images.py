@@ -177,7 +177,7 @@ _SHAPES = (
 _SADDLES = (
     Mutant(
         "extraction-corners-move-away",
-        "extraction/corners.py",
+        "extraction/quadratic.py",
         "np.clip(shift, -1, 1)",
         "np.clip(-shift, -1, 1)",
         "corners are off by as much again as their first guess",
