@@ -15,7 +15,7 @@ from mixpose.sensors import PinholeCamera
 
 
 def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
-    body: Body, pinhole_cameras: list[PinholeCamera]
+    pinhole_cameras: list[PinholeCamera]
 ) -> None:
     camera = replace(pinhole_cameras[0], T_sensor_world=np.eye(4))
     one_point = Body(
@@ -26,13 +26,13 @@ def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
     # points on the optical axis: no motion along it and no turn about it can be seen
     assert np.isinf(covariance[2, 2])
     assert np.isinf(covariance[5, 5])
-    full, _ = expected_covariance(pinhole_cameras, [1.0, 1.0], body, TRUTH, ALL_FREE)
+    full, _ = expected_covariance(pinhole_cameras, [1.0, 1.0], EIGHT, TRUTH, ALL_FREE)
     assert np.isfinite(full).all()
 
 
-def test_assessment_tells_hidden_from_met(body: Body, pinhole_cameras: list[PinholeCamera]) -> None:
-    views = detect(pinhole_cameras, body, TRUTH, hidden=2, false=2)
-    judged = assess(views, body, TRUTH, ALL_FREE)
+def test_judgement_tells_hidden_from_met(pinhole_cameras: list[PinholeCamera]) -> None:
+    views = detect(pinhole_cameras, EIGHT, TRUTH, hidden=2, false=2)
+    judged = judge(matched_objective(views, EIGHT, [1.5, 1.5]), TRUTH, ALL_FREE)
     assert judged.measurements == pytest.approx(24, abs=0.4)
     assert judged.coverage == pytest.approx(6 / 8, abs=0.02)
     for report in judged.sensors.values():
