@@ -30,11 +30,12 @@ from benchmarks.search_cases import looking_at
 from benchmarks.timing import PROCESSOR, Task, medians, show
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions, Track, Tracker, fit_near
-from mixpose.objective import Gaze, View, gazes_of
+from mixpose.fit import EstimatorOptions, fit_near
+from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Track, Tracker
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -148,21 +149,20 @@ def report(figures: dict[str, Any]) -> None:
         show(f"median error, {unit}", figures[key], at_most=figures[f"literal_{key}"])
 
 
-def estimate(views: Sequence[View], gazes: Sequence[Gaze], T_start: Floats) -> Floats:
+def estimate(views: Sequence[View], T_start: Floats) -> Floats:
     """What is measured: the pipeline's estimate of six numbers near a prediction.
 
     What stays the same from frame to frame, the sensors side by side, a tracker has at hand.
     """
     samples = BODY.means[:, None]  # the matched objective integrates without samples
     options = EstimatorOptions()
-    return fit_near(views, BODY, T_start, UNCERTAINTY, options, samples, gazes).T_world_object
+    return fit_near(views, BODY, T_start, UNCERTAINTY, options, samples).T_world_object
 
 
 def warm(one: Trial, cameras: int = 2) -> Callable[[], Floats]:
     """The estimate of a frame seen by the first cameras."""
     views = one.views[:cameras]
-    gazes = gazes_of([view.sensor for view in views], BODY)
-    return partial(estimate, views, gazes, pose(one.start))
+    return partial(estimate, views, pose(one.start))
 
 
 def warmed(one: Trial, cameras: int) -> tuple[Tracker, Track]:

@@ -22,7 +22,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.search_cases import Row, Trial, absent, errors_squared, is_right, rows_named, trial
-from mixpose.estimation import EstimatorOptions, Tracker
+from mixpose.fit import EstimatorOptions
+from mixpose.tracking import Tracker
 from mixpose.search import search
 
 TIMED = ("2 pinhole 6/0/0", "2 pinhole 6/1/3", "2 pinhole 8/2/4")

@@ -24,8 +24,6 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
-from scipy.optimize import linear_sum_assignment
 
 from mixpose.fit.misfit import SensorDensity
 from mixpose.objective import Quadratic, pose_jacobian
@@ -40,6 +38,8 @@ _STEPS = 30  # peaks two widths apart, the least, draw each other by 0.4 of a st
 
 def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
     """Where each of `count` features (n, m) explains most, if each has a peak of its own."""
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415 - takes long to import, seldom needed
+
     step = np.sqrt(sensor.variance / 8)  # half of σ
     limits = zip(*sensor.extent, strict=True)
     grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in limits)), axis=-1)
@@ -89,6 +89,8 @@ class Matching:
 
     def nearest(self, T: Floats) -> Labels:
         """The place of each feature, per sensor, with the least sum of squares at a pose."""
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - as above
+
         labels = []
         for sensor, place in zip(self.densities, self.places, strict=True):
             y, _ = sensor.geometry.project(transform(T, self.points))

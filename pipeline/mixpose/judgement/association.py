@@ -105,7 +105,7 @@ class Association:
 
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules
-) -> list[Association]:
+) -> tuple[list[Association], float]:
     """Compare what a pose predicts with what every sensor observed.
 
     Parameters
@@ -119,6 +119,8 @@ def associate(
     -------
     list of Association
         One per view.
+    float
+        The objective at the pose.
     """
     at, sampled, matched, _ = objective.match(T_world_object[None])
     node_weights = objective.projection.body.nodes.weights
@@ -158,4 +160,5 @@ def associate(
                 surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
             )
         )
-    return found
+    explained = matched.product**2 / matched.norm
+    return found, float((objective.weights / objective.energies * explained).sum())

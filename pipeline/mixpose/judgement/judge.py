@@ -105,7 +105,7 @@ def judge(
         What was known of the pose; None: nothing.
     rules : JudgementRules
     """
-    found = associate(objective, T_world_object, rules.association)
+    found, value = associate(objective, T_world_object, rules.association)
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
     information = information_of(found)
     noise, remembered = noises(before, noise_of(found, free), rules.noise)
@@ -121,7 +121,7 @@ def judge(
         log_evidence=evidence,
         noise=remembered,
         associations=tuple(found),
-        value=float(objective.value(T_world_object)),
+        value=value,
     )
 
 

@@ -72,7 +72,7 @@ class BodyProjection:
         J = pose_jacobian(by_world, arms.reshape(-1, 3)).reshape(L, H, n, 2, 6)
         seen = visible.reshape(L, H, n)
         if self._normals is None:
-            faced = np.broadcast_to(True, seen.shape)
+            faced = np.ones(seen.shape, dtype=np.bool_)
         else:
             points = world.reshape(H, n, 3)
             each = [facing(one, poses, points, self._normals) for one in self.sensors]

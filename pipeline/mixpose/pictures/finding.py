@@ -155,5 +155,5 @@ def _association(view: View, body: Body, T: Floats) -> Association | None:
         return None
     sigmas = [view.observation.sigma]
     objective = matched_objective([view], body, sigmas, T, steps_per_sigma=FINE_STEPS)
-    found = associate(objective, T, AssociationRules())[0]
+    found = associate(objective, T, AssociationRules())[0][0]
     return found if len(found.features) else None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
-from mixpose.judgement import Judged, Prior, judge, nearest_alike
+from mixpose.judgement import Judged, Prior, flat_prior, judge, nearest_alike
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.tracking.association_likelihood import are_associated
@@ -182,11 +182,13 @@ class AssociationLikelihood:
         """Judge a pose by the sum over all associations."""
         data, T = self.data, fit.T_world_object
         judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
+        anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
             replace(judged, proposer=fit.proposer),
             self._posterior(start),
             data.track.noise,
-            data.prior(T),
+            # the posterior holds the prediction already
+            replace(data.prior(T), spread=anywhere.spread),
             data.rules.judgement.noise,
             data.rules.ranges,
         )

@@ -152,7 +152,7 @@ def prior_of(
     if not predictions:
         return anywhere
     surprise = min(rules.surprise * (1 + misses), 1.0)
-    terms = [np.log(surprise) + anywhere.log_density]
+    terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
     for prediction in predictions:
         u = prediction.uncertainty[free]
         twist = twist_between(
@@ -163,7 +163,9 @@ def prior_of(
         log_density = -0.5 * scaled @ scaled - np.log(u * np.sqrt(2 * np.pi)).sum()
         weight = max((1 - surprise) * prediction.weight, 1e-12)
         terms.append(np.log(weight) + log_density)
-    return Prior(float(np.logaddexp.reduce(terms)), anywhere.spread)
+        spreads.append(prediction.uncertainty)
+    # directions that the data leave open are as uncertain as where the pose most likely comes from
+    return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
 
 
 class Found(NamedTuple):
