@@ -21,9 +21,9 @@ from benchmarks.timing import medians, slope
 from paper.systems import POINTS, pose
 
 from mixpose.density import Observation
-from mixpose.estimation import Track, Tracker, predict
 from mixpose.objective import View
 from mixpose.objective.paper import PaperObjective
+from mixpose.tracking import Track, Tracker, predict
 from mixpose.rigid import transform
 
 

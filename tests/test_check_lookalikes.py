@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
 from mixpose.checking import look_alikes, noise_of, typical_poses, with_image_sizes
-from mixpose.estimation import EstimatorOptions
 from mixpose.extraction import ExtractOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.rigid import Floats, from_parts, from_rotation_vector
 from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session

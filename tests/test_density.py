@@ -6,8 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from mixpose.density import FLOOR, Density, Observation, Window, render, self_overlap
-from mixpose.density.atlas import render_atlas
+from mixpose.density import (
+    FLOOR,
+    Density,
+    Observation,
+    Window,
+    matched_atlas,
+    render,
+    self_overlap,
+)
 from mixpose.density.grid import EXACT_CHANNELS, remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -99,13 +106,11 @@ def test_coordinates_a_thousandth_of_a_step_apart_are_told_apart() -> None:
 @pytest.mark.parametrize("pattern", [points_pattern(), range_points(), range_profile()])
 def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Pattern) -> None:
     observation = Observation(pattern, 2.0)
-    for density in (
-        observation.matched(2.0, observation.extent),
-        observation.density(2.0, observation.extent, gradient=True),
-    ):
-        assert density.values.shape[2] in EXACT_CHANNELS
-        y = np.array([observation.extent[0]])
-        assert density.sample(y).shape == (1, 1 + density.dimension)
+    density = observation.density(2.0, observation.extent, gradient=True)
+    assert density.values.shape[2] in EXACT_CHANNELS
+    y = np.array([observation.extent[0]])
+    assert density.sample(y).shape == (1, 1 + density.dimension)
+    assert matched_atlas([observation], [2.0], 4.0).values.shape[2] in EXACT_CHANNELS
 
 
 def test_more_samples_than_one_map_side_can_hold() -> None:
@@ -144,13 +149,13 @@ def test_gradient_channels_are_the_derivative_of_the_density(pattern: Pattern) -
 def test_matched_density_holds_inner_products_with_a_feature() -> None:
     pattern, sigma = points_pattern(), 4.0
     observation = Observation(pattern, sigma)
-    matched = observation.matched(sigma, (np.zeros(2), np.full(2, 200.0)))
+    matched = matched_atlas([observation], [sigma], 4.0)
     weights = pattern.weights / pattern.weights.sum()
     p = np.array([[80.0, 90.0]])
     away = pattern.points - p
     variance = 2 * sigma**2
     expected = np.sum(weights * np.exp(-0.5 * (away**2).sum(1) / variance) / (2 * np.pi * variance))
-    assert matched.sample(p)[0, 0] == pytest.approx(expected, rel=0.02)
+    assert matched.look_up(p[None, None])[0, 0, 0, 0] == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("count", [20, 300])
@@ -180,29 +185,6 @@ def test_an_empty_pattern_gives_a_density_of_zero() -> None:
 
 def test_opencv_is_new_enough_for_exact_remap() -> None:
     assert int(cv2.__version__.split(".")[0]) >= 5
-
-
-@pytest.mark.parametrize("m", [1, 2])
-def test_tiles_of_a_grid_pattern_are_sums_over_its_points(m: int) -> None:
-    place, sigma, blur, step = np.array([31.3, 24.8])[:m], 4.0, 3.0, 0.8
-    axes = [step * np.arange(80.0), step * np.arange(70.0)][:m]
-    bells = [np.exp(-0.5 * ((a - p) / sigma) ** 2) for a, p in zip(axes, place, strict=True)]
-    values = bells[0][None] if m == 1 else np.outer(bells[1], bells[0])
-    pattern = GridPattern(values.astype(np.float32), np.zeros(m), step)
-    y = place + np.array([[0.0, 0.0], [2.1, -1.3], [-3.3, 4.0]])[:, :m]
-    sampled, second = render_atlas(pattern, blur, y, 3 * blur).sample_all(y)
-    # a Gaussian blurred by a Gaussian is a Gaussian
-    variance = sigma**2 + blur**2
-    away = y - place
-    C = np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2 * np.pi * variance) ** (m / 2)
-    slope = -away * C[:, None] / variance
-    bend = C[:, None, None] * (
-        away[:, :, None] * away[:, None, :] / variance**2 - np.eye(m) / variance
-    )
-    # the centre of a tile is a grid point: only single precision and the cut at 6 sigma are left
-    assert sampled[:, 0] == pytest.approx(C, rel=1e-5)
-    assert sampled[:, 1:] == pytest.approx(slope, abs=1e-5 * C.max())
-    assert second == pytest.approx(bend, abs=1e-5 * C.max())
 
 
 def test_a_profile_that_lies_below_zero_is_empty() -> None:

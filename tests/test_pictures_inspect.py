@@ -16,7 +16,7 @@ import mixpose
 from mixpose.body import Body
 from mixpose.cli import main
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.frames import pair
 from mixpose.objective import View
 from mixpose.pictures.advice import describe

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 import mixpose
 from mixpose import runner
-from mixpose.estimation import Expectation
-from mixpose.estimation.track import Prediction
 from mixpose.extraction import ExtractOptions, extract
 from mixpose.frames import Source
 from mixpose.poses.jsonl import read_poses
@@ -23,6 +21,7 @@ from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
 from mixpose.selection import Selection
 from mixpose.session import Session
+from mixpose.tracking import Expectation, Prediction
 
 Floats = NDArray[np.float64]
 Edit = Callable[[str, int, NDArray[np.uint8]], None]

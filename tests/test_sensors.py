@@ -16,7 +16,6 @@ from mixpose.sensors import (
     PinholeCamera,
     RangeSensor,
     Sensor,
-    moved_against,
 )
 
 K = np.array([[820.0, 0.4, 633.0], [0, 815.0, 507.0], [0, 0, 1]])
@@ -252,7 +251,7 @@ def test_a_sensor_moved_against_a_motion_measures_what_it_would_of_moved_points(
     sensor, points = SENSORS[name], points_in_view(20)
     motion = from_rotation_vector([0.3, -0.2, 0.15], [20.0, 5.0, -40.0])
     expected, seen = sensor.project(transform(motion, points))
-    y, visible = moved_against(sensor, motion).project(points)
+    y, visible = sensor.moved(motion).project(points)
     np.testing.assert_array_equal(visible, seen)
     np.testing.assert_allclose(y, expected, atol=1e-8)
     assert np.abs(expected - sensor.project(points)[0]).max() > 5.0

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import mixpose.session as session_room
 from mixpose.body import PointFeature, SegmentFeature
-from mixpose.estimation import EstimatorOptions
 from mixpose.extraction.options import ExtractOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.rigid import TWIST_NAMES
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import Session, load_session

@@ -51,10 +51,12 @@ TESTS: dict[str, tuple[str, ...]] = {
     "simulation": ("test_simulation_*.py",),
     "checking": ("test_check_*.py",),
     "runner": ("test_runner_*.py",),
-    "density": ("test_density.py",),
+    "density": ("test_density*.py",),
     "objective": ("test_objective*.py",),
     "search": ("test_search_*.py",),
-    "estimation": ("test_estimation*.py", "test_runner_*.py"),
+    "fit": ("test_fit*.py",),
+    "judgement": ("test_judgement.py", "test_tracking*.py"),
+    "tracking": ("test_tracking*.py", "test_runner_*.py"),
 }
 
 # A mutant may make the code go on for ever: then it counts as noticed.

@@ -224,8 +224,8 @@ _RUNNER = (
     Mutant(
         "runner-worse-than-before-convinces",
         "runner.py",
-        "if step.met is not None and step.met.as_good_as(before):",
-        "if step.met is not None:",
+        "if step.convinces and are_as_good(step.track.tallies, track.tallies):",
+        "if step.convinces:",
         "features that left the window are not looked for",
     ),
     Mutant(
@@ -238,8 +238,8 @@ _RUNNER = (
     Mutant(
         "runner-otsu-in-windows",
         "runner.py",
-        'and setup.extract.threshold not in ("otsu", "local")',
-        'and setup.extract.threshold not in ("otsu",)',
+        'and (setup.extract.threshold == "auto" or not isinstance(setup.extract.threshold, str))',
+        'and setup.extract.threshold != "local"',
         "features found by their surroundings change with the window",
     ),
     Mutant(

@@ -177,9 +177,9 @@ _SHAPES = (
 _SADDLES = (
     Mutant(
         "extraction-corners-move-away",
-        "extraction/corners.py",
-        "np.clip(shift, -1, 1)",
-        "np.clip(-shift, -1, 1)",
+        "extraction/quadratic.py",
+        "np.clip(shift / determinant[:, None], -1, 1)",
+        "np.clip(-shift / determinant[:, None], -1, 1)",
         "corners are off by as much again as their first guess",
         (_CORNERS,),
     ),

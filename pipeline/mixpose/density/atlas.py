@@ -215,14 +215,15 @@ def _grid(parts: Sequence[Floats], reach: float, detected: bool) -> _Grid:
     if not len(q):
         return _Grid(np.zeros(2), (3, 3), page)
     lower, upper = q.min(axis=0), q.max(axis=0)
-    is_cut = math.prod(((upper - lower) / page + 4).tolist()) > MAX_PAGES
+    is_cut = math.prod(((upper - lower) / page + 5).tolist()) > MAX_PAGES
     if is_cut:
         middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
         lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
     columns, rows = ((upper - lower + 2 * reach) / page).tolist()
-    # half a cell more, lest rounding puts the outermost place on a page of the rim
-    origin = lower - (reach + page + 0.5)
-    return _Grid(origin, (int(columns) + 4, int(rows) + 4), page, is_cut)
+    # Pages begin at whole ones from sensor coordinates 0, so that a density is the same whatever is
+    # drawn beside it; half a cell is left, lest rounding puts a place on a page of the rim.
+    origin = page * np.floor((lower - (reach + page + 0.5)) / page)
+    return _Grid(origin, (int(columns) + 5, int(rows) + 5), page, is_cut)
 
 
 def _draw_points(

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from mixpose.rigid import from_rotation_vector
 from mixpose.sensors import (
     OUTSIDE,
-    Bank,
     FisheyeCamera,
     ParallelBeam,
     PinholeCamera,
     RangeSensor,
     Sensor,
-    bank,
+    SensorBatch,
+    side_by_side,
 )
-from mixpose.sensors.bank import MixedBank, PinholeBank, RangeBank
+from mixpose.sensors.batch import MixedBatch, PinholeBatch, RangeBatch
 
 Floats = NDArray[np.float64]
 
@@ -52,17 +52,20 @@ def cameras(
     ]  # fmt: skip
 
 
-def assert_as_one_by_one(together: Bank, sensors: Sequence[Sensor], points: Floats) -> None:
+def assert_as_one_by_one(together: SensorBatch, sensors: Sequence[Sensor], points: Floats) -> None:
     y, J, visible = together.linearise(points)
     m = sensors[0].dimension
-    assert y.shape == (len(sensors), len(points), m)
-    assert J.shape == (len(sensors), len(points), m, 3)
+    assert y.shape == (len(sensors), len(points), 2)
+    assert J.shape == (len(sensors), len(points), 2, 3)
+    # sensors of one coordinate have 0 as their second
+    assert not y[visible][:, m:].any()
+    assert not J[..., m:, :].any()
     for k, sensor in enumerate(sensors):
         y_alone, J_alone, visible_alone = sensor.linearise(points)
         np.testing.assert_array_equal(visible[k], visible_alone)
         # the same sums in another order: rounding of numbers up to 1e4, hence 1e-8 at most
-        np.testing.assert_allclose(y[k], y_alone, rtol=1e-11, atol=1e-9)
-        np.testing.assert_allclose(J[k], J_alone, rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(y[k, :, :m], y_alone, rtol=1e-11, atol=1e-9)
+        np.testing.assert_allclose(J[k, :, :m], J_alone, rtol=1e-10, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -79,8 +82,8 @@ def test_pinholes_side_by_side_are_those_one_by_one(
     lenses: tuple[Floats | None, ...], resolution: tuple[int, int] | None
 ) -> None:
     sensors = cameras(*lenses, resolution=resolution)
-    together = bank(sensors)
-    assert isinstance(together, PinholeBank)
+    together = side_by_side(sensors)
+    assert isinstance(together, PinholeBatch)
     visible = together.linearise(POINTS)[2]
     # the comparison is of what is seen and of what is not
     assert visible.any(axis=1).all()
@@ -91,8 +94,8 @@ def test_pinholes_side_by_side_are_those_one_by_one(
 def test_pinholes_that_see_all_points_are_those_one_by_one() -> None:
     near = 0.2 * POINTS[:60]
     sensors = cameras(None, BARREL, RATIONAL)
-    assert bank(sensors).linearise(near)[2].all()
-    assert_as_one_by_one(bank(sensors), sensors, near)
+    assert side_by_side(sensors).linearise(near)[2].all()
+    assert_as_one_by_one(side_by_side(sensors), sensors, near)
 
 
 def test_an_image_of_known_size_beside_one_without_limits() -> None:
@@ -100,8 +103,8 @@ def test_an_image_of_known_size_beside_one_without_limits() -> None:
     R, t = PLACES[0][:3, :3], PLACES[0][:3, 3]
     # about u = 633 + 820 (1 - 0.21) = 1281 px, where the image ends at 1279.5
     beside = (np.array([[900.0, 0.0, 900.0]]) - t) @ R
-    assert bank([bounded, unbounded]).linearise(beside)[2][:, 0].tolist() == [False, True]
-    assert_as_one_by_one(bank([bounded, unbounded]), [bounded, unbounded], POINTS)
+    assert side_by_side([bounded, unbounded]).linearise(beside)[2][:, 0].tolist() == [False, True]
+    assert_as_one_by_one(side_by_side([bounded, unbounded]), [bounded, unbounded], POINTS)
 
 
 def test_a_camera_without_a_lens_sees_wide_angles_beside_one_whose_model_folds_back() -> None:
@@ -109,14 +112,14 @@ def test_a_camera_without_a_lens_sees_wide_angles_beside_one_whose_model_folds_b
     plain = PinholeCamera(K)
     folding = PinholeCamera(K, np.array([-0.3, 0, 0, 0]))
     points = np.array([[1.0, 0, 1.0], [1.1, 0, 1.0], [2.0, 0, 1.0]])
-    visible = bank([plain, folding]).linearise(points)[2]
+    visible = side_by_side([plain, folding]).linearise(points)[2]
     np.testing.assert_array_equal(visible, [[True, True, True], [True, False, False]])
-    assert_as_one_by_one(bank([plain, folding]), [plain, folding], points)
+    assert_as_one_by_one(side_by_side([plain, folding]), [plain, folding], points)
 
 
 def test_the_skew_of_a_camera_matrix_is_in_pixels_and_jacobian() -> None:
     skewed = PinholeCamera(np.array([[800.0, 80.0, 0], [0, 800.0, 0], [0, 0, 1]]))
-    y, J, _ = bank([skewed]).linearise(np.array([[0.0, 0.5, 1.0]]))
+    y, J, _ = side_by_side([skewed]).linearise(np.array([[0.0, 0.5, 1.0]]))
     # u = 800 x/z + 80 y/z: by y it grows by 80
     np.testing.assert_allclose(y[0, 0], [40.0, 400.0])
     np.testing.assert_allclose(J[0, 0], [[800.0, 80.0, -40.0], [0.0, 800.0, -400.0]])
@@ -124,7 +127,7 @@ def test_the_skew_of_a_camera_matrix_is_in_pixels_and_jacobian() -> None:
 
 def test_points_behind_cameras_side_by_side_are_outside_and_without_pull() -> None:
     sensors = [PinholeCamera(K), PinholeCamera(K, BARREL)]
-    y, J, visible = bank(sensors).linearise(np.array([[10.0, 5.0, -800.0], [0.0, 0.0, 800.0]]))
+    y, J, visible = side_by_side(sensors).linearise(np.array([[10.0, 5.0, -800.0], [0.0, 0.0, 800.0]]))
     np.testing.assert_array_equal(visible, [[False, True], [False, True]])
     assert (y[:, 0] == OUTSIDE).all()
     assert (J[:, 0] == 0).all()
@@ -132,8 +135,8 @@ def test_points_behind_cameras_side_by_side_are_outside_and_without_pull() -> No
 
 def test_tilted_cameras_side_by_side_keep_a_tilt_each() -> None:
     sensors = cameras(*TILTS)
-    together = bank(sensors)
-    assert isinstance(together, MixedBank)
+    together = side_by_side(sensors)
+    assert isinstance(together, MixedBatch)
     assert_as_one_by_one(together, sensors, POINTS)
     one_tilt = PinholeCamera(K, TILTS[0], (1280, 1024), PLACES[1])
     y = together.linearise(0.2 * POINTS[:60])[0]
@@ -147,8 +150,8 @@ def test_ranges_with_biases_and_limits_side_by_side_are_those_one_by_one() -> No
         RangeSensor(np.array([800.0, 0.0, 0.0]), -12.0, (600.0, 1500.0)),
         RangeSensor(np.array([0.0, 100.0, 900.0])),
     ]
-    together = bank(sensors)
-    assert isinstance(together, RangeBank)
+    together = side_by_side(sensors)
+    assert isinstance(together, RangeBatch)
     visible = together.linearise(POINTS)[2]
     assert visible[[0, 2]].all()
     assert 0 < visible[1].sum() < len(POINTS)
@@ -157,7 +160,7 @@ def test_ranges_with_biases_and_limits_side_by_side_are_those_one_by_one() -> No
 
 def test_a_bias_makes_every_range_longer_by_itself() -> None:
     sensors = [RangeSensor(np.zeros(3), bias, (0.0, 10.0)) for bias in (0.25, -0.5)]
-    y, J, visible = bank(sensors).linearise(np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0]]))
+    y, J, visible = side_by_side(sensors).linearise(np.array([[3.0, 4.0, 0.0], [30.0, 40.0, 0.0]]))
     np.testing.assert_allclose(y[:, 0, 0], [5.25, 4.5])
     np.testing.assert_allclose(J[:, 0, 0], [[0.6, 0.8, 0.0]] * 2)
     np.testing.assert_array_equal(visible, [[True, False]] * 2)
@@ -166,9 +169,9 @@ def test_a_bias_makes_every_range_longer_by_itself() -> None:
 
 
 def test_a_point_at_the_very_place_of_a_range_sensor_has_a_finite_jacobian() -> None:
-    y, J, visible = bank([RangeSensor(np.ones(3))]).linearise(np.ones((1, 3)))
-    assert y.tolist() == [[[0.0]]]
-    assert J.tolist() == [[[[0.0, 0.0, 0.0]]]]
+    y, J, visible = side_by_side([RangeSensor(np.ones(3))]).linearise(np.ones((1, 3)))
+    assert y.tolist() == [[[0.0, 0.0]]]
+    assert J.tolist() == [[[[0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]]]
     assert visible.all()
 
 
@@ -178,8 +181,8 @@ def test_cameras_of_all_kinds_side_by_side_are_those_one_by_one() -> None:
         FisheyeCamera(K / 1.5, np.array([0.05, -0.01, 2e-3, -3e-4]), (1280, 1024), PLACES[2]),
         ParallelBeam(0.5, np.array([640.0, 512.0]), (1280, 1024), PLACES[1]),
     ]
-    together = bank(sensors)
-    assert isinstance(together, MixedBank)
+    together = side_by_side(sensors)
+    assert isinstance(together, MixedBatch)
     visible = together.linearise(POINTS)[2]
     assert visible.any(axis=1).all()
     assert not visible.all(axis=1).any()

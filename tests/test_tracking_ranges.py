@@ -11,8 +11,7 @@ from scipy.special import chdtri
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions, Tracker
-from mixpose.estimation.labelling import _summed, are_labelled, label
+from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
@@ -23,6 +22,12 @@ from mixpose.rigid import (
     twist_between,
 )
 from mixpose.sensors import RangeSensor
+from mixpose.tracking import Tracker
+from mixpose.tracking.association_likelihood import (
+    _summed,
+    are_associated,
+    sum_associations,
+)
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +91,7 @@ def sum_by_hand(odds: Floats, used: frozenset[int] = frozenset()) -> float:
     return sum_by_hand(rest, used) + met
 
 
-def test_the_sum_over_labellings_is_that_of_all_of_them() -> None:
+def test_the_sum_over_associations_is_that_of_all_of_them() -> None:
     odds = 5 * np.random.default_rng(0).random((2, 3, 4))
     total, shares = _summed(odds)
     assert total == pytest.approx([sum_by_hand(one) for one in odds], rel=1e-12)
@@ -101,16 +106,18 @@ def test_the_gradient_of_the_likelihood_is_its_slope() -> None:
     T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
     views = views_at(T, np.random.default_rng(1))
     steps = 1e-5 * np.eye(6)
-    ahead, behind = (label(views, TROLLEY, perturb(T, s)).log_odds for s in (steps, -steps))
-    gradient = label(views, TROLLEY, T[None]).gradient[0]
+    ahead, behind = (
+        sum_associations(views, TROLLEY, perturb(T, s)).log_odds for s in (steps, -steps)
+    )
+    gradient = sum_associations(views, TROLLEY, T[None]).gradient[0]
     assert gradient == pytest.approx((ahead - behind) / 2e-5, rel=1e-5, abs=1e-5)
 
 
 def test_bodies_of_many_features_and_images_keep_the_matched_objective() -> None:
     views = views_at(np.eye(4), np.random.default_rng(2))
-    assert are_labelled(views, TROLLEY)
+    assert are_associated(views, TROLLEY)
     many = Body("many", tuple(PointFeature(x) for x in np.random.default_rng(0).random((9, 3))))
-    assert not are_labelled(views, many)
+    assert not are_associated(views, many)
 
 
 def test_one_frame_leaves_the_turn_open_and_says_so() -> None:
@@ -120,7 +127,7 @@ def test_one_frame_leaves_the_turn_open_and_says_so() -> None:
     _, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
     assert estimate.status == "ambiguous"
     assert estimate.covariance is not None
-    # labels known, ranges of 8 cm give 5.0 degrees; not known, never less
+    # associations known, ranges of 8 cm give 5.0 degrees; not known, never less
     assert np.sqrt(estimate.covariance[5, 5]) > np.radians(5.0)
 
 

@@ -9,14 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions, Tracker, fit_near
-from mixpose.estimation.assessment import assess
-from mixpose.estimation.local import FINE
-from mixpose.estimation.sharpening import agreed, bent, sharpened
-from mixpose.objective import View
+from mixpose.fit import EstimatorOptions, fit_near
+from mixpose.fit.near import SHARP
+from mixpose.judgement import Judged, judge
+from mixpose.objective import View, matched_objective
+from mixpose.optimise import ascend
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Rules, Tracker
+from mixpose.tracking.outliers import has_outlier, step_without_loosest
 
 Floats = NDArray[np.float64]
 
@@ -47,6 +49,11 @@ def view_of(points: Floats) -> View:
     return View("camera", CAMERA, Observation(PointPattern(points, np.ones(len(points))), SIGMA))
 
 
+def judged_at(T_world_object: Floats, views: list[View]) -> Judged:
+    objective = matched_objective(views, BODY, [SIGMA] * len(views))
+    return judge(objective, T_world_object, np.ones(6, dtype=np.bool_))
+
+
 def estimated(points: Floats, T_start: Floats) -> Estimate:
     tracker = Tracker.create(BODY, EstimatorOptions(), T_start)
     return tracker.advance(tracker.begin(), 0, 0.0, [view_of(points)])[1]
@@ -70,19 +77,17 @@ def test_a_pair_counts_as_one_feature_and_its_middle_is_met() -> None:
     T = in_line(1, 2, 3.0)
     y = seen(T)
     merged = np.vstack([np.delete(y, [1, 2], axis=0), y[1:3].mean(axis=0)])
-    free = np.ones(6, dtype=np.bool_)
-    (meeting,) = assess([view_of(merged)], BODY, T, free).meetings
-    assert meeting.pairs == 1
-    assert meeting.met == pytest.approx(5.0)
-    assert meeting.squared.max() < 1e-6
+    (association,) = judged_at(T, [view_of(merged)]).associations
+    assert association.merged == 1
+    assert association.met == pytest.approx(5.0)
+    assert association.squared.max() < 1e-6
 
 
 def test_a_hidden_feature_beside_a_seen_one_is_no_pair() -> None:
     T = in_line(1, 2, 3.0)
-    free = np.ones(6, dtype=np.bool_)
-    (meeting,) = assess([view_of(np.delete(seen(T), 1, axis=0))], BODY, T, free).meetings
-    assert meeting.pairs == 0
-    assert meeting.met == pytest.approx(5.0)
+    (association,) = judged_at(T, [view_of(np.delete(seen(T), 1, axis=0))]).associations
+    assert association.merged == 0
+    assert association.met == pytest.approx(5.0)
 
 
 def test_a_closer_look_is_hardly_bent_by_a_false_detection_beside_a_hidden_feature(
@@ -98,11 +103,12 @@ def test_a_closer_look_is_hardly_bent_by_a_false_detection_beside_a_hidden_featu
     tracker = Tracker.create(BODY, EstimatorOptions(), T)
     u, samples = tracker.start_uncertainty, tracker.samples
     T_bent = fit_near(views, BODY, T, u, tracker.options, samples).T_world_object
-    meetings = assess(views, BODY, T_bent, tracker.free).meetings
-    assert bent(meetings)
-    T_begin = perturb(T_bent, agreed(meetings, tracker.free))
+    bent = judged_at(T_bent, views)
+    rules = Rules().proposals
+    assert has_outlier(bent, rules)
+    T_begin = perturb(T_bent, step_without_loosest(bent.associations, tracker.free, rules))
     # eleven of twelve are exact: without the twelfth they agree on the truth
     assert rotation_angle_deg(T_begin, T) < 1e-3
-    T_sharp = sharpened(views, BODY, T_begin, tracker.free, FINE)
-    assert T_sharp is not None
+    narrow = matched_objective(views, BODY, [rules.narrow * SIGMA] * 2, T_begin)
+    T_sharp = ascend(narrow.linearise, perturb, T_begin, tracker.free, SHARP).state
     assert rotation_angle_deg(T_sharp, T) < 0.3 * rotation_angle_deg(T_bent, T)

@@ -5,22 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.estimation import EstimatorOptions, Tracker
+from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import Floats, from_parts, perturb, rotation_angle_deg, transform
-from mixpose.sensors import (
-    FisheyeCamera,
-    ParallelBeam,
-    PinholeCamera,
-    RangeSensor,
-    Sensor,
-    moved_against,
-)
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Tracker
 
 K = np.array([[900.0, 0, 320], [0, 900, 240], [0, 0, 1]])
 MARKERS = np.array(
@@ -83,20 +76,3 @@ def test_clocks_that_have_nothing_in_common_are_not_believed() -> None:
         views[1] = replace(views[0], name="other clock", delay=1.6e9)
         track, estimate = tracker.advance(track, number, number * INTERVAL, views)
     assert estimate.status == "ok"
-
-
-@pytest.mark.parametrize(
-    "sensor",
-    [
-        PinholeCamera(K, np.zeros(0), (640, 480), FRONT),
-        FisheyeCamera(K, np.zeros(4), (640, 480), FRONT),
-        ParallelBeam(0.5, np.array([320.0, 240.0]), (640, 480), FRONT),
-        RangeSensor(np.array([100.0, -900, 30]), range_bias=2.0),
-    ],
-    ids=lambda sensor: type(sensor).__name__,
-)
-def test_a_sensor_moved_against_a_motion_sees_what_moved(sensor: Sensor) -> None:
-    motion = perturb(np.eye(4), np.array([3.0, -2.0, 5.0, 0.02, -0.05, 0.03]))
-    seen_moved, _ = moved_against(sensor, motion).project(MARKERS)
-    moved_seen, _ = sensor.project(transform(motion, MARKERS))
-    np.testing.assert_allclose(seen_moved, moved_seen, rtol=1e-12, atol=1e-9)

@@ -1,0 +1,268 @@
+"""Densities drawn as pages of one image and looked up by cv2.remap, against sums of Gaussians."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mixpose.density import Atlas, draw
+from mixpose.density.atlas import MAX_PAGES, REACH
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.records import GridPattern, PointPattern
+
+Floats = NDArray[np.float64]
+
+SIGMA = 2.0
+"""Of the blur that is drawn: √2 σ_ε in the matched objective."""
+
+CUT = math.exp(-(REACH**2) / 2)
+"""Share of its peak at which a Gaussian may end, where its pages end."""
+
+
+def looked_up(atlas: Atlas, y: Floats, sensor: int = 0) -> tuple[Floats, Floats]:
+    """Densities (n,) and gradients (n, m) at places (n, m) of one sensor."""
+    padded = np.zeros((len(atlas.per_unit), 1, len(y), 2))
+    padded[sensor, 0, :, : y.shape[1]] = y
+    found = atlas.look_up(padded)[sensor, 0]
+    return found[:, 0], found[:, 1 : 1 + y.shape[1]]
+
+
+def exact(points: Floats, y: Floats, sigma: float = SIGMA) -> tuple[Floats, Floats]:
+    """The same of equal Gaussians about points (M, m), in closed form."""
+    away = points - y[:, None]
+    bells = np.exp(-0.5 * (away**2).sum(axis=2) / sigma**2)
+    bells /= len(points) * (2 * np.pi * sigma**2) ** (y.shape[1] / 2)
+    return bells.sum(axis=1), (bells[..., None] * away).sum(axis=1) / sigma**2
+
+
+def peak(count: int, m: int = 2, sigma: float = SIGMA) -> float:
+    return float((2 * np.pi * sigma**2) ** (-m / 2) / count)
+
+
+def points_only(points: Floats, steps: float, sigma: float = SIGMA) -> Atlas:
+    return draw([PointPattern(points, np.ones(len(points)))], [sigma], steps, [None])
+
+
+def far_apart(seed: int, side: int = 10) -> Floats:
+    """Places 20 standard deviations apart, anywhere within a cell."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(20 * SIGMA * np.arange(side), 20 * SIGMA * np.arange(side))
+    return np.stack([u.ravel(), v.ravel()], axis=1) + rng.uniform(0, SIGMA, (side**2, 2))
+
+
+def cubic_term(steps: float) -> float:
+    """By how much linear look-up may move the zero of the gradient of a Gaussian, in σ.
+
+    Between two cells h apart, a share t of the way, linear interpolation of f errs by
+    −h² t (1−t) f''/2 − h³ t (1−t)(1−2t) f'''/6.  At the peak f'' of the gradient is 0, f''' is
+    3 C/σ⁴, and a gradient error e moves its zero by e σ²/C; t (1−t)(1−2t) is at most √3/18.
+    """
+    return math.sqrt(3) / 36 / steps**3
+
+
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, 4.0, FINE_STEPS])
+def test_gradients_of_features_apart_are_zero_where_the_detections_are(steps: float) -> None:
+    points = far_apart(1)
+    atlas = points_only(points, steps)
+    value, gradient = looked_up(atlas, points)
+    off = np.linalg.norm(SIGMA * gradient / value[:, None], axis=1)
+    # along two axes; a twentieth for what follows the cubic term; coordinates of an array of at
+    # most 32000 rows are rounded to 2⁻¹⁰ cells
+    assert off.max() < 1.05 * math.sqrt(2) * cubic_term(steps) + 2**-10 / steps
+    # and no systematic shift: 200 numbers that are as likely to either side
+    assert np.abs((SIGMA * gradient / value[:, None]).mean()) < cubic_term(steps) / 4
+
+
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+@pytest.mark.parametrize("apart", [2.0, 3.0, 4.0, 5.0, 6.0])
+def test_gradients_of_pairs_are_those_of_two_gaussians(apart: float, steps: float) -> None:
+    # features of σ_ε = SIGMA / √2, 2 to 6 σ_ε apart, looked up within σ_ε of either
+    rng = np.random.default_rng(2)
+    first = far_apart(2)
+    turns = rng.uniform(0, 2 * np.pi, len(first))
+    towards = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    points = np.concatenate([first, first + apart * SIGMA / math.sqrt(2) * towards])
+    y = points + rng.uniform(-0.5, 0.5, points.shape) * SIGMA
+    value, gradient = looked_up(points_only(points, steps), y)
+    expected_value, expected = exact(points, y)
+    top = peak(len(points))
+    # h²/2 (t (1−t) − 1/6) of the second derivative, which is at most 1.38 C/σ³ along the gradient
+    # and 0.61 C/σ³ across, of either; less than 3 σ away the other one may be cut off
+    linear = 2 * (1.38 + 0.61) / 12 / steps**2 + 2 * cubic_term(steps)
+    assert np.abs(gradient - expected).max() < (linear + REACH * CUT) * top / SIGMA
+    # the same of the value: its curvature is at most C/σ² along each axis
+    assert np.abs(value - expected_value).max() < (2 * 2 / 12 / steps**2 + CUT) * top
+
+
+@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+def test_values_err_by_the_curvature_within_a_cell(steps: float, m: int) -> None:
+    rng = np.random.default_rng(3)
+    points = far_apart(3)[:, :m] if m == 2 else 20 * SIGMA * rng.permutation(30)[:, None]
+    y = np.repeat(points, 20, axis=0)
+    y = y + rng.uniform(-2.9, 2.9, y.shape) * SIGMA
+    value, gradient = looked_up(points_only(points, steps), y)
+    expected_value, expected = exact(points, y)
+    # between cells h apart a value errs by h²/2 (t (1−t) − 1/6) C'', at most h²/12, of which the
+    # average is drawn narrower; 2 % for the fourth derivative; single precision
+    assert np.abs(value - expected_value).max() < 1.02 * m / 12 / steps**2 * peak(len(points), m)
+    top_slope = peak(len(points), m) / SIGMA
+    assert np.abs(gradient - expected).max() < 1.05 * (1.38 + 0.61 * (m - 1)) / 12 / steps**2 * (
+        top_slope
+    ) + 2 * cubic_term(steps) * top_slope
+
+
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+@pytest.mark.parametrize("m", [1, 2])
+def test_a_drawn_density_integrates_to_one(steps: float, m: int) -> None:
+    points = np.random.default_rng(4).uniform(0, 12 * SIGMA, (9, m))
+    h = SIGMA / steps / 2.5
+    axes = [np.arange(-8 * SIGMA, 20 * SIGMA, h)] * m
+    y = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, m)
+    integral = looked_up(points_only(points, steps), y)[0].sum() * h**m
+    # a square of three standard deviations to either side holds 0.9973 along each axis
+    assert 0.9973**m - 1e-4 < integral < 1 + 1e-4
+
+
+def grey_values() -> GridPattern:
+    v, u = np.mgrid[:60, :80]
+    spots = [(20.3, 25.7), (47.1, 33.4), (55.6, 12.2)]
+    image = sum(np.exp(-0.5 * ((u - a) ** 2 + (v - b) ** 2) / 1.5**2) for a, b in spots)
+    return GridPattern(np.asarray(image, dtype=np.float32), np.array([100.0, 50.0]), 1.0)
+
+
+def test_grey_values_are_sums_over_pixels() -> None:
+    pattern = grey_values()
+    v, u = np.mgrid[:60, :80]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1) + pattern.origin
+    weights = pattern.values.ravel() / pattern.values.sum(dtype=np.float64)
+    y = np.random.default_rng(5).uniform(pattern.origin, pattern.origin + [79, 59], (500, 2))
+    squared = ((pixels - y[:, None]) ** 2).sum(axis=2)
+    expected = np.exp(-0.5 * squared / SIGMA**2) @ weights / (2 * np.pi * SIGMA**2)
+    everywhere = draw([pattern], [SIGMA], FINE_STEPS, [None])
+    value, gradient = looked_up(everywhere, y)
+    # spots of standard deviation 1.5 blurred by 2 bend less than the blur alone
+    assert np.abs(value - expected).max() < 2 / 12 / FINE_STEPS**2 * expected.max()
+    # drawn around some places only, it is the same there
+    near = draw([pattern], [SIGMA], FINE_STEPS, [y[:5]])
+    # cells begin elsewhere
+    bend = 2 * 2 / 12 / FINE_STEPS**2 * expected.max()
+    np.testing.assert_allclose(looked_up(near, y[:5])[0], value[:5], atol=bend)
+    assert near.values.size < everywhere.values.size
+    assert np.abs(gradient).max() > 0
+
+
+def test_grey_values_drawn_close_to_places_have_their_gradients_to_the_last_digits() -> None:
+    sigma, blur, step = 4.0, 3.0, 0.8
+    for m in (1, 2):
+        place = np.array([31.3, 24.8])[:m]
+        axes = [step * np.arange(80.0), step * np.arange(70.0)][:m]
+        bells = [np.exp(-0.5 * ((a - p) / sigma) ** 2) for a, p in zip(axes, place, strict=True)]
+        values = bells[0][None] if m == 1 else np.outer(bells[1], bells[0])
+        pattern = GridPattern(values.astype(np.float32), np.zeros(m), step)
+        y = place + np.array([[0.0, 0.0], [2.1, -1.3], [-3.3, 4.0]])[:, :m]
+        atlas = draw([pattern], [blur], 256.0, [y], 0.0625)
+        # a Gaussian blurred by a Gaussian is a Gaussian
+        both = math.hypot(sigma, blur)
+        C, slope = exact(place[None], y, both)
+        value, gradient = looked_up(atlas, y)
+        # 256 cells per standard deviation: single precision and the cut at 6 sigma are left
+        np.testing.assert_allclose(value, C, rtol=2e-5)
+        np.testing.assert_allclose(gradient, slope, atol=2e-5 * C.max())
+
+
+def test_pages_join_without_a_seam() -> None:
+    points = far_apart(6, side=4)
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    step = SIGMA / STEPS_PER_SIGMA
+    borders = (atlas.origin[0] + atlas.page * np.arange(1, atlas.shape[0])) * step
+    beside = 1e-4 * step
+    crossed = 0
+    for x in borders:
+        near = points[np.abs(points[:, 0] - x) < 2 * SIGMA]
+        left, right = (near.copy() for _ in range(2))
+        left[:, 0], right[:, 0] = x - beside, x + beside
+        crossed += len(near)
+        (a, da), (b, db) = looked_up(atlas, left), looked_up(atlas, right)
+        # on either side of a border, 2e-4 of a cell apart, a value changes by its slope and no
+        # more; coordinates in an array of some hundred rows are rounded to 2e-5 cells
+        top = peak(len(points))
+        assert np.abs(a - b).max(initial=0.0) < 4 * beside / SIGMA * top
+        assert np.abs(da - db).max(initial=0.0) < 8 * beside / SIGMA * top / SIGMA
+    assert crossed > 2
+
+
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+@pytest.mark.parametrize("m", [1, 2])
+def test_a_detection_counts_once_wherever_the_origin_is(m: int, steps: float) -> None:
+    rng = np.random.default_rng(7)
+    for scale in (0.1, 1.0, 10.0, 1000.0):
+        for _ in range(20):
+            point = rng.normal(0, scale, (1, m))
+            value, _ = looked_up(points_only(point, steps), point)
+            # where rounding puts it on two pages that are one, it is twice as high
+            assert value[0] == pytest.approx(peak(1, m), rel=m / 6 / steps**2)
+
+
+def test_ranges_and_images_lie_in_one_atlas_as_each_alone() -> None:
+    rng = np.random.default_rng(8)
+    image = PointPattern(rng.uniform(0, 600, (6, 2)), np.ones(6))
+    ranges = PointPattern(rng.uniform(3, 9, (4, 1)), rng.uniform(1, 2, 4))
+    profile = GridPattern(rng.uniform(0, 1, (1, 200)).astype(np.float32), np.array([900.0]), 0.5)
+    patterns, sigmas = [image, ranges, profile, grey_values()], [2.0, 0.3, 3.0, 2.0]
+    together = draw(patterns, sigmas, STEPS_PER_SIGMA, [None] * 4)
+    places = [
+        image.points + rng.normal(0, 1, (6, 2)),
+        np.repeat(ranges.points, 2, axis=0) + rng.normal(0, 0.3, (8, 1)),
+        rng.uniform(900, 1000, (7, 1)),
+        rng.uniform((100, 50), (179, 109), (9, 2)),
+    ]
+    for k, (pattern, sigma, y) in enumerate(zip(patterns, sigmas, places, strict=True)):
+        alone = draw([pattern], [sigma], STEPS_PER_SIGMA, [None])
+        value, gradient = looked_up(together, y, k)
+        expected, expected_gradient = looked_up(alone, y)
+        # cells begin elsewhere: both err by up to 1/12 n² of the curvature, of m axes
+        top = expected.max()
+        assert np.abs(value - expected).max() < 2 * 2 / 12 / STEPS_PER_SIGMA**2 * top
+        bend = 2 * (1.38 + 0.61) / 12 / STEPS_PER_SIGMA**2 + 4 * cubic_term(STEPS_PER_SIGMA)
+        assert np.abs(gradient - expected_gradient).max() < bend * top / sigma
+        # where the one-dimensional ones have a second coordinate, it does not pull
+        padded = np.zeros((4, 1, len(y), 2))
+        padded[k, 0, :, : y.shape[1]] = y
+        if y.shape[1] == 1:
+            assert not together.look_up(padded)[k, 0, :, 2].any()
+
+
+def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> None:
+    rng = np.random.default_rng(9)
+    near = rng.uniform(100, 500, (8, 2))
+    alone = points_only(near, STEPS_PER_SIGMA)
+    expected = looked_up(alone, near)[0] * 8 / 9
+    for far in ([1e7, 200.0], [-1e7, 1e7], [300.0, 1e12]):
+        points = np.concatenate([near, [far]])
+        atlas = points_only(points, STEPS_PER_SIGMA)
+        value, _ = looked_up(atlas, near)
+        # cells begin elsewhere: 1/12 n² along two axes, each
+        np.testing.assert_allclose(value, expected, rtol=4 / 12 / STEPS_PER_SIGMA**2)
+        assert len(atlas.table) < 1.1 * MAX_PAGES
+        assert atlas.values.nbytes < 1e6
+    several = rng.uniform(-1e7, 1e7, (20, 2))
+    assert points_only(several, STEPS_PER_SIGMA).values.nbytes < 1e6
+
+
+def test_where_nothing_is_drawn_the_density_is_zero() -> None:
+    atlas = points_only(far_apart(10, side=3), STEPS_PER_SIGMA)
+    outside = np.array([[-1e6, -1e6], [1e12, 3.0], [300.0, 300.0], [10 * SIGMA, 10 * SIGMA]])
+    value, gradient = looked_up(atlas, outside)
+    assert not value.any()
+    assert not gradient.any()
+
+
+def test_no_detection_near_the_predicted_features_is_an_empty_density() -> None:
+    points = np.array([[100.0, 100.0]])
+    pattern = PointPattern(points, np.ones(1))
+    atlas = draw([pattern], [SIGMA], STEPS_PER_SIGMA, [np.array([[5000.0, 5000.0]])])
+    assert not looked_up(atlas, points)[0].any()

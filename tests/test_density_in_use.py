@@ -1,0 +1,138 @@
+"""What runs look up, and what pictures show, are densities drawn as images, through cv2.remap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import mixpose
+from mixpose.density import Atlas, observation
+from mixpose.objective import View, project_body
+from mixpose.pictures.stages import densities_picture
+from mixpose.records import Estimate, FrameSet
+from mixpose.runner import run
+from mixpose.selection import Selection
+
+Floats = NDArray[np.float64]
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+RECORDINGS = ["two_cameras", "one_camera_video", "parallel_beams", "range_profiles"]
+FRAMES = 4
+
+
+@dataclass
+class Spy:
+    """Atlases that were drawn, and arrays and maps that cv2.remap was called with."""
+
+    drawn: list[Atlas] = field(default_factory=list)
+    calls: list[tuple[Any, Any, Any]] = field(default_factory=list)
+
+    def forget(self) -> None:
+        self.drawn.clear()
+        self.calls.clear()
+
+    def places_in(self, atlas: Atlas) -> list[Floats]:
+        """Maps (n, 2) of the look-ups in an atlas."""
+        return [
+            np.stack([np.ravel(u), np.ravel(v)], axis=1)
+            for values, u, v in self.calls
+            if values is atlas.values
+        ]
+
+
+@pytest.fixture
+def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
+    found = Spy()
+    remap, draw = cv2.remap, observation.draw
+
+    def recorded(values: Any, u: Any, v: Any, *others: Any, **named: Any) -> Any:
+        found.calls.append((values, np.array(u), np.array(v)))
+        return remap(values, u, v, *others, **named)
+
+    def drawn(*arguments: Any, **named: Any) -> Atlas:
+        atlas = draw(*arguments, **named)
+        found.drawn.append(atlas)
+        return atlas
+
+    monkeypatch.setattr("mixpose.density.grid.cv2.remap", recorded)
+    monkeypatch.setattr(observation, "draw", drawn)
+    return found
+
+
+def predicted(views: Sequence[View], body: mixpose.Body, T: Floats) -> Floats:
+    """Places (L, 1, n, 2) of the body's features at a pose."""
+    return project_body(tuple(view.sensor for view in views), body).project(T[None]).y
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_every_pose_is_looked_up_in_drawn_densities_by_remap(name: str, spy: Spy) -> None:
+    session = mixpose.load_session(SYNTHETIC / name / "session.toml")
+    assert session.estimator.objective == "matched"  # as by default
+    looked_up = []
+
+    def watch(frame: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        assert estimate.T_world_object is not None
+        at_pose, around = 0, 0
+        y = predicted(views, session.body, estimate.T_world_object)
+        drawn = list(spy.drawn)
+        for atlas in drawn:
+            if len(atlas.per_unit) != len(views):
+                continue
+            calls = spy.places_in(atlas)
+            before = len(spy.calls)
+            atlas.look_up(y)
+            maps = np.stack([np.ravel(each) for each in spy.calls[before][1:]], axis=1)
+            del spy.calls[before:]
+            around += len(calls)
+            at_pose += sum(np.array_equal(one, maps) for one in calls)
+        looked_up.append((at_pose, around))
+        spy.forget()
+
+    estimates = list(run(session, selection=Selection(0, FRAMES), watch=watch))
+    assert [one.status for one in estimates] == ["ok"] * FRAMES
+    # of each frame: where its pose puts the features, once at least, and on the way to it
+    assert len(looked_up) == FRAMES
+    for at_pose, around in looked_up:
+        assert at_pose >= 1
+        assert around >= 3
+
+
+@pytest.mark.parametrize("name", ["two_cameras", "one_camera_video", "parallel_beams"])
+def test_pictures_of_densities_show_what_the_estimate_looked_up(name: str, spy: Spy) -> None:
+    session = mixpose.load_session(SYNTHETIC / name / "session.toml")
+    seen: list[tuple[list[View], Floats, list[Atlas]]] = []
+
+    def watch(frame: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        assert estimate.T_world_object is not None
+        seen.append((list(views), estimate.T_world_object, list(spy.drawn)))
+
+    list(run(session, selection=Selection(0, 1), watch=watch))
+    ((views, T, drawn),) = seen
+    for k, view in enumerate(views):
+        y = predicted(views, session.body, T)
+        spy.forget()
+        sigma = view.observation.sigma
+        densities_picture(view, session.body, T, [sigma], (400, 300), 1)
+        (shown,) = spy.drawn
+        assert isinstance(shown, Atlas)
+        assert spy.places_in(shown), "what is shown is looked up, too"
+        # those of the estimate that are as fine
+        alike = [
+            atlas
+            for atlas in drawn
+            if len(atlas.per_unit) == len(views)
+            and np.array_equal(atlas.per_unit[k], shown.per_unit[0])
+        ]
+        assert alike
+        expected = alike[-1].look_up(y)[k]
+        values = shown.look_up(y[k : k + 1])[0]
+        assert values[..., 0].max() > 0
+        # single precision: of places of up to 40 cells, and of products of three numbers
+        np.testing.assert_allclose(values, expected, rtol=2e-5, atol=2e-5 * expected.max())

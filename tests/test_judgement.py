@@ -1,0 +1,41 @@
+"""What a pose is worth: features met, covariance, evidence, and what is believed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detections import ALL_FREE, EIGHT, TRUTH, detect
+
+from mixpose.body import Body, PointFeature
+from mixpose.judgement import expected_covariance, judge
+from mixpose.objective import matched_objective
+from mixpose.sensors import PinholeCamera
+
+
+def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
+    pinhole_cameras: list[PinholeCamera]
+) -> None:
+    camera = replace(pinhole_cameras[0], T_sensor_world=np.eye(4))
+    one_point = Body(
+        "far", tuple(PointFeature(np.array([0.0, 0.0, z])) for z in (900.0, 1000.0, 1200.0))
+    )
+    covariance, counts = expected_covariance([camera], [1.0], one_point, np.eye(4), ALL_FREE)
+    assert counts == [3]
+    # points on the optical axis: no motion along it and no turn about it can be seen
+    assert np.isinf(covariance[2, 2])
+    assert np.isinf(covariance[5, 5])
+    full, _ = expected_covariance(pinhole_cameras, [1.0, 1.0], EIGHT, TRUTH, ALL_FREE)
+    assert np.isfinite(full).all()
+
+
+def test_judgement_tells_hidden_from_met(pinhole_cameras: list[PinholeCamera]) -> None:
+    views = detect(pinhole_cameras, EIGHT, TRUTH, hidden=2, false=2)
+    judged = judge(matched_objective(views, EIGHT, [1.5, 1.5]), TRUTH, ALL_FREE)
+    assert judged.measurements == pytest.approx(24, abs=0.4)
+    assert judged.coverage == pytest.approx(6 / 8, abs=0.02)
+    for report in judged.sensors.values():
+        # six of eight features met, six of eight detections explained: (6/8)²
+        assert report.explained == pytest.approx((6 / 8) ** 2, abs=0.02)
+        assert report.rms == pytest.approx(0.0, abs=0.05)
