@@ -8,13 +8,11 @@ a descent of their own.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import uniforms
 from mixpose.fit import blur_schedule
 from mixpose.judgement import Judged
 from mixpose.objective import matched_objective
@@ -63,13 +61,6 @@ def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list
 
 
 def _twists(uncertainty: Floats, count: int, seed: int) -> Floats:
-    """Quasi-random twists (n, 6), uniform within √3 standard deviations each way."""
-    return np.asarray((2 * _cube(count, seed) - 1) * np.sqrt(3) * uncertainty)
-
-
-@lru_cache(maxsize=4)
-def _cube(count: int, seed: int) -> Floats:
-    """Quasi-random points (n, 6) of the unit cube; they take longer than what is done with them."""
-    first = uniforms(count, sampler="low-discrepancy", seed=seed)
-    second = uniforms(count, sampler="low-discrepancy", seed=seed + 1)
-    return np.concatenate([first[:, :3], second[:, :3]], axis=1)
+    """Random twists (n, 6), uniform within √3 standard deviations each way."""
+    cube = np.random.default_rng(seed).random((count, 6))
+    return np.asarray((2 * cube - 1) * np.sqrt(3) * uncertainty)
