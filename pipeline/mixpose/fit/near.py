@@ -34,8 +34,8 @@ def _value_error(steps_per_sigma: float) -> float:
 
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_value_error(STEPS_PER_SIGMA))
-# after a step that gains 3e-5, 0.008 σ long, 1e-4 σ are left to go
-SHARP = NewtonOptions(iterations=40, tolerance=3e-5, value_error=_value_error(STEPS_PER_SIGMA))
+# after a step that gains 1e-6, 0.002 σ long, a twentieth of it is left to go: residuals draw it
+SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=_value_error(STEPS_PER_SIGMA))
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_value_error(FINE_STEPS))
 
 
