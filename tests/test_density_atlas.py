@@ -110,9 +110,11 @@ def test_values_err_by_the_curvature_within_a_cell(steps: float, m: int) -> None
     # average is drawn narrower; 2 % for the fourth derivative; single precision
     assert np.abs(value - expected_value).max() < 1.02 * m / 12 / steps**2 * peak(len(points), m)
     top_slope = peak(len(points), m) / SIGMA
-    assert np.abs(gradient - expected).max() < 1.05 * (1.38 + 0.61 * (m - 1)) / 12 / steps**2 * (
-        top_slope
-    ) + 2 * cubic_term(steps) * top_slope
+    assert (
+        np.abs(gradient - expected).max()
+        < 1.05 * (1.38 + 0.61 * (m - 1)) / 12 / steps**2 * (top_slope)
+        + 2 * cubic_term(steps) * top_slope
+    )
 
 
 @pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
