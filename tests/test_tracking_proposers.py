@@ -30,7 +30,8 @@ Floats = NDArray[np.float64]
 
 def without(tracker: Tracker, name: str) -> Tracker:
     """A tracker that does not have one of the proposers or refinements."""
-    assert name in {one.__name__ for one in (*tracker.proposers, *tracker.refinements)}
+    names = [one.__name__ for one in tracker.proposers]
+    assert name in [*names, *(one.__name__ for one in tracker.refinements)]
     return replace(
         tracker,
         proposers=tuple(one for one in tracker.proposers if one.__name__ != name),
