@@ -127,24 +127,26 @@ def test_a_symmetry_within_the_spread_of_the_features_counts() -> None:
 @pytest.mark.parametrize(
     ("rows", "columns", "expected"),
     [
-        (1, 1, 0.0),
-        (2, 2, 2 / 4),
-        (3, 3, 6 / 9),
-        (7, 5, 30 / 35),  # a step along the longer side leaves one row of five unmet
+        (1, 1, 0),
+        (2, 2, 0),  # a step maps two of four onto the others
+        (3, 3, 4),  # six of nine, along and across
+        (7, 5, 12),  # along, across and diagonally, also by two rows or columns along: 21 of 35
     ],
 )
-def test_a_grid_recurs_but_for_the_row_that_a_step_leaves(
-    rows: int, columns: int, expected: float
+def test_a_grid_has_steps_that_map_most_of_it_onto_itself(
+    rows: int, columns: int, expected: int
 ) -> None:
     places = [(20.0 * i, 20.0 * j, 0.0) for i in range(rows) for j in range(columns)]
     grid = Body("grid", tuple(PointFeature(np.array(place)) for place in places))
-    assert grid.recurrence == pytest.approx(expected)
+    steps = grid.grid_steps
+    assert len(steps) == expected
+    assert all(any(np.allclose(step, -other) for other in steps) for step in steps)
 
 
-def test_points_at_random_do_not_recur() -> None:
+def test_points_at_random_have_no_steps() -> None:
     points = np.random.default_rng(3).normal(scale=50.0, size=(9, 3))
     body = Body("scatter", tuple(PointFeature(point) for point in points))
-    assert body.recurrence == pytest.approx(1 / 9)
+    assert len(body.grid_steps) == 0
 
 
 def test_a_corner_moved_beyond_the_tolerance_leaves_the_turns_about_its_diagonal() -> None:

@@ -116,11 +116,14 @@ class SensorReport:
         Share of the sensor's feature density that the pose accounts for, 0 to 1.
     rms : float or None
         Residual of the explained features, px or length units.
+    why : str or None
+        Why a sensor with features was not used.
     """
 
     used: bool
     explained: float | None = None
     rms: float | None = None
+    why: str | None = None
 
 
 @dataclass(frozen=True)

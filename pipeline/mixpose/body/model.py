@@ -12,9 +12,13 @@ from scipy.special import ndtri
 
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.symmetry import default_tolerance, keeps_normals, recurrence, symmetries
+from mixpose.body.symmetry import default_tolerance, grid_steps, keeps_normals, symmetries
 
 Floats: TypeAlias = NDArray[np.float64]
+
+RECURRENT = 0.6
+"""Share of the features that a shift must map onto others for the body to be followed there by
+mistake: the steps of a chessboard of 6 × 9 corners have 0.8, markers at random 1/N."""
 
 
 @dataclass(frozen=True)
@@ -127,9 +131,10 @@ class Body:
         return found[[keeps_normals(T, points, self.node_normals) for T in found]]
 
     @cached_property
-    def recurrence(self) -> float:
-        """Share of the features met by features of the same body shifted by a step."""
-        return recurrence(self.means, max(default_tolerance(self.means), self.spread))
+    def grid_steps(self) -> Floats:
+        """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
+        tolerance = max(default_tolerance(self.means), self.spread)
+        return grid_steps(self.means, tolerance, RECURRENT)
 
     def sample(
         self,

@@ -68,17 +68,22 @@ def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
     return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > _SAME_NORMAL)
 
 
-def recurrence(points: Floats, tolerance: float) -> float:
-    """Largest share of points (N, 3) that a shift from one to a neighbour maps onto points.
+def grid_steps(points: Floats, tolerance: float, share: float) -> Floats:
+    """Shifts (S, 3) from one point to a neighbour that map a share of points (N, 3) onto points.
 
-    It is 1/N for points at random, and near 1 for a large grid.
+    There are none for points at random, for which that share is 1/N; for a grid it is near 1.
     """
     if len(points) < 2:
-        return 0.0
+        return np.zeros((0, 3))
     _, near = cKDTree(points).query(points, k=min(len(points), 1 + _NEIGHBOURS))
     steps = (points[near[:, 1:]] - points[:, None]).reshape(-1, 3)
-    alike = cKDTree(steps).query_ball_point(steps, tolerance, return_length=True)
-    return float(np.max(alike)) / len(points)
+    alike = cKDTree(steps).query_ball_point(steps, tolerance)
+    found: list[Floats] = []
+    for step, others in zip(steps, alike, strict=True):
+        known = any(np.linalg.norm(step - other) <= 2 * tolerance for other in found)
+        if len(others) >= share * len(points) and not known:
+            found.append(step)
+    return np.array(found).reshape(-1, 3)
 
 
 def default_tolerance(points: Floats) -> float:

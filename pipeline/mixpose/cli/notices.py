@@ -59,6 +59,7 @@ class Summary:
         self.shared = 0  # frames with a pose in which two sensors or more had features
         self.split: Counter[str] = Counter()  # sensors not explained where another one is
         self.split_frames = 0
+        self.left_out: Counter[tuple[str, str]] = Counter()  # sensors, and why
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
 
     def add(self, estimate: Estimate) -> None:
@@ -66,6 +67,8 @@ class Summary:
         self.statuses[estimate.status] += 1
         if estimate.status == "lost":
             return
+        reasons = {n: one.why for n, one in estimate.sensors.items() if one.why}
+        self.left_out.update(reasons.items())
         shares = {n: one.explained or 0.0 for n, one in estimate.sensors.items() if one.used}
         idle = [name for name, share in shares.items() if share < _NOTHING]
         self.posed.update(shares.keys())
@@ -110,6 +113,11 @@ class Summary:
         if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
             apart = set(self.split)
             found.append(self._split_text())
+        posed = sum(self.statuses.values()) - self.statuses["lost"]
+        found += [
+            f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
+            for (name, why), count in self.left_out.items()
+        ]
         far = self._far_off(apart)
         if far:
             found.append(

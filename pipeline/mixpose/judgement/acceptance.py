@@ -44,6 +44,14 @@ class AcceptanceRules:
         "share of the body that must be met for the prediction to be taken without looking "
         "elsewhere: a body slipped by a step of its grid meets less",
     )
+    agreeing: float = constant(
+        0.5, "share of the body that a sensor must meet to count as one that agrees"
+    )
+    disagreeing: float = constant(
+        25.0,
+        "residual variance over that of the other sensors from which one that meets the body is "
+        "left out: five times their deviation; web cams a frame late have three times and still help",
+    )
     same_rotation_deg: float = constant(1.0, "poses nearer than this are one, unless both fit")
     same_distance: float = constant(0.02, "the same, of the body's radius")
     same_peak: float = constant(
@@ -91,7 +99,10 @@ def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> 
 
 def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose near its prediction needs no other to compare with."""
-    return judged.coverage > rules.convincing and is_sure(judged, free, rules)
+    agreeing = [one.coverage for one in judged.associations if one.coverage >= rules.agreeing]
+    # of two sensors or more that agree, others may be covered, blind or out of step
+    share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else judged.coverage
+    return share > rules.convincing and is_sure(judged, free, rules)
 
 
 def decide(

@@ -93,6 +93,7 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
                 "used": bool(report.used),
                 "explained": plain_or_none(report.explained),
                 "rms": plain_or_none(report.rms),
+                **({"why": report.why} if report.why else {}),
             }
             for name, report in estimate.sensors.items()
         },

@@ -63,6 +63,7 @@ class _Sensor(_Line):
     used: bool = True
     explained: float | None = None
     rms: float | None = None
+    why: str | None = None
 
 
 class _Pose(_Line):
@@ -122,7 +123,7 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         covariance=_covariance(pose.covariance, where),
         score=pose.score,
         sensors={
-            name: SensorReport(report.used, report.explained, report.rms)
+            name: SensorReport(report.used, report.explained, report.rms, report.why)
             for name, report in pose.sensors.items()
         },
         hypotheses=tuple(

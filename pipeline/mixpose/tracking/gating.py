@@ -103,6 +103,8 @@ class Expectation:
 def is_convincing(tallies: Tallies, cameras: Sequence[str], share: float) -> bool:
     """Whether cameras met so much of the body that the next frame need not be seen whole."""
     some = [tallies[name] for name in cameras if name in tallies]
+    agreeing = [one for one in some if one.met >= 0.5 * one.in_view > 0]
+    some = agreeing if len(agreeing) > 1 else some
     return sum(one.met for one in some) > share * sum(one.in_view for one in some)
 
 

@@ -6,8 +6,8 @@ over all associations of ranges and features.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, TypeAlias
 
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
-from mixpose.judgement import Judged, Prior, flat_prior, judge, nearest_alike
+from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.records import SensorReport
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
@@ -38,11 +39,14 @@ class Start:
         Standard deviations; None: the pose is there already.
     prediction : Prediction or None
         That it comes from.
+    left_out : mapping of str to str
+        Sensors that are not to take part, and why.
     """
 
     T_world_object: Floats
     uncertainty: Floats | None = None
     prediction: Prediction | None = None
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
 
 class Likelihood(Protocol):
@@ -101,6 +105,13 @@ class FrameData:
         steps = FINE_STEPS if fine else STEPS_PER_SIGMA
         return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
 
+    def without(self, names: Mapping[str, str]) -> FrameData:
+        """The frame without some sensors."""
+        if not names:
+            return self
+        views = [view for view in self.views if view.name not in names]
+        return replace(self, views=views)
+
     @cached_property
     def finest(self) -> MatchedObjective | None:
         """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
@@ -128,7 +139,7 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs."""
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        data = self.data
+        data = self.data.without(start.left_out)
         return fit_near(
             data.views,
             data.body,
@@ -141,8 +152,8 @@ class MatchedLikelihood:
         )
 
     def judge(self, fit: Fit, start: Start) -> Judged:
-        """Judge a pose by matched densities at σ_ε."""
-        data = self.data
+        """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
+        data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         judged = judge(
             data.objective_near(T),
@@ -152,7 +163,22 @@ class MatchedLikelihood:
             prior=data.prior(T),
             rules=data.rules.judgement,
         )
-        return replace(judged, proposer=fit.proposer)
+        if not start.left_out:
+            return judged
+        rules = self.data.rules.judgement
+        found, _ = associate(self.data.objective_near(T), T, rules.association)
+        others = [one for one in found if one.name in start.left_out]
+        missed = sum(one.expected for one in others) * rules.detection.log_missed
+        reports = {
+            one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
+            for one in others
+        }
+        return replace(
+            judged,
+            sensors=judged.sensors | reports,
+            log_evidence=judged.log_evidence + missed,
+            associations=(*judged.associations, *others),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +210,7 @@ class AssociationLikelihood:
         judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
         anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
-            replace(judged, proposer=fit.proposer),
+            judged,
             self._posterior(start),
             data.track.noise,
             # the posterior holds the prediction already

@@ -41,32 +41,42 @@ def step_without_loosest(
     """The step (6,) to where the met features agree, leaving out those that agree least.
 
     One feature after the other is left out, each time the one without which the rest agree best,
-    until all are met tightly or too few are left.
+    until all are met tightly or too few are left.  With H_i = J_i A⁻¹ J_iᵀ, leaving feature i out
+    lowers the sum of squares by r_iᵀ (I − H_i)⁻¹ r_i (R. D. Cook and S. Weisberg, Residuals and
+    Influence in Regression, 1982).
     """
-    parts = [
-        (J[:, free] / one.sigma, offset / one.sigma)
-        for one in associations
-        for J, offset, share in zip(one.J, one.offsets, one.shares, strict=True)
-        if share > 0
-    ]
+    J, offsets = _rows(associations, free)
     step = np.zeros(len(free))
-    fewest = -(-(int(free.sum()) + 2) // min(len(r) for _, r in parts))
-    while len(parts) >= fewest:
-        solved, squared = _solve(parts)
-        step[free] = solved
-        if squared.max() < rules.noticeable or len(parts) == fewest:
+    coordinates = min(one.J.shape[1] for one in associations if one.met)
+    fewest = -(-(int(free.sum()) + 2) // coordinates)
+    while len(J) >= fewest:
+        A = np.einsum("nmi,nmj->ij", J, J)
+        A.flat[:: len(A) + 1] *= 1 + 1e-9
+        A.flat[:: len(A) + 1] += 1e-18
+        inverse = np.linalg.inv(A)
+        step[free] = inverse @ np.einsum("nmi,nm->i", J, offsets)
+        left = offsets - J @ step[free]
+        if (left**2).sum(axis=1).max() < rules.noticeable or len(J) == fewest:
             break
-        remaining = [_solve(parts[:k] + parts[k + 1 :])[1].sum() for k in range(len(parts))]
-        del parts[int(np.argmin(remaining))]
+        remain = np.eye(J.shape[1]) - J @ inverse @ J.swapaxes(1, 2)
+        remain += 1e-9 * np.eye(J.shape[1])  # a feature that alone fixes a direction
+        gain = (left * np.linalg.solve(remain, left[..., None])[..., 0]).sum(axis=1)
+        kept = np.arange(len(J)) != int(np.argmax(gain))
+        J, offsets = J[kept], offsets[kept]
     return step
 
 
-def _solve(parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
-    """Least-squares step, and what is left of each feature's squared offset."""
-    J, r = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-    A = J.T @ J
-    A.flat[:: len(A) + 1] *= 1 + 1e-9
-    A.flat[:: len(A) + 1] += 1e-18
-    step = np.linalg.solve(A, J.T @ r)
-    left = (r - J @ step) ** 2
-    return step, np.add.reduceat(left, np.cumsum([0] + [len(part[1]) for part in parts[:-1]]))
+def _rows(
+    associations: Sequence[Association], free: NDArray[np.bool_]
+) -> tuple[Floats, Floats]:
+    """Jacobians (n, 2, k) and offsets (n, 2) of the met features in σ, missing coordinates 0."""
+    met = [one.shares > 0 for one in associations]
+    count = sum(int(np.count_nonzero(seen)) for seen in met)
+    J, offsets = np.zeros((count, 2, int(free.sum()))), np.zeros((count, 2))
+    begin = 0
+    for one, seen in zip(associations, met, strict=True):
+        m, end = one.J.shape[1], begin + int(np.count_nonzero(seen))
+        J[begin:end, :m] = one.J[seen][..., free] / one.sigma
+        offsets[begin:end, :m] = one.offsets[seen] / one.sigma
+        begin = end
+    return J, offsets

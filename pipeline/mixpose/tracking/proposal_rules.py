@@ -11,11 +11,6 @@ from mixpose.constants import constant
 class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
-    recurrent: float = constant(
-        0.6,
-        "share of a body met a step aside from which it may be followed there: a chessboard has "
-        "0.8, markers at random 1/N",
-    )
     drawn: int = constant(
         512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
     )

@@ -203,4 +203,5 @@ def _tallies(judged: Judged) -> dict[str, SensorTally]:
             int(np.count_nonzero(one.shares)), len(one.features), one.missed, one.surplus
         )
         for one in judged.associations
+        if judged.sensors[one.name].used
     }

@@ -16,7 +16,9 @@ from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_outlier import without_outlier
+from mixpose.tracking.proposers.without_sensor import without_sensor
 
 
 class Proposer(Protocol):
@@ -37,5 +39,5 @@ class Refinement(Protocol):
     ) -> Iterable[Start]: ...
 
 
-PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, mirrored)
-REFINEMENTS: tuple[Refinement, ...] = (without_outlier, merged_pair)
+PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, multistart, searched, mirrored)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, without_outlier, merged_pair)

@@ -13,7 +13,6 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import uniforms
 from mixpose.fit import blur_schedule
 from mixpose.judgement import Judged
 from mixpose.objective import matched_objective
@@ -25,13 +24,14 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 def multistart(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
-    """The most promising poses around the first prediction, where nothing convinces yet."""
+    """The most promising poses around the first prediction, until something convinces."""
     if not data.predictions or not is_doubtful(data, ranked):
-        return []
+        return
     first = data.predictions[0]
     wide = np.where(data.free, np.maximum(first.uncertainty, data.start_uncertainty), 0.0)
-    poses = starts_around(data, first.T_world_object, wide)
-    return [Start(T, wide / data.rules.proposals.narrowing) for T in poses]
+    for T in starts_around(data, first.T_world_object, wide):
+        if is_doubtful(data, ranked):
+            yield Start(T, wide / data.rules.proposals.narrowing)
 
 
 def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
@@ -61,8 +61,6 @@ def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list
 
 
 def _twists(uncertainty: Floats, count: int, seed: int) -> Floats:
-    """Quasi-random twists (n, 6), uniform within √3 standard deviations each way."""
-    first = uniforms(count, sampler="low-discrepancy", seed=seed)
-    second = uniforms(count, sampler="low-discrepancy", seed=seed + 1)
-    cube = np.concatenate([first[:, :3], second[:, :3]], axis=1)
+    """Random twists (n, 6), uniform within √3 standard deviations each way."""
+    cube = np.random.default_rng(seed).random((count, 6))
     return np.asarray((2 * cube - 1) * np.sqrt(3) * uncertainty)
