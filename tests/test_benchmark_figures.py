@@ -23,8 +23,8 @@ from paper.systems import POINTS, pose
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.objective.paper import PaperObjective
-from mixpose.tracking import Track, Tracker, predict
 from mixpose.rigid import transform
+from mixpose.tracking import Track, Tracker, predict
 
 
 def test_the_literal_objective_has_the_values_of_ours() -> None:

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mixpose
-from mixpose.density import Atlas, observation
+from mixpose.density import Atlas, draw, observation
 from mixpose.objective import View, project_body
 from mixpose.pictures.stages import densities_picture
 from mixpose.records import Estimate, FrameSet
@@ -50,7 +50,7 @@ class Spy:
 @pytest.fixture
 def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
     found = Spy()
-    remap, draw = cv2.remap, observation.draw
+    remap = cv2.remap
 
     def recorded(values: Any, u: Any, v: Any, *others: Any, **named: Any) -> Any:
         found.calls.append((values, np.array(u), np.array(v)))

@@ -15,7 +15,7 @@ from mixpose.sensors import PinholeCamera
 
 
 def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
-    pinhole_cameras: list[PinholeCamera]
+    pinhole_cameras: list[PinholeCamera],
 ) -> None:
     camera = replace(pinhole_cameras[0], T_sensor_world=np.eye(4))
     one_point = Body(

@@ -211,9 +211,7 @@ def test_the_matched_share_is_one_at_the_truth_and_what_clutter_leaves_of_it(
     cluttered = PointPattern(np.concatenate([pattern.points, false]), np.ones(9))
     for found, expected in ((pattern, 1.0), (cluttered, 6 / 9)):
         views = [View("0", camera, Observation(found, 2.0))]
-        objective = matched_objective(
-            views, paper_body, [2.0], TRUTH, steps_per_sigma=FINE_STEPS
-        )
+        objective = matched_objective(views, paper_body, [2.0], TRUTH, steps_per_sigma=FINE_STEPS)
         share = objective.value(TRUTH[None])[0] / objective.weights[0, 0]
         # bilinear values on 8 grid points per σ err by 1/8²/12 along each axis, twice that squared
         assert share == pytest.approx(expected, rel=2e-3)

@@ -168,10 +168,10 @@ def test_features_that_are_not_seen_neither_count_nor_pull() -> None:
     seen = at.seen.copy()
     y[:, :, 4:], J[:, :, 4:], weights[:, :, 4:], seen[:, :, 4:] = -1e6, 0.0, 0.0, False
     fewer = Projected(y, J, seen, seen, weights)
-    found = slopes(
-        fewer, sampled, overlaps(y, weights, VARIANCES, TOPS), VARIANCES, TOPS, SCALES
+    found = slopes(fewer, sampled, overlaps(y, weights, VARIANCES, TOPS), VARIANCES, TOPS, SCALES)
+    some = Projected(
+        at.y[:, :, :4], at.J[:, :, :4], at.seen[:, :, :4], at.faced[:, :, :4], at.weights[:, :, :4]
     )
-    some = Projected(*(each[:, :, :4] for each in at))
     expected = slopes(
         some,
         sampled[:, :, :4],

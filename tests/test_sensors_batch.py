@@ -127,7 +127,9 @@ def test_the_skew_of_a_camera_matrix_is_in_pixels_and_jacobian() -> None:
 
 def test_points_behind_cameras_side_by_side_are_outside_and_without_pull() -> None:
     sensors = [PinholeCamera(K), PinholeCamera(K, BARREL)]
-    y, J, visible = side_by_side(sensors).linearise(np.array([[10.0, 5.0, -800.0], [0.0, 0.0, 800.0]]))
+    y, J, visible = side_by_side(sensors).linearise(
+        np.array([[10.0, 5.0, -800.0], [0.0, 0.0, 800.0]])
+    )
     np.testing.assert_array_equal(visible, [[False, True], [False, True]])
     assert (y[:, 0] == OUTSIDE).all()
     assert (J[:, 0] == 0).all()

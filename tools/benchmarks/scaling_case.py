@@ -19,12 +19,12 @@ from benchmarks.timing import PROCESSOR, Task, medians, show, slope
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, fit_near
-from mixpose.tracking import estimate_pose
 from mixpose.objective import View
 from mixpose.objective.paper import PaperObjective
 from mixpose.records import PointPattern
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
+from mixpose.tracking import estimate_pose
 
 Floats: TypeAlias = NDArray[np.float64]
 

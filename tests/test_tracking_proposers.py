@@ -1,0 +1,186 @@
+"""Where poses come from: each proposer finds what the others miss, and can be left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detections import EIGHT, TRUTH, detect, random_start, view_of
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body, PointFeature
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View
+from mixpose.records import Estimate
+from mixpose.rigid import (
+    from_parts,
+    from_rotation_vector,
+    perturb,
+    rotation_angle_deg,
+    transform,
+)
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Tracker
+from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
+
+Floats = NDArray[np.float64]
+
+
+def without(tracker: Tracker, name: str) -> Tracker:
+    """A tracker that does not have one of the proposers or refinements."""
+    names = [one.__name__ for one in tracker.proposers]
+    assert name in [*names, *(one.__name__ for one in tracker.refinements)]
+    return replace(
+        tracker,
+        proposers=tuple(one for one in tracker.proposers if one.__name__ != name),
+        refinements=tuple(one for one in tracker.refinements if one.__name__ != name),
+    )
+
+
+def only(tracker: Tracker, name: str) -> Tracker:
+    """A tracker that has one proposer."""
+    proposers = tuple(one for one in tracker.proposers if one.__name__ == name)
+    assert len(proposers) == 1
+    return replace(tracker, proposers=proposers)
+
+
+def first_frame(tracker: Tracker, views: list[View]) -> Estimate:
+    return tracker.advance(tracker.begin(), 0, None, views)[1]
+
+
+def is_right(estimate: Estimate, T: Floats) -> bool:
+    """Within a degree and 2 mm, tens of times what 0.1 px leave."""
+    if estimate.T_world_object is None:
+        return False
+    near = np.linalg.norm((estimate.T_world_object - T)[:3, 3]) < 2
+    return bool(near and rotation_angle_deg(estimate.T_world_object, T) < 1)
+
+
+def test_all_are_on_as_a_rule_and_any_is_an_argument() -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    assert tracker.proposers == PROPOSERS
+    assert tracker.refinements == REFINEMENTS
+    none = Tracker(
+        EIGHT, tracker.options, tracker.samples, tracker.start_uncertainty, TRUTH, proposers=()
+    )
+    assert none.proposers == ()
+
+
+def test_without_any_proposer_every_frame_is_lost(pinhole_cameras: list[PinholeCamera]) -> None:
+    tracker = replace(Tracker.create(EIGHT, EstimatorOptions(), TRUTH), proposers=())
+    estimate = first_frame(tracker, detect(pinhole_cameras, EIGHT, TRUTH))
+    assert estimate.status == "lost"
+    assert estimate.T_world_object is None
+
+
+def test_a_prediction_finds_a_pose_in_clutter_in_which_nothing_else_does(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # 120 false detections beside 7 true ones; the start is right, and said to be off by 80 mm and
+    # 40 degrees: poses drawn from that are all somewhere in the clutter
+    views = detect(pinhole_cameras[:1], EIGHT, TRUTH, noise=0.1, false=120, hidden=1, seed=1)
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH, rotation_deg=40, distance=80)
+    assert is_right(first_frame(tracker, views), TRUTH)
+    assert is_right(first_frame(only(tracker, "predicted"), views), TRUTH)
+    assert not is_right(first_frame(without(tracker, "predicted"), views), TRUTH)
+
+
+def test_several_starts_find_a_pose_off_its_prediction_in_clutter(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # up to 15 mm and 7.5 degrees off, some 20 px, in 60 false detections: one descent goes astray,
+    # and the search has too many triples that fit by chance
+    views = detect(pinhole_cameras[:1], EIGHT, TRUTH, noise=0.1, false=60, hidden=1, seed=0)
+    start = random_start(0, 15.0, 7.5)
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), start, rotation_deg=7.5, distance=15)
+    assert is_right(first_frame(tracker, views), TRUTH)
+    assert is_right(first_frame(only(tracker, "multistart"), views), TRUTH)
+    assert not is_right(first_frame(without(tracker, "multistart"), views), TRUTH)
+
+
+def test_the_search_finds_a_pose_that_was_not_predicted(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    elsewhere = from_rotation_vector([1.4, -2.0, 0.7], [80.0, 20.0, -30.0])
+    views = detect(pinhole_cameras, EIGHT, elsewhere, noise=0.1, false=3, hidden=1)
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    assert is_right(first_frame(tracker, views), elsewhere)
+    assert is_right(first_frame(only(tracker, "searched"), views), elsewhere)
+    assert not is_right(first_frame(without(tracker, "searched"), views), elsewhere)
+
+
+PLATE = Body(
+    "plate",
+    tuple(
+        PointFeature(np.array([x, y, 0.0]))
+        for x, y in [(-50, -40), (50, -40), (40, 45), (-30, 35), (10, -10), (-45, 5)]
+    ),
+)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_flat_body_followed_at_the_wrong_tilt_is_turned_over(seed: int) -> None:
+    K = np.array([[900.0, 0, 640], [0, 900.0, 512], [0, 0, 1]])
+    camera = PinholeCamera(K, resolution=(1280, 1024))
+    T = from_rotation_vector([0.35, 0.25, 0.3], [10.0, -20.0, 600.0])
+    towards = -T[:3, 3] / np.linalg.norm(T[:3, 3])
+    mirrors = np.eye(3) - 2 * np.outer(towards, towards), np.diag([1.0, 1.0, -1.0])
+    T_wrong = from_parts(mirrors[0] @ T[:3, :3] @ mirrors[1], T[:3, 3])
+    views = detect([camera], PLATE, T, noise=0.1, seed=seed)
+    tracker = Tracker.create(PLATE, EstimatorOptions(), T_wrong)
+    assert is_right(first_frame(tracker, views), T)
+    # the wrong tilt meets all features, within a pixel or two: nothing else is asked
+    estimate = first_frame(without(tracker, "mirrored"), views)
+    assert estimate.T_world_object is not None
+    assert rotation_angle_deg(estimate.T_world_object, T) > 40
+
+
+SIX = np.array(
+    [[0, 0, 0], [80, 6, 10], [-55, 48, -12], [-30, -66, 25], [36, 40, 62], [22, -35, -48]], float
+)
+WAND = Body("wand", tuple(PointFeature(point) for point in SIX))
+
+
+def test_a_false_detection_beside_a_hidden_feature_is_left_out_by_a_closer_look(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    T = from_parts(Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix(), [50.0, 40.0, 5.0])
+    views = detect(pinhole_cameras, WAND, T)
+    y = pinhole_cameras[0].project(transform(T, SIX))[0]
+    y[2] += [2.0, 1.0]
+    views[0] = view_of("0", pinhole_cameras[0], y)
+    tracker = Tracker.create(WAND, EstimatorOptions(), T)
+    bent = first_frame(without(tracker, "without_outlier"), views)
+    estimate = first_frame(tracker, views)
+    assert estimate.T_world_object is not None
+    assert bent.T_world_object is not None
+    # eleven of twelve are exact; from where they agree the twelfth is 2.2 px away and pulls with
+    # exp(-d²/4σ²): 0.57 at σ = 1.5 px, 0.11 at half of it, a fifth
+    angle = rotation_angle_deg(estimate.T_world_object, T)
+    assert rotation_angle_deg(bent.T_world_object, T) > 0.25
+    assert angle < 0.25 * rotation_angle_deg(bent.T_world_object, T)
+
+
+def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:
+    camera = PinholeCamera(
+        np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.zeros(4), (640, 480)
+    )
+    along = SIX[2] - SIX[1]
+    R, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], [along])
+    apart = Rotation.from_euler("y", 4.0 / 700 * 460 / np.linalg.norm(along))
+    turned = (apart * R).as_matrix()
+    T = from_parts(turned, np.array([0.0, 0.0, 460.0]) - turned @ SIX[1])
+    y = camera.project(transform(T, SIX))[0]
+    merged = np.vstack([np.delete(y, [1, 2], axis=0), y[1:3].mean(axis=0)])
+    views = [view_of("camera", camera, merged)]
+    start = perturb(T, np.array([1.0, -1.0, 2.0, 0.01, -0.01, 0.01]))
+    tracker = Tracker.create(WAND, EstimatorOptions(), start)
+    estimate = first_frame(tracker, views)
+    bent = first_frame(without(tracker, "merged_pair"), views)
+    assert estimate.T_world_object is not None
+    assert bent.T_world_object is not None
+    # without noise the middle of two images is the image of both to far less than a pixel
+    assert rotation_angle_deg(estimate.T_world_object, T) < 0.02
+    assert rotation_angle_deg(bent.T_world_object, T) > 0.05
