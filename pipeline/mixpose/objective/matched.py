@@ -128,6 +128,13 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
+def steps_at(view: View, sigma: float) -> float:
+    """Cells per standard deviation with which a sensor's density is drawn at a blur."""
+    if sigma > view.observation.sigma:
+        return STEPS_PER_SIGMA
+    return LAST_STEPS if view.observation.cell is None else FINE_STEPS
+
+
 def matched_objective(
     views: Sequence[View],
     body: Body,
