@@ -1,12 +1,13 @@
 """Search: the first pose from nothing, over all orientations and positions.
 
-Few features that are seen clearly name a pose: three points in space, a point and two lines of
-sight, three lines of sight.  Where none are seen clearly, all orientations are scored on blurred
-densities.  Every guess is judged on all sensors, and the best descend through narrowing blurs.
+Few features that are seen clearly name a pose: three points in space, a point and two rays, three
+rays of one camera.  Where none are seen clearly, all orientations are scored on blurred densities.
+Every guess is judged on all sensors, and the best descend through narrowing blurs.
 """
 
 from __future__ import annotations
 
-from mixpose.search.search import Candidate, search
+from mixpose.search.budget import SearchBudget
+from mixpose.search.search import Candidate, SearchReport, search
 
-__all__ = ["Candidate", "search"]
+__all__ = ["Candidate", "SearchBudget", "SearchReport", "search"]

@@ -10,18 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.objective import MatchedObjective, matched_objective
 from mixpose.rigid import perturb, transform
-from mixpose.search.levels import Level, levels
-from mixpose.search.scoring import scores, slopes
-from mixpose.search.sightings import Sighting
+from mixpose.search.budget import DescentOptions
+from mixpose.search.detections import SensorDetections
 
 Floats: TypeAlias = NDArray[np.float64]
-
-_DAMPING = 1e-3
-_LONGEST_TURN = 0.35  # rad in one step: farther the linear model holds no longer
-_MOST_CELLS = 1_000_000  # of pairs of predicted features in memory at once
-_SAME = 0.01  # of the radius, grid on which poses during a descent are one
-_ALIKE = 0.03  # of the radius: root mean square distance of features of poses that are one
 
 
 @dataclass(frozen=True)
@@ -30,57 +24,92 @@ class Stage:
 
     Attributes
     ----------
-    factors : sequence of float
-        Blur per sighting, as a multiple of its σ_ε.
+    factors : tuple of float
+        Blur per sensor, as a multiple of its σ_ε.
     steps : int
     survivors : int
         How many poses go on.
     """
 
-    factors: Sequence[float]
+    factors: tuple[float, ...]
     steps: int
     survivors: int
 
 
-def descend(
-    sightings: Sequence[Sighting],
-    body: Body,
-    poses: Floats,
-    stages: Sequence[Stage],
-    free: NDArray[np.bool_],
-) -> Floats:
-    """Refine poses stage by stage.
+class Descent:
+    """Refines poses on the blurred detections of all sensors, which are drawn once per blur.
 
     Parameters
     ----------
-    sightings : sequence of Sighting
+    detections : sequence of SensorDetections
     body : Body
-    poses : (H, 4, 4) array
-    stages : sequence of Stage
     free : (6,) bool
         Directions that may change.
-
-    Returns
-    -------
-    (K, 4, 4) array
-        The poses left, best first: by the cosine between observed and predicted densities,
-        summed over sensors.
+    options : DescentOptions
     """
-    rows = max(_MOST_CELLS // len(body.nodes.points) ** 2, 1)
-    for stage in stages:
-        blurred = levels(sightings, stage.factors, len(body))
-        for _ in range(stage.steps):
-            chunks = [
-                _stepped(blurred, body, poses[start : start + rows], free)
-                for start in range(0, len(poses), rows)
-            ]
-            poses = np.concatenate(chunks) if chunks else poses
-        # a sum of shares k/n, not of their squares: what counts is how many features are met
-        values = np.sqrt(scores(blurred, body, poses, whole=True)).sum(axis=0)
-        order = np.argsort(-values, kind="stable")
-        order = order[unlike(body, poses[order], _SAME)][: stage.survivors]
-        poses = poses[order]
-    return poses
+
+    def __init__(
+        self,
+        detections: Sequence[SensorDetections],
+        body: Body,
+        free: NDArray[np.bool_],
+        options: DescentOptions,
+    ) -> None:
+        self._views = [each.view for each in detections]
+        self._body = body
+        self._free = free
+        self._options = options
+        self._objectives: dict[tuple[float, ...], MatchedObjective] = {}
+
+    def objective(self, factors: Sequence[float] | None = None) -> MatchedObjective:
+        """The matched objective with features wider than σ_ε by factors per sensor; None: 1."""
+        key = tuple(factors or [1.0] * len(self._views))
+        if key not in self._objectives:
+            sigmas = [f * view.observation.sigma for f, view in zip(key, self._views, strict=True)]
+            self._objectives[key] = matched_objective(self._views, self._body, sigmas)
+        return self._objectives[key]
+
+    def refine(self, poses: Floats, stages: Sequence[Stage]) -> Floats:
+        """Refine poses (H, 4, 4) stage by stage.
+
+        Returns
+        -------
+        (K, 4, 4) array
+            The poses left, best first: by the cosine between observed and predicted densities,
+            summed over sensors.
+        """
+        for stage in stages:
+            objective = self.objective(stage.factors)
+            for _ in range(stage.steps):
+                poses = self._stepped(objective, poses)
+            # a sum of shares k/n, not of their squares: what counts is how many features are met
+            values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
+            order = np.argsort(-values, kind="stable")
+            order = order[unlike(self._body, poses[order], self._options.same)]
+            poses = poses[order[: stage.survivors]]
+        return poses
+
+    def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:
+        """One damped Newton step of every pose."""
+        if not len(poses):
+            return poses
+        model, free = objective.slopes(poses), self._free
+        A = model.curvature[:, free][:, :, free]
+        b = model.gradient[:, free]
+        diagonal = np.einsum("hkk->hk", A)
+        largest = diagonal.max(axis=1, keepdims=True)
+        tiny = np.finfo(np.float64).tiny
+        scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + tiny))
+        A = A * scale[:, :, None] * scale[:, None, :] + self._options.damping * np.eye(A.shape[1])
+        twists = np.zeros((len(poses), 6))
+        twists[:, free] = scale * np.linalg.solve(A, (scale * b)[..., None])[..., 0]
+        twists[largest[:, 0] <= 0] = 0.0
+        turn = np.linalg.norm(twists[:, 3:], axis=1)
+        shift = np.linalg.norm(twists[:, :3], axis=1) / max(self._body.radius, 1e-12)
+        most = self._options.max_turn
+        longest = np.maximum(turn, most / 2 * shift)
+        twists *= np.minimum(1.0, most / np.maximum(longest, 1e-12))[:, None]
+        return perturb(poses, twists)
 
 
 def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:
@@ -100,28 +129,7 @@ def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:
     return np.sort(np.unique(keys, return_index=True)[1])
 
 
-def _stepped(
-    blurred: Sequence[Level], body: Body, poses: Floats, free: NDArray[np.bool_]
-) -> Floats:
-    """One damped Newton step of every pose."""
-    model = slopes(blurred, body, poses)
-    A = model.curvature[:, free][:, :, free]
-    b = model.gradient[:, free]
-    diagonal = np.einsum("hkk->hk", A)
-    largest = diagonal.max(axis=1, keepdims=True)
-    scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + np.finfo(np.float64).tiny))
-    A = A * scale[:, :, None] * scale[:, None, :] + _DAMPING * np.eye(A.shape[1])
-    twists = np.zeros((len(poses), 6))
-    twists[:, free] = scale * np.linalg.solve(A, (scale * b)[..., None])[..., 0]
-    twists[largest[:, 0] <= 0] = 0.0
-    turn = np.linalg.norm(twists[:, 3:], axis=1)
-    shift = np.linalg.norm(twists[:, :3], axis=1) / max(body.radius, 1e-12)
-    longest = np.maximum(turn, _LONGEST_TURN / 2 * shift)
-    twists *= np.minimum(1.0, _LONGEST_TURN / np.maximum(longest, 1e-12))[:, None]
-    return perturb(poses, twists)
-
-
-def first_of_each(body: Body, poses: Floats, values: Floats, count: int) -> list[int]:
+def first_of_each(body: Body, poses: Floats, values: Floats, count: int, alike: float) -> list[int]:
     """Indices of the best poses, no two of which put the features in about the same places.
 
     Parameters
@@ -130,6 +138,8 @@ def first_of_each(body: Body, poses: Floats, values: Floats, count: int) -> list
     poses : (H, 4, 4) array
     values : (H,) array
     count : int
+    alike : float
+        Root mean square distance of features of poses that are one, as a share of the radius.
     """
     points = body.means
     kept: list[int] = []
@@ -137,7 +147,7 @@ def first_of_each(body: Body, poses: Floats, values: Floats, count: int) -> list
     for k in np.argsort(-values, kind="stable"):
         here = transform(poses[k], points)
         if all(
-            np.sqrt(((here - image) ** 2).sum(axis=-1).mean(axis=-1)).min() > _ALIKE * body.radius
+            np.sqrt(((here - image) ** 2).sum(axis=-1).mean(axis=-1)).min() > alike * body.radius
             for image in images
         ):
             kept.append(int(k))

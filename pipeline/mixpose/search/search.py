@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -12,40 +12,16 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.objective import View
+from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.constraint import Constraint
-from mixpose.search.counting import GATE, LabelMap, explained, label_maps
+from mixpose.search.detections import SensorDetections, is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
-from mixpose.search.guesses import (
-    from_cameras,
-    from_restricted_turns,
-    from_slips,
-    from_spread_orientations,
-)
-from mixpose.search.layout import far_apart
-from mixpose.search.levels import levels
-from mixpose.search.refinement import Stage, descend, first_of_each, unlike
-from mixpose.search.scoring import scores
-from mixpose.search.sightings import Sighting, sightings
+from mixpose.search.guesses import from_slips, from_spread_orientations, kinds_of_guesses
+from mixpose.search.inlier_counts import LabelImage, count_inliers, label_images
+from mixpose.search.refinement import Descent, Stage, first_of_each, unlike
+from mixpose.search.spread import far_apart
 
 Floats: TypeAlias = NDArray[np.float64]
-
-SHORTLISTED = 300
-CONVINCING = 0.7
-"""Share of the body that all sensors together must meet for no other kind of guess to be made."""
-
-SUFFICIENT = 0.45
-"""Share at which guesses of lines of sight are not followed by all orientations."""
-
-OVERWHELMING = 24.0
-"""Evidence, in nats, at which several cameras leave no doubt: a million guesses make 14."""
-
-_FEW_FEATURES = 8  # with more, fewer guesses need to be kept
-_MANY_FEATURES = 16  # with as many, chance does not explain most of them
-_LEAST = 40
-_GRIDS = 120  # features of a body up to which slips by a step of a grid are looked for
-_ENOUGH = 0.8  # of all detections: the search for better guesses of a kind ends
-_CELL = 0.05  # of the body's radius: guesses that put features so close together are one
-_BEHIND = 3.0  # detections that a guess may explain less than the best
 
 
 @dataclass(frozen=True)
@@ -69,14 +45,22 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class _Task:
-    """What stays the same during a search."""
+class SearchReport:
+    """What a search cost.
 
-    sightings: Sequence[Sighting]
-    body: Body
-    constraint: Constraint
-    maps: Sequence[LabelMap]
-    rng: np.random.Generator
+    Attributes
+    ----------
+    made : int
+        Guesses.
+    tested : int
+        Guesses counted on all features and sensors.
+    refined : int
+        Guesses that descended.
+    """
+
+    made: int = 0
+    tested: int = 0
+    refined: int = 0
 
 
 def search(
@@ -87,6 +71,7 @@ def search(
     T_reference: Floats | None,
     count: int = 8,
     seed: int = 0,
+    budget: SearchBudget = THOROUGH,
 ) -> list[Candidate]:
     """Find poses that explain the views, without a start.
 
@@ -103,6 +88,7 @@ def search(
         Most candidates returned.
     seed : int
         Of the order in which guesses are tried, where not all can be.
+    budget : SearchBudget
 
     Returns
     -------
@@ -120,143 +106,162 @@ def search(
             "search: start: found none, but some directions are not free: a start must say where "
             "they stay"
         )
-    seen = sightings(views, body)
-    if not seen:
+    detections = sensor_detections(views, body, budget.peaks)
+    if not detections:
         return []
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
-    maps = label_maps(seen, GATE)
-    task = _Task(seen, body, Constraint(free, reference), maps, np.random.default_rng(seed))
-    poses, ranks = _found(task)
-    if len(poses) and maps and _MANY_FEATURES <= len(body) <= _GRIDS:
-        slips = _shortlist(task, [from_slips(body, poses[ranks.argmax()])])
-        found = _descended(task, slips)
-        poses, ranks = np.concatenate([poses, found]), np.append(ranks, _rank(task, found))
-    return _candidates(task, poses, ranks, count)
+    run = _Run(detections, body, Constraint(free, reference), budget, seed)
+    run.find()
+    return run.candidates(count)
 
 
-def _found(task: _Task) -> tuple[Floats, Floats]:
-    """Refined poses with their ranks, of as many kinds of guesses as are needed."""
-    poses, ranks, coverage = np.zeros((0, 4, 4)), np.zeros(0), 0.0
-    for attempt in (_sharp_attempts, _blunt_attempt):
-        for found in attempt(task):
-            poses, ranks = np.concatenate([poses, found]), np.append(ranks, _rank(task, found))
-            coverage = _coverage(task, poses[ranks.argmax()]) if len(poses) else 0.0
-            overwhelming = len(task.sightings) > 1 and ranks.max(initial=0.0) > OVERWHELMING
-            if coverage >= (SUFFICIENT if overwhelming else CONVINCING):
-                break
-        if coverage >= SUFFICIENT:
-            break
-    return poses, ranks
+class _Run:
+    """One search: what stays the same during it, and what was found so far."""
 
+    def __init__(
+        self,
+        detections: Sequence[SensorDetections],
+        body: Body,
+        constraint: Constraint,
+        budget: SearchBudget,
+        seed: int,
+    ) -> None:
+        self._detections = detections
+        self._body = body
+        self._constraint = constraint
+        self._budget = budget
+        self._rng = np.random.default_rng(seed)
+        self._images: list[LabelImage] = []
+        if is_pointlike(body):
+            self._images = label_images(detections, budget.gate)
+        # ranges are met by chance too often, and err too coarsely, to be counted one by one
+        self._by_evidence = len(self._images) == len(detections)
+        self._descent = Descent(detections, body, constraint.free, budget.descent)
+        self._poses = np.zeros((0, 4, 4))
+        self._ranks = np.zeros(0)
+        self.report = SearchReport()
 
-def _is_seen_by_cameras(task: _Task) -> bool:
-    """Whether all sensors have detections in an image, of features that are points.
+    def find(self) -> None:
+        """Make as many kinds of guesses as are needed."""
+        budget = self._budget
+        if self._images:
+            kinds = kinds_of_guesses(
+                self._detections, self._body, self._constraint, budget, self._rng
+            )
+            for guesses in kinds:
+                self._keep(self._descended(self._shortlist(guesses)))
+                if self._is_settled():
+                    break
+        if self._coverage() < budget.sufficient:
+            self._keep(self._blunt())
+        slippery = 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
+        if len(self._poses) and self._images and slippery:
+            slips = from_slips(self._body, self._poses[self._ranks.argmax()])
+            self._keep(self._descended(self._shortlist(iter([slips]))))
 
-    Ranges are met by chance too often, and err too coarsely, for single detections to count.
-    """
-    return len(task.maps) == len(task.sightings) and _is_pointlike(task.body)
-
-
-def _is_pointlike(body: Body) -> bool:
-    return len(body.nodes.points) == len(body)
-
-
-def _rank(task: _Task, poses: Floats) -> Floats:
-    """Evidence where all sensors are cameras, else the score."""
-    if _is_seen_by_cameras(task):
-        return evidence(task.sightings, task.body, poses, task.constraint.free)
-    finest = levels(task.sightings, [1.0] * len(task.sightings), len(task.body))
-    return np.asarray(scores(finest, task.body, poses).sum(axis=0))
-
-
-def _descended(task: _Task, guesses: Floats) -> Floats:
-    """Guesses that are off by a few σ_ε, refined in two ways.
-
-    Once to σ_ε; and once from less to less, where clutter beside a feature pulls less.  Where
-    detections err by as much as σ_ε the second is no gain, and the ranking keeps the first.
-    """
-    plans = [((3.0, 1), (1.5, 2), (1.0, 3))]
-    if _is_seen_by_cameras(task):
-        plans.append(((1.5, 2), (0.75, 2), (0.4, 2)))
-    count = len(task.sightings)
-    found = [
-        descend(
-            task.sightings,
-            task.body,
-            guesses,
-            [Stage([factor] * count, steps, SHORTLISTED) for factor, steps in plan],
-            task.constraint.free,
+    def candidates(self, count: int) -> list[Candidate]:
+        """Distinct poses, best first."""
+        kept = first_of_each(
+            self._body, self._poses, self._ranks, count, self._budget.descent.alike
         )
-        for plan in plans
-    ]
-    return np.concatenate(found)
+        values = self._descent.objective().shares(self._poses[kept]).sum(axis=0)
+        return [
+            Candidate(self._poses[k], float(value), float(self._ranks[k]))
+            for k, value in zip(kept, values, strict=True)
+        ]
 
+    def _keep(self, poses: Floats) -> None:
+        self._ranks = np.append(self._ranks, self._rank(poses))
+        self._poses = np.concatenate([self._poses, poses])
 
-def _blunt_attempt(task: _Task) -> Iterator[Floats]:
-    """Refined poses of all orientations on blurred densities."""
-    poses, plan = from_spread_orientations(task.sightings, task.body, task.constraint)
-    yield descend(task.sightings, task.body, poses, plan, task.constraint.free)
+    def _rank(self, poses: Floats) -> Floats:
+        """Evidence where all sensors are cameras, else the score."""
+        if self._by_evidence:
+            options = self._budget.evidence
+            free = self._constraint.free
+            return evidence(self._detections, self._body, poses, free, options)
+        return np.asarray(self._descent.objective().shares(poses).sum(axis=0))
 
+    def _is_settled(self) -> bool:
+        """Whether no other kind of guess is needed."""
+        overwhelming = (
+            len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming
+        )
+        wanted = self._budget.sufficient if overwhelming else self._budget.convincing
+        return self._coverage() >= wanted
 
-def _sharp_attempts(task: _Task) -> Iterator[Floats]:
-    """Refined poses of one kind of guess after the other, the quickest kind first."""
-    if task.maps and _is_pointlike(task.body):
-        kinds: list[Iterable[Floats]] = []
-        if task.constraint.turns.sum() < 2:
-            kinds.append(from_restricted_turns(task.sightings, task.body, task.constraint))
-        kinds += from_cameras(task.sightings, task.body, task.rng)
-        for guesses in kinds:
-            shortlist = _shortlist(task, guesses)
-            if len(shortlist):
-                yield _descended(task, shortlist)
+    def _coverage(self) -> float:
+        """Mean share of the features that the sensors meet at the best pose."""
+        if not len(self._poses):
+            return 0.0
+        best = self._poses[self._ranks.argmax()]
+        return float(np.sqrt(self._descent.objective().shares(best[None])).mean())
 
+    def _descended(self, guesses: Floats) -> Floats:
+        """Guesses that are off by a few σ_ε, refined in two ways.
 
-def _shortlist(task: _Task, guesses: Iterable[Floats]) -> Floats:
-    """The guesses that explain most distinct detections, and among equals most closely."""
-    poses, ranks = np.zeros((0, 4, 4)), np.zeros(0)
-    most = max(min(SHORTLISTED, SHORTLISTED * _FEW_FEATURES // len(task.body)), _LEAST)
-    for batch in guesses:
-        allowed = _promising(task, task.constraint.apply(batch))
-        counts, near = explained(task.maps, task.body.means, task.body.normals, allowed)
-        rank = counts.sum(axis=0) + 0.1 * near
-        if len(ranks) == most:
-            better = rank > ranks[-1]
-            allowed, rank = allowed[better], rank[better]
-        poses, ranks = np.concatenate([poses, allowed]), np.concatenate([ranks, rank])
-        order = np.argsort(-ranks, kind="stable")
-        order = order[unlike(task.body, poses[order], _CELL)][:most]
-        poses, ranks = poses[order], ranks[order]
-        if ranks.max(initial=0.0) > _ENOUGH * _most_explainable(task):
-            break
-    return np.asarray(poses[ranks > ranks.max(initial=0.0) - _BEHIND])
+        Once to σ_ε; and once from less to less, where clutter beside a feature pulls less.  Where
+        detections err by as much as σ_ε the second is no gain, and the ranking keeps the first.
+        """
+        if not len(guesses):
+            return guesses
+        self.report = replace(self.report, refined=self.report.refined + len(guesses))
+        plans = self._budget.descent_plans[: None if self._by_evidence else 1]
+        count = len(self._detections)
+        found = [
+            self._descent.refine(
+                guesses, [Stage((factor,) * count, steps, len(guesses)) for factor, steps in plan]
+            )
+            for plan in plans
+        ]
+        return np.concatenate(found)
 
+    def _blunt(self) -> Floats:
+        """Refined poses of all orientations on blurred densities."""
+        poses, stages = from_spread_orientations(
+            self._detections, self._body, self._constraint, self._budget
+        )
+        return self._descent.refine(poses, stages)
 
-def _promising(task: _Task, poses: Floats) -> Floats:
-    """The better of many guesses, judged by some features where the body has many."""
-    few = far_apart(task.body.means, _MANY_FEATURES)
-    if len(few) == len(task.body) or len(poses) <= SHORTLISTED:
+    def _shortlist(self, guesses: Iterator[Floats]) -> Floats:
+        """The guesses that explain most distinct detections, and among equals most closely."""
+        budget = self._budget
+        poses, ranks = np.zeros((0, 4, 4)), np.zeros(0)
+        most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
+        most = max(most, budget.min_shortlist)
+        for batch in guesses:
+            allowed = self._promising(self._constraint.apply(batch))
+            rank = self._count(allowed)
+            if len(ranks) == most:
+                better = rank > ranks[-1]
+                allowed, rank = allowed[better], rank[better]
+            poses, ranks = np.concatenate([poses, allowed]), np.concatenate([ranks, rank])
+            order = np.argsort(-ranks, kind="stable")
+            order = order[unlike(self._body, poses[order], budget.distinct)][:most]
+            poses, ranks = poses[order], ranks[order]
+            if ranks.max(initial=0.0) > budget.enough * self._most_explainable():
+                break
+        return np.asarray(poses[ranks > ranks.max(initial=0.0) - budget.behind])
+
+    def _count(self, poses: Floats, chosen: NDArray[np.intp] | None = None) -> Floats:
+        """Distinct detections explained, and a tenth of how near they are met."""
+        body, few = self._body, slice(None) if chosen is None else chosen
+        normals = None if body.normals is None else body.normals[few]
+        together = self._budget.max_together
+        counts, near = count_inliers(self._images, body.means[few], normals, poses, together)
+        return np.asarray(counts.sum(axis=0) + 0.1 * near)
+
+    def _promising(self, poses: Floats) -> Floats:
+        """The better of many guesses, judged by some features where the body has many."""
+        few = far_apart(self._body.means, self._budget.test_features)
+        self.report = replace(self.report, made=self.report.made + len(poses))
+        if len(few) < len(self._body) and len(poses) > self._budget.shortlist:
+            rank = self._count(poses, few)
+            poses = poses[np.argsort(-rank, kind="stable")[: self._budget.shortlist]]
+        self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
-    normals = None if task.body.normals is None else task.body.normals[few]
-    counts, near = explained(task.maps, task.body.means[few], normals, poses)
-    rank = counts.sum(axis=0) + 0.1 * near
-    return poses[np.argsort(-rank, kind="stable")[:SHORTLISTED]]
 
-
-def _most_explainable(task: _Task) -> float:
-    """Detections that a perfect pose explains; infinite where chance could reach it too."""
-    each = [min(len(task.body), each.count) for each in task.maps]
-    return float(sum(each)) if min(each) >= _MANY_FEATURES else np.inf
-
-
-def _coverage(task: _Task, pose: Floats) -> float:
-    """Mean share of the features that the sensors meet."""
-    finest = levels(task.sightings, [1.0] * len(task.sightings), len(task.body))
-    return float(np.sqrt(scores(finest, task.body, pose[None])).mean())
-
-
-def _candidates(task: _Task, poses: Floats, ranks: Floats, count: int) -> list[Candidate]:
-    """Distinct poses, best first."""
-    finest = levels(task.sightings, [1.0] * len(task.sightings), len(task.body))
-    kept = first_of_each(task.body, poses, ranks, count)
-    values = scores(finest, task.body, poses[kept]).sum(axis=0)
-    return [Candidate(poses[k], float(v), float(ranks[k])) for k, v in zip(kept, values)]
+    def _most_explainable(self) -> float:
+        """Detections that a perfect pose explains; infinite where chance could reach it too."""
+        each = [min(len(self._body), image.count) for image in self._images]
+        return float(sum(each)) if min(each) >= 2 * self._budget.exhaustive else np.inf

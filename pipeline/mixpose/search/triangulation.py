@@ -1,4 +1,4 @@
-"""Points in space where lines of sight of different sensors meet."""
+"""Points in space where rays of different sensors meet."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.search.sightlines import Sightlines
+from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
-
-_LEAST_SINE = 0.02  # of the angle between two lines that still fix a depth
+Indices: TypeAlias = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Meetings:
-    """Points where a line of one sensor comes close to a line of another.
+class TriangulatedPoints:
+    """Points where a ray of one sensor comes close to a ray of another.
 
     Attributes
     ----------
@@ -26,57 +25,68 @@ class Meetings:
         In the world.
     tolerance : (P,) float64
         How far off the point may be, in length units.
+    gap : (P,) float64
+        Distance of the two rays as a share of what the gates allow, 0 to 1.
     sensors : (P, 2) int
         The two sensors, first before second.
-    lines : (P, 2) int
-        The line of either sensor.
+    rays : (P, 2) int
+        The ray of either sensor.
     """
 
     points: Floats
     tolerance: Floats
-    sensors: NDArray[np.intp]
-    lines: NDArray[np.intp]
+    gap: Floats
+    sensors: Indices
+    rays: Indices
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> Meetings:
+    def select(self, chosen: Indices | NDArray[np.bool_]) -> TriangulatedPoints:
         """Some of the points."""
-        return Meetings(
-            self.points[chosen], self.tolerance[chosen], self.sensors[chosen], self.lines[chosen]
+        return TriangulatedPoints(
+            self.points[chosen],
+            self.tolerance[chosen],
+            self.gap[chosen],
+            self.sensors[chosen],
+            self.rays[chosen],
         )
 
 
-def triangulate(lines: Sequence[Sightlines], gates: Sequence[float]) -> Meetings:
-    """All pairs of lines of two sensors that meet within the error of the detections.
+def triangulate(
+    rays: Sequence[Rays], gates: Sequence[float], min_sine: float
+) -> TriangulatedPoints:
+    """All pairs of rays of two sensors that meet within the error of the detections.
 
     Parameters
     ----------
-    lines : sequence of Sightlines
+    rays : sequence of Rays
         One per sensor.
     gates : sequence of float
         Largest error of a detection per sensor, in px.
+    min_sine : float
+        Of the angle between two rays that still fix a depth.
     """
     found = [
-        _between(lines, gates, first, second)
-        for first in range(len(lines))
-        for second in range(first + 1, len(lines))
+        _between(rays, gates, first, second, min_sine)
+        for first in range(len(rays))
+        for second in range(first + 1, len(rays))
     ]
-    if not found:
-        empty = np.zeros((0, 2), dtype=np.intp)
-        return Meetings(np.zeros((0, 3)), np.zeros(0), empty, empty)
-    return Meetings(
+    pairs = np.zeros((0, 2), dtype=np.intp)
+    found.append(TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), np.zeros(0), pairs, pairs))
+    return TriangulatedPoints(
         np.concatenate([each.points for each in found]),
         np.concatenate([each.tolerance for each in found]),
+        np.concatenate([each.gap for each in found]),
         np.concatenate([each.sensors for each in found]),
-        np.concatenate([each.lines for each in found]),
+        np.concatenate([each.rays for each in found]),
     )
 
 
 def _between(
-    lines: Sequence[Sightlines], gates: Sequence[float], first: int, second: int
-) -> Meetings:
-    a, b = lines[first], lines[second]
+    rays: Sequence[Rays], gates: Sequence[float], first: int, second: int, min_sine: float
+) -> TriangulatedPoints:
+    a, b = rays[first], rays[second]
     apart = b.origins[None] - a.origins[:, None]
     cosine = a.directions @ b.directions.T
     along_a = (apart * a.directions[:, None]).sum(axis=-1)
@@ -90,12 +100,13 @@ def _between(
     error_a = gates[first] * (a.offset + a.slope * np.abs(s))
     error_b = gates[second] * (b.offset + b.slope * np.abs(t))
     tolerance = np.hypot(error_a, error_b)
-    good = (gap <= tolerance) & (sine2 > _LEAST_SINE**2)
+    good = (gap <= tolerance) & (sine2 > min_sine**2)
     good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
     i, j = np.nonzero(good)
-    return Meetings(
+    return TriangulatedPoints(
         0.5 * (on_a[i, j] + on_b[i, j]),
         tolerance[i, j] / np.sqrt(sine2[i, j]),
+        gap[i, j] / tolerance[i, j],
         np.tile(np.array([first, second], dtype=np.intp), (len(i), 1)),
         np.stack([i, j], axis=1),
     )

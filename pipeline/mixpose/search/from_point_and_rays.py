@@ -1,7 +1,7 @@
-"""Guesses of several cameras from one point in space and two more lines of sight.
+"""Guesses of several cameras from one point in space and two more rays.
 
 Where cameras see different features, few points in space are known.  From one of them a feature
-at a known distance lies where its line of sight cuts a sphere; two such features must be as far
+at a known distance lies where its ray cuts a sphere; two such features must be as far
 apart as they are on the body.
 """
 
@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.search.alignment import align_triples
-from mixpose.search.sightlines import Sightlines
-from mixpose.search.triangulation import Meetings
+from mixpose.search.triangulation import TriangulatedPoints
+from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
-
-_MOST_PAIRS = 20_000
 
 
 @dataclass(frozen=True)
@@ -45,16 +43,20 @@ class _Spots:
     error: Floats
 
 
-def from_anchors(
-    meetings: Meetings, lines: Sequence[Sightlines], gates: Sequence[float], features: Floats
+def from_point_and_rays(
+    found: TriangulatedPoints,
+    lines: Sequence[Rays],
+    gates: Sequence[float],
+    features: Floats,
+    max_pairs: int,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) with one point in space as a certain feature, anchor by anchor.
 
     Parameters
     ----------
-    meetings : Meetings
+    found : TriangulatedPoints
         The points in space.
-    lines : sequence of Sightlines
+    lines : sequence of Rays
         One per camera.
     gates : sequence of float
         Largest error of a detection per camera, in px.
@@ -62,11 +64,11 @@ def from_anchors(
         Of the body.
     """
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-    for p in range(len(meetings)):
-        around = _lines_around(meetings, p, lines, gates)
+    for p in range(len(found)):
+        around = _lines_around(found, p, lines, gates)
         for i in range(len(features)):
-            spots = _spots(meetings.points[p], around, distances[i], i)
-            a, b = _agreeing(spots, distances)
+            spots = _spots(found.points[p], around, distances[i], i)
+            a, b = _agreeing(spots, distances, max_pairs)
             if len(a) == 0:
                 continue
             body = np.stack(
@@ -76,23 +78,23 @@ def from_anchors(
                     features[spots.feature[b]],
                 ]
             )
-            anchor = np.tile(meetings.points[p], (len(a), 1))
+            anchor = np.tile(found.points[p], (len(a), 1))
             world = np.stack([anchor, spots.points[a], spots.points[b]])
             yield align_triples(body.transpose(0, 2, 1), world.transpose(0, 2, 1))
 
 
 def _lines_around(
-    meetings: Meetings, p: int, lines: Sequence[Sightlines], gates: Sequence[float]
+    found: TriangulatedPoints, p: int, lines: Sequence[Rays], gates: Sequence[float]
 ) -> _Lines:
     parts = []
     for k, each in enumerate(lines):
-        used = meetings.lines[p][meetings.sensors[p] == k]
+        used = found.rays[p][found.sensors[p] == k]
         rest = each.select(np.setdiff1d(np.arange(len(each)), used))
-        away = meetings.points[p] - rest.origins
+        away = found.points[p] - rest.origins
         along = (away * rest.directions).sum(axis=1)
         across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
         error = gates[k] * (rest.offset + rest.slope * np.abs(along))
-        error = np.hypot(error, meetings.tolerance[p])
+        error = np.hypot(error, found.tolerance[p])
         central = np.full(len(rest), rest.central)
         parts.append((rest.origins, rest.directions, along, across, error, central))
     return _Lines(*(np.concatenate(column) for column in zip(*parts)))
@@ -115,7 +117,9 @@ def _spots(anchor: Floats, around: _Lines, distances: Floats, i: int) -> _Spots:
     return _Spots(points, feature, line, around.error[line])
 
 
-def _agreeing(spots: _Spots, distances: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _agreeing(
+    spots: _Spots, distances: Floats, most: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Pairs of spots of two features and two lines that are the right distance apart."""
     x = spots.points
     squares = (x * x).sum(axis=1)
@@ -125,4 +129,4 @@ def _agreeing(spots: _Spots, distances: Floats) -> tuple[NDArray[np.intp], NDArr
     good = (np.abs(apart - wanted) <= error) & (wanted > 0)
     good &= spots.line[:, None] != spots.line[None]
     a, b = np.nonzero(np.triu(good, 1))
-    return a[:_MOST_PAIRS], b[:_MOST_PAIRS]
+    return a[:most], b[:most]

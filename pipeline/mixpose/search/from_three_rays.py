@@ -11,43 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.search.alignment import align_triples
-from mixpose.search.layout import far_apart
+from mixpose.search.budget import SearchBudget
 from mixpose.search.p3p import depths
-from mixpose.search.sightlines import Sightlines
+from mixpose.search.spread import far_apart
+from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
-CHUNK = 4096
-"""Problems solved at once: numbers stay in the cache."""
 
-MOST_PROBLEMS = 250_000
-_FEW = 8  # features, and half as many again detections, of which all triples are tried
-_LEAST_PIXELS = 3.0  # apart, for two features to be told apart
-
-
-def from_three_lines(
-    lines: Sightlines, features: Floats, rng: np.random.Generator
+def from_three_rays(
+    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[Floats]:
-    """Poses (K, 4, 4) from triples of one camera's lines of sight, chunk by chunk.
+    """Poses (K, 4, 4) from triples of one camera's rays, chunk by chunk.
 
     Parameters
     ----------
-    lines : Sightlines
+    lines : Rays
     features : (n, 3) array
         Of the body.
+    budget : SearchBudget
     rng : numpy Generator
         Order of the triples.
     """
     if len(lines) < 3 or len(features) < 3:
         return
     solve = _perspective if lines.central else _orthographic
-    for detections, corners in _problems(lines, features, rng):
-        yield solve(lines, features, detections, corners)
+    for detections, corners in _problems(lines, features, budget, rng):
+        yield solve(lines, features, detections, corners, budget.min_pixels)
 
 
 def _problems(
-    lines: Sightlines, features: Floats, rng: np.random.Generator
+    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[tuple[Indices, Indices]]:
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
@@ -55,34 +50,34 @@ def _problems(
     fix a pose best, and of which the outermost are likely the same.
     """
     n, M = len(features), len(lines)
-    if comb(M, 3) * perm(n, 3) <= MOST_PROBLEMS:
-        yield from _all_problems(np.arange(M), np.arange(n), rng)
+    if comb(M, 3) * perm(n, 3) <= budget.max_problems:
+        yield from _all_problems(np.arange(M), np.arange(n), budget, rng)
         return
-    spread_lines = far_apart(lines.pixels, int(1.5 * _FEW))
-    yield from _all_problems(spread_lines, far_apart(features, _FEW), rng)
-    for _ in range(MOST_PROBLEMS // CHUNK // 2):
-        yield _drawn(M, rng), _drawn(n, rng)
+    spread_lines = far_apart(lines.pixels, int(1.5 * budget.exhaustive))
+    yield from _all_problems(spread_lines, far_apart(features, budget.exhaustive), budget, rng)
+    for _ in range(budget.max_problems // budget.chunk // 2):
+        yield _drawn(M, budget.chunk, rng), _drawn(n, budget.chunk, rng)
 
 
 def _all_problems(
-    detections: Indices, features: Indices, rng: np.random.Generator
+    detections: Indices, features: Indices, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[tuple[Indices, Indices]]:
     by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
     by_feature = np.array(list(permutations(features, 3)), dtype=np.intp).T
     total = by_detection.shape[1] * by_feature.shape[1]
-    order = rng.permutation(total)[:MOST_PROBLEMS]
-    for start in range(0, len(order), CHUNK):
-        a, b = np.divmod(order[start : start + CHUNK], by_feature.shape[1])
+    order = rng.permutation(total)[: budget.max_problems]
+    for start in range(0, len(order), budget.chunk):
+        a, b = np.divmod(order[start : start + budget.chunk], by_feature.shape[1])
         yield by_detection[:, a], by_feature[:, b]
 
 
-def _drawn(count: int, rng: np.random.Generator) -> Indices:
+def _drawn(count: int, problems: int, rng: np.random.Generator) -> Indices:
     """Random triples (3, K) of different indices."""
-    return np.argsort(rng.random((CHUNK, count)), axis=1)[:, :3].T
+    return np.argsort(rng.random((problems, count)), axis=1)[:, :3].T
 
 
 def _perspective(
-    lines: Sightlines, features: Floats, detections: Indices, corners: Indices
+    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
 ) -> Floats:
     directions = lines.directions.T[:, detections].transpose(1, 0, 2)
     body = features.T[:, corners].transpose(1, 0, 2)
@@ -91,14 +86,14 @@ def _perspective(
     distances, which = depths(directions, squared)
     # smaller than this in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > _LEAST_PIXELS * lines.slope * distances.min(axis=0)
+    near = largest > min_pixels * lines.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
     world = lines.origins[0][:, None] + directions[:, :, which] * distances[:, None]
     return align_triples(body[:, :, which], world)
 
 
 def _orthographic(
-    lines: Sightlines, features: Floats, detections: Indices, corners: Indices
+    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
 ) -> Floats:
     """Three parallel lines: the sides' lengths give depth differences, which must add up.
 
@@ -106,7 +101,7 @@ def _orthographic(
     """
     body = features.T[:, corners].transpose(1, 0, 2)
     seen = lines.origins.T[:, detections].transpose(1, 0, 2)
-    tolerance = 3 * _LEAST_PIXELS * lines.offset
+    tolerance = 3 * min_pixels * lines.offset
     rise = []
     for i, j in ((0, 1), (0, 2), (1, 2)):
         side, flat = body[j] - body[i], seen[j] - seen[i]

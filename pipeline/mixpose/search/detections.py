@@ -1,0 +1,138 @@
+"""What each sensor contributes to the search: detections that count alike, and rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import GridPattern, PointPattern
+from mixpose.search.budget import PeakOptions
+from mixpose.sensors import Rays
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SensorDetections:
+    """One sensor with its detections.
+
+    Attributes
+    ----------
+    view : View
+        Its observation holds every detection with the same weight: a bright blob is not worth
+        more features than a faint one, nor are two that merged.
+    points : (M, m) float64
+        Detections in sensor coordinates; none for range profiles and for grey values of bodies
+        whose features are not points.
+    rays : Rays or None
+        None for sensors without lines of sight.
+    mean : (m,) float64
+        Middle of what the sensor saw.
+    spread : float
+        Root mean square distance from it, in sensor units.
+    """
+
+    view: View
+    points: Floats
+    rays: Rays | None
+    mean: Floats
+    spread: float
+
+    @property
+    def sigma(self) -> float:
+        """σ_ε of the sensor."""
+        return self.view.observation.sigma
+
+
+def is_pointlike(body: Body) -> bool:
+    """Whether every feature of a body is a point."""
+    return len(body.nodes.points) == len(body)
+
+
+def sensor_detections(
+    views: Sequence[View], body: Body, options: PeakOptions
+) -> list[SensorDetections]:
+    """Detections of all views that saw something."""
+    found = []
+    for view in views:
+        observation = view.observation
+        if observation.is_empty:
+            continue
+        pattern = observation.pattern
+        # the one place where kinds of pattern differ
+        if isinstance(pattern, PointPattern):
+            points = pattern.points[pattern.weights > 0]
+        elif observation.dimension == 2 and is_pointlike(body):
+            points = peaks(pattern, observation.sigma, options)
+        else:
+            nothing = np.zeros((0, observation.dimension))
+            mean, spread = _moments(*_weighted_places(pattern, options))
+            found.append(SensorDetections(view, nothing, None, mean, spread))
+            continue
+        if len(points):
+            alike = Observation(PointPattern(points, np.ones(len(points))), observation.sigma)
+            mean, spread = _moments(points, np.ones(len(points)))
+            rays = view.sensor.rays(points)
+            seen = View(view.name, view.sensor, alike, view.delay)
+            found.append(SensorDetections(seen, points, rays, mean, spread))
+    return found
+
+
+def _moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
+    """Weighted mean (m,) and root mean square distance from it."""
+    mean = weights @ points / weights.sum()
+    variance = weights @ ((points - mean) ** 2).sum(axis=1) / weights.sum()
+    return mean, float(np.sqrt(variance))
+
+
+def _weighted_places(pattern: GridPattern, options: PeakOptions) -> tuple[Floats, Floats]:
+    """Grid points (K, m) that stand out, and their values (K,)."""
+    values = pattern.values.astype(np.float64)
+    rows, columns = np.nonzero(values > options.grey_floor * values.max())
+    places = np.stack([columns, rows], axis=1)[:, : len(pattern.origin)]
+    return pattern.origin + pattern.step * places, values[rows, columns]
+
+
+def peaks(pattern: GridPattern, sigma: float, options: PeakOptions) -> Floats:
+    """Local maxima (M, 2) of a blurred image, highest first, in sensor coordinates.
+
+    Parameters
+    ----------
+    pattern : GridPattern
+    sigma : float
+        Standard deviation of the blur in sensor units.
+    options : PeakOptions
+    """
+    values = np.asarray(pattern.values, dtype=np.float32)
+    spread = max(sigma / pattern.step, 0.5)
+    blurred = np.asarray(
+        cv2.GaussianBlur(values, (0, 0), spread, borderType=cv2.BORDER_CONSTANT), dtype=np.float32
+    )
+    size = 2 * max(round(spread), 1) + 1
+    highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
+    rows, columns = np.nonzero((blurred >= highest) & (blurred > options.height * blurred.max()))
+    order = np.argsort(-blurred[rows, columns], kind="stable")[: options.max_peaks]
+    rows, columns = rows[order], columns[order]
+    inner_rows = np.clip(rows, 1, values.shape[0] - 2)
+    inner_columns = np.clip(columns, 1, values.shape[1] - 2)
+    shift_u = _vertex(*(blurred[rows, inner_columns + k] for k in (-1, 0, 1)))
+    shift_v = _vertex(*(blurred[inner_rows + k, columns] for k in (-1, 0, 1)))
+    places = np.stack([inner_columns + shift_u, inner_rows + shift_v], axis=1)
+    return np.asarray(pattern.origin + pattern.step * places)
+
+
+def _vertex(
+    before: NDArray[np.float32], here: NDArray[np.float32], after: NDArray[np.float32]
+) -> Floats:
+    """Offset of the top of the parabola through three neighbours, within half a step."""
+    bend = (2.0 * here - before - after).astype(np.float64)
+    slope = 0.5 * (after - before).astype(np.float64)
+    return np.asarray(np.clip(slope / np.maximum(bend, 1e-12), -0.5, 0.5))

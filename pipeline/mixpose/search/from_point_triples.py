@@ -1,0 +1,201 @@
+"""Guesses of several cameras: three triangulated points as three features of the body.
+
+Triangles of features are put into a tree by the lengths of their sides, once for a body; three
+points find the triangles of the same shape in it.  The points that most cameras confirm, and where
+the rays pass each other most closely, are combined first (PROSAC, Chum and Matas, CVPR 2005).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mixpose.body import Body
+from mixpose.search.alignment import align_triples
+from mixpose.search.budget import SearchBudget
+from mixpose.search.detections import SensorDetections
+from mixpose.search.triangulation import TriangulatedPoints
+
+Floats: TypeAlias = NDArray[np.float64]
+Indices: TypeAlias = NDArray[np.intp]
+
+_SIDES = ((0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True)
+class FeatureTriangles:
+    """Ordered triples of features that span a triangle.
+
+    Attributes
+    ----------
+    corners : (K, 3) int
+    sides : (K, 3) float64
+        Lengths between corners 0 and 1, 0 and 2, 1 and 2.
+    tree : cKDTree
+        Of the sides.
+    """
+
+    corners: Indices
+    sides: Floats
+    tree: cKDTree
+
+
+@lru_cache(maxsize=16)
+def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTriangles:
+    """All ordered triples of a body's features, or as many at random.
+
+    Parameters
+    ----------
+    body : Body
+    count : int
+        Most triangles.
+    min_height : float
+        Of a triangle, as a share of its longest side.
+    """
+    n = len(body)
+    if n * (n - 1) * (n - 2) <= count:
+        corners = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    else:
+        corners = np.random.default_rng(0).integers(0, n, (count, 3))
+    sides = _sides(body.means, corners)
+    wide = _is_wide(sides, min_height)
+    corners, sides = corners[wide], sides[wide]
+    return FeatureTriangles(corners, sides, cKDTree(sides.reshape(-1, 3)))
+
+
+def from_point_triples(
+    found: TriangulatedPoints,
+    body: Body,
+    budget: SearchBudget,
+    rng: np.random.Generator,
+) -> Iterator[Floats]:
+    """Poses (K, 4, 4) of triples of points, batch by batch.
+
+    Parameters
+    ----------
+    found : TriangulatedPoints
+        Most promising first.
+    body : Body
+    budget : SearchBudget
+    rng : numpy Generator
+        Draws among the triples of all points where they are too many.
+    """
+    triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
+    if not len(triangles.corners):
+        return
+    for drawn in _point_triples(found, budget, rng):
+        wide = _is_wide(_sides(found.points, drawn), budget.min_height)
+        triples = drawn[wide]
+        sides = _sides(found.points, triples)
+        if not len(triples):
+            continue
+        tolerance = found.tolerance[triples]
+        allowed = np.stack([np.hypot(tolerance[:, i], tolerance[:, j]) for i, j in _SIDES], axis=1)
+        k = min(budget.triangles_alike, len(triangles.corners))
+        away, index = triangles.tree.query(
+            sides, k=np.arange(1, k + 1), distance_upper_bound=float(allowed.max()) * np.sqrt(3)
+        )
+        which, rank = np.nonzero(np.isfinite(away))
+        chosen = index[which, rank]
+        off = np.abs(sides[which] - triangles.sides[chosen])
+        alike = (off <= allowed[which]).all(axis=1)
+        which, chosen = which[alike], chosen[alike]
+        world = found.points[triples[which]].transpose(1, 2, 0)
+        features = body.means[triangles.corners[chosen]].transpose(1, 2, 0)
+        yield align_triples(features, world)
+
+
+def by_promise(
+    found: TriangulatedPoints, detections: Sequence[SensorDetections], gate: float, count: int
+) -> TriangulatedPoints:
+    """The points that most sensors confirm, the closest first, each place once.
+
+    Parameters
+    ----------
+    found : TriangulatedPoints
+    detections : sequence of SensorDetections
+        Of the sensors with rays.
+    gate : float
+        Largest error of a detection in σ_ε.
+    count : int
+        Most points.
+    """
+    support, error = np.zeros(len(found)), found.gap.copy()
+    if len(detections) > 2:
+        error[:] = 0.0
+        for each in detections:
+            y, seen = each.view.sensor.project(found.points)
+            reach = gate * each.sigma
+            away, _ = cKDTree(each.points).query(y, distance_upper_bound=reach)
+            met = seen & np.isfinite(away)
+            support += met
+            error += np.where(met, away / reach, 0.0)
+        error /= np.maximum(support, 1.0)
+    order = np.lexsort((error, -support))
+    kept: list[int] = []
+    left = np.ones(len(found), dtype=np.bool_)
+    for k in order:
+        if left[k]:
+            kept.append(int(k))
+            if len(kept) == count:
+                break
+            near = np.abs(found.points - found.points[k]).max(axis=1) <= found.tolerance[k]
+            left &= ~near
+    return found.select(np.array(kept, dtype=np.intp))
+
+
+def _point_triples(
+    found: TriangulatedPoints, budget: SearchBudget, rng: np.random.Generator
+) -> Iterator[Indices]:
+    """Batches of triples (K, 3) of points that share no ray, the most promising first."""
+    P = len(found)
+    first = min(P, budget.max_prosac_points)
+    if first < 3:
+        return
+    excluded = _share_a_ray(found)
+    triples = _combinations(first)
+    if first < P:
+        triples = np.concatenate([triples, rng.integers(0, P, (budget.random_triples, 3))])
+    for start in range(0, len(triples), budget.batch):
+        i, j, k = triples[start : start + budget.batch].T
+        good = ~(excluded[i, j] | excluded[i, k] | excluded[j, k])
+        yield np.stack([i, j, k], axis=1)[good]
+
+
+@lru_cache(maxsize=64)
+def _combinations(count: int) -> Indices:
+    """Triples below a number, those of the first first."""
+    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp)
+    return triples[np.argsort(triples[:, 2], kind="stable")]
+
+
+def _share_a_ray(found: TriangulatedPoints) -> NDArray[np.bool_]:
+    """Pairs of points (P, P) that share a ray: at most one of them is a feature."""
+    shared = np.eye(len(found), dtype=np.bool_)
+    for a in range(2):
+        for b in range(2):
+            shared |= (found.sensors[:, a, None] == found.sensors[None, :, b]) & (
+                found.rays[:, a, None] == found.rays[None, :, b]
+            )
+    return shared
+
+
+def _sides(points: Floats, triples: Indices) -> Floats:
+    corners = points[triples]
+    sides = [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in _SIDES]
+    return np.stack(sides, axis=1)
+
+
+def _is_wide(sides: Floats, min_height: float) -> NDArray[np.bool_]:
+    """Whether triangles with sides (K, 3) have a height, as a share of the longest side."""
+    a, b, c = np.sort(sides, axis=1).T
+    # Heron's formula; twice the area is height times longest side
+    area4 = np.maximum((a + b + c) * (a + b - c) * (a - b + c) * (b + c - a), 0.0)
+    return np.asarray(np.sqrt(area4) / 2 > min_height * c * c)
