@@ -81,7 +81,6 @@ class SearchBudget:
     shortlist: int = _because(300, "guesses refined; fewer for bodies of more than 8 features")
     min_shortlist: int = _because(40, "guesses refined at least, for bodies of many features")
     behind: float = _because(3.0, "detections that a refined guess may explain less than the best")
-    enough: float = _because(0.8, "of all detections explained: better guesses are not sought")
     distinct: float = _because(0.05, "of the body's radius: guesses nearer to each other are one")
     convincing: float = _because(
         0.7, "share of the body that must be met for no other kind of guess to be made"
@@ -108,10 +107,18 @@ class SearchBudget:
         ((1.0, 0, 500), (1.0, 3, 300), (0.6, 4, 150), (0.3, 4, 60), (0.0, 6, 24)),
         "power of that blur, steps and survivors of each stage: 3 ranges 6/0/0 99 of 100",
     )
-    descent_plans: tuple[tuple[tuple[float, int], ...], ...] = _because(
-        (((3.0, 1), (1.5, 2), (1.0, 3)), ((1.5, 2), (0.75, 2), (0.4, 2))),
-        "blurs in σ_ε and steps; the second, for cameras: clutter beside a feature draws less",
+    descent_plan: tuple[tuple[float, int], ...] = _because(
+        ((1.5, 2), (0.75, 2), (0.4, 2)),
+        "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
     )
+    wide_plan: tuple[tuple[float, int], ...] = _because(
+        ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
+    )
+    final_plan: tuple[tuple[float, int], ...] = _because(
+        ((1.5, 1), (1.0, 2)), "the same for the best, where detections err by as much as σ_ε"
+    )
+    finalists: int = _because(16, "poses refined by the final plan, too")
+    checked: int = _because(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
     peaks: PeakOptions = PeakOptions()
     evidence: EvidenceOptions = EvidenceOptions()

@@ -152,12 +152,15 @@ class _Run:
                 self._keep(self._descended(self._shortlist(guesses)))
                 if self._is_settled():
                     break
-        if self._coverage() < budget.sufficient:
-            self._keep(self._blunt())
+        if not self._by_evidence or not self.report.made:
+            if self._coverage() < budget.sufficient:
+                self._keep(self._blunt())
         slippery = 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
         if len(self._poses) and self._images and slippery:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
+        best = np.argsort(-self._ranks, kind="stable")[: budget.finalists]
+        self._keep(self._refined(self._poses[best], budget.final_plan))
 
     def candidates(self, count: int) -> list[Candidate]:
         """Distinct poses, best first."""
@@ -198,23 +201,15 @@ class _Run:
         return float(np.sqrt(self._descent.objective().shares(best[None])).mean())
 
     def _descended(self, guesses: Floats) -> Floats:
-        """Guesses that are off by a few σ_ε, refined in two ways.
-
-        Once to σ_ε; and once from less to less, where clutter beside a feature pulls less.  Where
-        detections err by as much as σ_ε the second is no gain, and the ranking keeps the first.
-        """
-        if not len(guesses):
-            return guesses
+        """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        plans = self._budget.descent_plans[: None if self._by_evidence else 1]
+        plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
+        return self._refined(guesses, plan)
+
+    def _refined(self, poses: Floats, plan: Sequence[tuple[float, int]]) -> Floats:
         count = len(self._detections)
-        found = [
-            self._descent.refine(
-                guesses, [Stage((factor,) * count, steps, len(guesses)) for factor, steps in plan]
-            )
-            for plan in plans
-        ]
-        return np.concatenate(found)
+        stages = [Stage((factor,) * count, steps, len(poses)) for factor, steps in plan]
+        return self._descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""
@@ -226,7 +221,7 @@ class _Run:
     def _shortlist(self, guesses: Iterator[Floats]) -> Floats:
         """The guesses that explain most distinct detections, and among equals most closely."""
         budget = self._budget
-        poses, ranks = np.zeros((0, 4, 4)), np.zeros(0)
+        poses, ranks, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0
         most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
         most = max(most, budget.min_shortlist)
         for batch in guesses:
@@ -239,8 +234,9 @@ class _Run:
             order = np.argsort(-ranks, kind="stable")
             order = order[unlike(self._body, poses[order], budget.distinct)][:most]
             poses, ranks = poses[order], ranks[order]
-            if ranks.max(initial=0.0) > budget.enough * self._most_explainable():
+            if ranks.max(initial=0.0) > checked + 1 and self._is_found(poses[: budget.checked]):
                 break
+            checked = max(checked, ranks.max(initial=0.0))
         return np.asarray(poses[ranks > ranks.max(initial=0.0) - budget.behind])
 
     def _count(self, poses: Floats, chosen: NDArray[np.intp] | None = None) -> Floats:
@@ -261,7 +257,12 @@ class _Run:
         self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
 
-    def _most_explainable(self) -> float:
-        """Detections that a perfect pose explains; infinite where chance could reach it too."""
-        each = [min(len(self._body), image.count) for image in self._images]
-        return float(sum(each)) if min(each) >= 2 * self._budget.exhaustive else np.inf
+    def _is_found(self, guesses: Floats) -> bool:
+        """Whether the best guesses of several cameras leave no need for others."""
+        budget = self._budget
+        if not self._by_evidence or len(self._detections) < 2:
+            return False
+        if self._rank(guesses).max() < budget.overwhelming / 2:
+            return False
+        self._keep(self._descended(guesses))
+        return self._is_settled()
