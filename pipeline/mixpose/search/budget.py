@@ -58,9 +58,9 @@ class SearchBudget:
         None, "guesses of one search, counted and not timed, so that results repeat; None: thorough"
     )
     gate: float = _because(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
-    max_points: int = _because(200, "triangulated points kept, the most promising first")
+    max_points: int = _because(1000, "triangulated points kept, the most promising first")
     max_prosac_points: int = _because(50, "of them all triples are tried: 19,600, which take 0.1 s")
-    random_triples: int = _because(20_000, "triples of all points that are tried after them")
+    random_triples: int = _because(20_000, "triples of points near each other tried after them")
     max_triangles: int = _because(120_000, "of features kept for a body: all of 50 features")
     triangles_alike: int = _because(16, "of features tried for three points, the nearest in shape")
     min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
@@ -72,6 +72,9 @@ class SearchBudget:
     max_problems: int = _because(250_000, "triples of rays as triples of features, of one camera")
     exhaustive: int = _because(
         8, "features, and half as many again rays, of which all triples are tried first"
+    )
+    crowds: tuple[int, ...] = _because(
+        (8, 16, 32), "nearest detections among which triples are drawn: a body is seen in one place"
     )
     chunk: int = _because(4096, "problems solved together: numbers stay in the cache")
     min_pixels: float = _because(3.0, "apart in the image, for two features to be told apart")

@@ -88,12 +88,14 @@ def from_point_triples(
         Draws among the triples of all points where they are too many.
     """
     triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
-    if not len(triangles.corners):
+    if not len(triangles.corners) or len(found) < 3:
         return
-    for drawn in _point_triples(found, budget, rng):
-        wide = _is_wide(_sides(found.points, drawn), budget.min_height)
-        triples = drawn[wide]
-        sides = _sides(found.points, triples)
+    longest = float(triangles.sides.max())
+    for drawn in _point_triples(found, longest, budget, rng):
+        sides = _sides(found.points, drawn)
+        slack = 2 * found.tolerance[drawn].max(axis=1)
+        possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
+        triples, sides = drawn[possible], sides[possible]
         if not len(triples):
             continue
         tolerance = found.tolerance[triples]
@@ -152,39 +154,53 @@ def by_promise(
 
 
 def _point_triples(
-    found: TriangulatedPoints, budget: SearchBudget, rng: np.random.Generator
+    found: TriangulatedPoints, reach: float, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[Indices]:
     """Batches of triples (K, 3) of points that share no ray, the most promising first."""
-    P = len(found)
-    first = min(P, budget.max_prosac_points)
-    if first < 3:
-        return
-    excluded = _share_a_ray(found)
+    first = min(len(found), budget.max_prosac_points)
     triples = _combinations(first)
-    if first < P:
-        triples = np.concatenate([triples, rng.integers(0, P, (budget.random_triples, 3))])
+    if first < len(found):
+        triples = np.concatenate([triples, _near_triples(found.points, reach, budget, rng)])
     for start in range(0, len(triples), budget.batch):
-        i, j, k = triples[start : start + budget.batch].T
-        good = ~(excluded[i, j] | excluded[i, k] | excluded[j, k])
-        yield np.stack([i, j, k], axis=1)[good]
+        batch = triples[start : start + budget.batch]
+        shared = [_share_a_ray(found, batch[:, i], batch[:, j]) for i, j in _SIDES]
+        yield batch[~np.any(shared, axis=0)]
 
 
 @lru_cache(maxsize=64)
 def _combinations(count: int) -> Indices:
-    """Triples below a number, those of the first first."""
-    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp)
+    """Triples (K, 3) of numbers below `count`, those of the first numbers first."""
+    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
     return triples[np.argsort(triples[:, 2], kind="stable")]
 
 
-def _share_a_ray(found: TriangulatedPoints) -> NDArray[np.bool_]:
-    """Pairs of points (P, P) that share a ray: at most one of them is a feature."""
-    shared = np.eye(len(found), dtype=np.bool_)
-    for a in range(2):
-        for b in range(2):
-            shared |= (found.sensors[:, a, None] == found.sensors[None, :, b]) & (
-                found.rays[:, a, None] == found.rays[None, :, b]
-            )
-    return shared
+def _near_triples(
+    points: Floats, reach: float, budget: SearchBudget, rng: np.random.Generator
+) -> Indices:
+    """Triples (K, 3) drawn among points (P, 3) that are within reach of the first of them."""
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    counts = np.bincount(pairs[:, 0], minlength=len(points))
+    crowded = np.flatnonzero(counts > 1)
+    if not len(crowded):
+        return np.zeros((0, 3), dtype=np.intp)
+    first = rng.choice(crowded, budget.random_triples)
+    begin = (np.cumsum(counts) - counts)[first]
+    second, third = (
+        pairs[begin + (rng.random(len(first)) * counts[first]).astype(np.intp), 1] for _ in range(2)
+    )
+    return np.stack([first, second, third], axis=1)[second != third]
+
+
+def _share_a_ray(found: TriangulatedPoints, i: Indices, j: Indices) -> NDArray[np.bool_]:
+    """Whether points share a ray: then at most one of them is a feature."""
+    same = [
+        (found.sensors[i, a] == found.sensors[j, b]) & (found.rays[i, a] == found.rays[j, b])
+        for a in range(2)
+        for b in range(2)
+    ]
+    return np.asarray(np.any(same, axis=0))
 
 
 def _sides(points: Floats, triples: Indices) -> Floats:

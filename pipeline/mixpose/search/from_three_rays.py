@@ -55,8 +55,15 @@ def _problems(
         return
     spread_lines = far_apart(lines.pixels, int(1.5 * budget.exhaustive))
     yield from _all_problems(spread_lines, far_apart(features, budget.exhaustive), budget, rng)
-    for _ in range(budget.max_problems // budget.chunk // 2):
-        yield _drawn(M, budget.chunk, rng), _drawn(n, budget.chunk, rng)
+    nearest = np.argsort(np.linalg.norm(lines.pixels[:, None] - lines.pixels, axis=2), axis=1)
+    for k in range(budget.max_problems // budget.chunk // 2):
+        crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]
+        first = rng.integers(0, M, budget.chunk)
+        chosen = _drawn(min(crowd, M) - 1, 2, budget.chunk, rng) + 1
+        yield (
+            np.stack([first, nearest[first, chosen[0]], nearest[first, chosen[1]]]),
+            _drawn(n, 3, budget.chunk, rng),
+        )
 
 
 def _all_problems(
@@ -71,9 +78,9 @@ def _all_problems(
         yield by_detection[:, a], by_feature[:, b]
 
 
-def _drawn(count: int, problems: int, rng: np.random.Generator) -> Indices:
-    """Random triples (3, K) of different indices."""
-    return np.argsort(rng.random((problems, count)), axis=1)[:, :3].T
+def _drawn(count: int, size: int, problems: int, rng: np.random.Generator) -> Indices:
+    """Random tuples (size, problems) of different numbers below `count`."""
+    return np.argsort(rng.random((problems, count)), axis=1)[:, :size].T
 
 
 def _perspective(

@@ -186,12 +186,17 @@ class _Run:
         return np.asarray(self._descent.objective().shares(poses).sum(axis=0))
 
     def _is_settled(self) -> bool:
-        """Whether no other kind of guess is needed."""
-        overwhelming = (
-            len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming
-        )
-        wanted = self._budget.sufficient if overwhelming else self._budget.convincing
-        return self._coverage() >= wanted
+        """Whether no other kind of guess is needed.
+
+        Where the evidence of several cameras is overwhelming, only a pose that explains most of
+        the detections could still be better.
+        """
+        if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming:
+            best = self._poses[self._ranks.argmax()]
+            explainable = sum(min(image.count, len(self._body)) for image in self._images)
+            explained = int(self._count(best[None])[0]) / max(explainable, 1)
+            return max(self._coverage(), explained) >= self._budget.sufficient
+        return self._coverage() >= self._budget.convincing
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
