@@ -66,10 +66,12 @@ class SearchBudget:
     min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
     batch: int = _because(1000, "triples of points between two looks at what was found")
     subsample: int = _because(10, "features far apart that stand for a body in guesses and tests")
-    max_anchors: int = _because(24, "points with which two rays are combined, least error first")
-    max_rays: int = _because(20, "rays of a camera that are combined with a point, far apart")
-    max_pairs: int = _because(20_000, "pairs of places on rays for one point as one feature")
-    max_problems: int = _because(250_000, "triples of rays as triples of features, of one camera")
+    max_anchors: int = _because(24, "points with which two rays are combined, the most promising")
+    max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
+    max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
+    max_problems: int = _because(
+        250_000, "triples of rays as triples of features, of all cameras together"
+    )
     exhaustive: int = _because(
         8, "features, and half as many again rays, of which all triples are tried first"
     )
@@ -93,6 +95,12 @@ class SearchBudget:
     )
     overwhelming: float = _because(
         24.0, "evidence in nats that leaves no doubt: a million guesses make 14"
+    )
+    survivors: tuple[int, ...] = _because(
+        (100, 50, 50), "guesses left after each blur of a plan: the cosine tells the good ones"
+    )
+    min_recurrence: float = _because(
+        0.3, "share of a body met a step aside, from which slips are looked for: 1/N at random"
     )
     max_slip_features: int = _because(120, "of a body up to which shifts by a grid step are tried")
     place_steps: int = _because(12, "Newton steps from a start to where the body's middle is")

@@ -19,7 +19,7 @@ from mixpose.search.orientations import spread_turns
 from mixpose.search.placement import centres, on_points, on_rays, place
 from mixpose.search.refinement import Stage
 from mixpose.search.spread import far_apart
-from mixpose.search.triangulation import triangulate
+from mixpose.search.triangulation import TriangulatedPoints, triangulate
 from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -34,21 +34,20 @@ def kinds_of_guesses(
 ) -> list[Iterator[Floats]]:
     """Kinds of guesses from rays, the quickest first; each yields poses (K, 4, 4) in batches.
 
-    Points in space; one such point and two rays; three rays of one camera.  Of many detections,
-    one point is as good as another, and three rays of one camera come before it.
+    Points in space; one such point and two rays; three rays of one camera.
     """
     seen = [each for each in detections if each.rays is not None and len(each.rays)]
     rays = [each.rays for each in seen if each.rays is not None]
     kinds = []
     if constraint.turns.sum() < 2:
         kinds.append(_from_restricted_turns(seen, body, constraint, budget))
-    single = [from_three_rays(each, body.means, budget, rng) for each in rays]
+    most = budget.max_problems // max(len(rays), 1)
+    single = [from_three_rays(each, body.means, most, budget, rng) for each in rays]
     if len(rays) < 2:
         return [*kinds, *single]
     points = _from_points(seen, body, budget, rng)
     anchors = _from_anchors(seen, body, budget)
-    many = max(len(each) for each in rays) > budget.max_rays
-    return [*kinds, points, *single, anchors] if many else [*kinds, points, anchors, *single]
+    return [*kinds, points, anchors, *single]
 
 
 def _rays_and_gates(
@@ -58,26 +57,29 @@ def _rays_and_gates(
     return rays, [budget.gate * each.sigma for each in detections]
 
 
+def _triangulated(
+    detections: Sequence[SensorDetections], budget: SearchBudget
+) -> TriangulatedPoints:
+    found = triangulate(*_rays_and_gates(detections, budget), budget.min_sine)
+    return by_promise(found, detections, budget.gate, budget.max_points)
+
+
 def _from_points(
     detections: Sequence[SensorDetections],
     body: Body,
     budget: SearchBudget,
     rng: np.random.Generator,
 ) -> Iterator[Floats]:
-    found = triangulate(*_rays_and_gates(detections, budget), budget.min_sine)
-    found = by_promise(found, detections, budget.gate, budget.max_points)
-    yield from from_point_triples(found, body, budget, rng)
+    yield from from_point_triples(_triangulated(detections, budget), body, budget, rng)
 
 
 def _from_anchors(
     detections: Sequence[SensorDetections], body: Body, budget: SearchBudget
 ) -> Iterator[Floats]:
     rays, gates = _rays_and_gates(detections, budget)
-    rays = [each.select(far_apart(each.pixels, budget.max_rays)) for each in rays]
-    found = triangulate(rays, gates, budget.min_sine)
-    found = found.select(np.argsort(found.tolerance)[: budget.max_anchors])
     features = body.means[far_apart(body.means, budget.subsample)]
-    yield from from_point_and_rays(found, rays, gates, features, budget.max_pairs)
+    found = _triangulated(detections, budget)
+    yield from from_point_and_rays(found, rays, gates, features, budget)
 
 
 def _from_restricted_turns(

@@ -155,7 +155,8 @@ class _Run:
         if not self._by_evidence or not self.report.made:
             if self._coverage() < budget.sufficient:
                 self._keep(self._blunt())
-        slippery = 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
+        slippery = self._body.recurrence >= budget.min_recurrence
+        slippery &= 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
         if len(self._poses) and self._images and slippery:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
@@ -213,7 +214,10 @@ class _Run:
 
     def _refined(self, poses: Floats, plan: Sequence[tuple[float, int]]) -> Floats:
         count = len(self._detections)
-        stages = [Stage((factor,) * count, steps, len(poses)) for factor, steps in plan]
+        stages = [
+            Stage((factor,) * count, steps, left)
+            for (factor, steps), left in zip(plan, self._budget.survivors)
+        ]
         return self._descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
