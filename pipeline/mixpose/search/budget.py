@@ -65,12 +65,15 @@ class SearchBudget:
     triangles_alike: int = _because(16, "of features tried for three points, the nearest in shape")
     min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
     batch: int = _because(1000, "triples of points between two looks at what was found")
-    subsample: int = _because(10, "features far apart that stand for a body in guesses and tests")
-    max_anchors: int = _because(24, "points with which two rays are combined, the most promising")
+    subsample: int = _because(8, "features far apart that stand for a body beside a point")
+    max_anchors: int = _because(16, "points with which two rays are combined, the most promising")
     max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
     max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
     max_problems: int = _because(
-        250_000, "triples of rays as triples of features, of all cameras together"
+        250_000, "triples of rays as triples of features, of one camera alone"
+    )
+    max_shared_problems: int = _because(
+        100_000, "the same for several cameras together, of which one hit of one is enough"
     )
     exhaustive: int = _because(
         8, "features, and half as many again rays, of which all triples are tried first"
@@ -83,7 +86,7 @@ class SearchBudget:
     min_sine: float = _because(0.02, "of the angle between rays: below it no depth is fixed")
     max_together: int = _because(100_000, "features times poses tested together: cache size")
     test_features: int = _because(16, "features by which many guesses are compared at first")
-    shortlist: int = _because(300, "guesses refined; fewer for bodies of more than 8 features")
+    shortlist: int = _because(150, "guesses refined; fewer for bodies of more than 8 features")
     min_shortlist: int = _because(40, "guesses refined at least, for bodies of many features")
     behind: float = _because(3.0, "detections that a refined guess may explain less than the best")
     distinct: float = _because(0.05, "of the body's radius: guesses nearer to each other are one")
@@ -94,13 +97,16 @@ class SearchBudget:
         0.45, "the same at overwhelming evidence, and for no spread orientations to be tried"
     )
     overwhelming: float = _because(
-        24.0, "evidence in nats that leaves no doubt: a million guesses make 14"
+        28.0, "evidence in nats that leaves no doubt: a wrong pose reached 26 in 100 of 8/4/8"
     )
     survivors: tuple[int, ...] = _because(
         (100, 50, 50), "guesses left after each blur of a plan: the cosine tells the good ones"
     )
     min_recurrence: float = _because(
         0.3, "share of a body met a step aside, from which slips are looked for: 1/N at random"
+    )
+    beyond_doubt: float = _because(
+        32.0, "the same for a kind of guess to be cut short"
     )
     max_slip_features: int = _because(120, "of a body up to which shifts by a grid step are tried")
     place_steps: int = _because(12, "Newton steps from a start to where the body's middle is")

@@ -41,7 +41,9 @@ def kinds_of_guesses(
     kinds = []
     if constraint.turns.sum() < 2:
         kinds.append(_from_restricted_turns(seen, body, constraint, budget))
-    most = budget.max_problems // max(len(rays), 1)
+    most = budget.max_problems
+    if len(rays) > 1:
+        most = budget.max_shared_problems // len(rays)
     single = [from_three_rays(each, body.means, most, budget, rng) for each in rays]
     if len(rays) < 2:
         return [*kinds, *single]

@@ -271,7 +271,7 @@ class _Run:
         budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._rank(guesses).max() < budget.overwhelming / 2:
+        if self._rank(guesses).max() < budget.beyond_doubt / 4:
             return False
         self._keep(self._descended(guesses))
-        return self._is_settled()
+        return self._ranks.max() > budget.beyond_doubt and self._is_settled()
