@@ -51,6 +51,7 @@ def from_point_and_rays(
     gates: Sequence[float],
     features: Floats,
     budget: SearchBudget,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) with one point in space as each feature, point by point.
 
@@ -65,9 +66,11 @@ def from_point_and_rays(
     features : (n, 3) array
         Of the body.
     budget : SearchBudget
+    skipped : int
+        Points left out, as they were tried before.
     """
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-    for p in range(min(len(found), budget.max_anchors)):
+    for p in range(skipped, min(len(found), budget.max_anchors)):
         near = _rays_near(found, p, rays, gates, budget.max_rays)
         body, world = [], []
         for i in range(len(features)):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, islice
 from typing import TypeAlias
 
 import numpy as np
@@ -75,6 +75,7 @@ def from_point_triples(
     body: Body,
     budget: SearchBudget,
     rng: np.random.Generator,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) of triples of points, batch by batch.
 
@@ -86,23 +87,25 @@ def from_point_triples(
     budget : SearchBudget
     rng : numpy Generator
         Draws among the triples of all points where they are too many.
+    skipped : int
+        Batches left out, as they were tried before.
     """
     triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
     if not len(triangles.corners) or len(found) < 3:
         return
     longest = float(triangles.sides.max())
-    for drawn in _point_triples(found, longest, budget, rng):
+    for drawn in islice(_point_triples(found, longest, budget, rng), skipped, None):
         sides = _sides(found.points, drawn)
         slack = 2 * found.tolerance[drawn].max(axis=1)
         possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
         triples, sides = drawn[possible], sides[possible]
-        if not len(triples):
-            continue
         tolerance = found.tolerance[triples]
         allowed = np.stack([np.hypot(tolerance[:, i], tolerance[:, j]) for i, j in _SIDES], axis=1)
         k = min(budget.triangles_alike, len(triangles.corners))
         away, index = triangles.tree.query(
-            sides, k=np.arange(1, k + 1), distance_upper_bound=float(allowed.max()) * np.sqrt(3)
+            sides,
+            k=np.arange(1, k + 1),
+            distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
         )
         which, rank = np.nonzero(np.isfinite(away))
         chosen = index[which, rank]

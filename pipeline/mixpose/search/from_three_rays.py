@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, permutations
+from itertools import combinations, islice, permutations
 from math import comb, perm
 from typing import TypeAlias
 
@@ -21,7 +21,12 @@ Indices: TypeAlias = NDArray[np.intp]
 
 
 def from_three_rays(
-    rays: Rays, features: Floats, most: int, budget: SearchBudget, rng: np.random.Generator
+    rays: Rays,
+    features: Floats,
+    most: int,
+    budget: SearchBudget,
+    rng: np.random.Generator,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) from triples of one camera's rays, chunk by chunk.
 
@@ -35,11 +40,13 @@ def from_three_rays(
     budget : SearchBudget
     rng : numpy Generator
         Order of the triples.
+    skipped : int
+        Chunks left out, as they were tried before.
     """
     if len(rays) < 3 or len(features) < 3:
         return
     solve = _perspective if rays.central else _orthographic
-    for detections, corners in _problems(rays, features, most, budget, rng):
+    for detections, corners in islice(_problems(rays, features, most, budget, rng), skipped, None):
         yield solve(rays, features, detections, corners, budget.min_pixels)
 
 

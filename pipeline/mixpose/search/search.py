@@ -63,6 +63,31 @@ class SearchReport:
     refined: int = 0
 
 
+@dataclass(frozen=True)
+class SearchState:
+    """Where a search with a limited budget goes on in the next frame.
+
+    Attributes
+    ----------
+    kind : int
+        Kind of guess, after the first, which is tried in every frame.
+    batch : int
+        Batches of it that were tried.
+    """
+
+    kind: int = 0
+    batch: int = 0
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Candidates, best first, what they cost, and where to go on while none convinces."""
+
+    candidates: list[Candidate]
+    report: SearchReport
+    state: SearchState
+
+
 def search(
     views: Sequence[View],
     body: Body,
@@ -73,7 +98,30 @@ def search(
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
 ) -> list[Candidate]:
-    """Find poses that explain the views, without a start.
+    """Find poses that explain the views, without a start; arguments as of `search_frame`.
+
+    Returns
+    -------
+    list of Candidate
+        Best first, no two alike modulo the body's symmetries; empty where nothing was seen.
+    """
+    return search_frame(
+        views, body, free=free, T_reference=T_reference, count=count, seed=seed, budget=budget
+    ).candidates
+
+
+def search_frame(
+    views: Sequence[View],
+    body: Body,
+    *,
+    free: NDArray[np.bool_],
+    T_reference: Floats | None,
+    count: int = 8,
+    seed: int = 0,
+    budget: SearchBudget = THOROUGH,
+    state: SearchState | None = None,
+) -> SearchResult:
+    """Find poses that explain the views of one frame, without a start.
 
     Parameters
     ----------
@@ -89,11 +137,8 @@ def search(
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
-
-    Returns
-    -------
-    list of Candidate
-        Best first, no two alike modulo the body's symmetries; empty where nothing was seen.
+    state : SearchState or None
+        Of the frame before, where its budget was used up.
 
     Raises
     ------
@@ -108,11 +153,11 @@ def search(
         )
     detections = sensor_detections(views, body, budget.peaks)
     if not detections:
-        return []
+        return SearchResult([], SearchReport(), SearchState())
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
     run = _Run(detections, body, Constraint(free, reference), budget, seed)
-    run.find()
-    return run.candidates(count)
+    after = run.find(state or SearchState())
+    return SearchResult(run.candidates(count), run.report, after)
 
 
 class _Run:
@@ -130,7 +175,7 @@ class _Run:
         self._body = body
         self._constraint = constraint
         self._budget = budget
-        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         self._images: list[LabelImage] = []
         if is_pointlike(body):
             self._images = label_images(detections, budget.gate)
@@ -141,27 +186,55 @@ class _Run:
         self._ranks = np.zeros(0)
         self.report = SearchReport()
 
-    def find(self) -> None:
-        """Make as many kinds of guesses as are needed."""
+    def find(self, state: SearchState) -> SearchState:
+        """Make as many kinds of guesses as are needed and allowed."""
         budget = self._budget
-        if self._images:
-            kinds = kinds_of_guesses(
-                self._detections, self._body, self._constraint, budget, self._rng
-            )
-            for guesses in kinds:
-                self._keep(self._descended(self._shortlist(guesses)))
-                if self._is_settled():
-                    break
-        if not self._by_evidence or not self.report.made:
-            if self._coverage() < budget.sufficient:
-                self._keep(self._blunt())
+        after = self._sharp(state) if self._images else SearchState()
+        if (not self._by_evidence or not self.report.made) and (
+            self._coverage() < budget.sufficient
+        ):
+            self._keep(self._blunt())
         slippery = self._body.recurrence >= budget.min_recurrence
-        slippery &= 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
-        if len(self._poses) and self._images and slippery:
+        slippery &= len(self._body) <= budget.max_slip_features
+        if slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
         best = np.argsort(-self._ranks, kind="stable")[: budget.finalists]
         self._keep(self._refined(self._poses[best], budget.final_plan))
+        return after
+
+    def _sharp(self, state: SearchState) -> SearchState:
+        """Guesses from rays, kind after kind; those after the first from where they stopped."""
+        kinds = kinds_of_guesses(
+            self._detections, self._body, self._constraint, self._budget, self._seed
+        )
+        most = self._budget.max_guesses
+        if len(kinds) > 1:
+            self._tried(kinds[0](0), None if most is None else most // 2)
+        for k, kind in enumerate(kinds[1:] or kinds):
+            if self._is_settled():
+                break
+            if k >= state.kind:
+                skipped = state.batch if k == state.kind else 0
+                batches = self._tried(kind(skipped), most)
+                if most is not None and self.report.made >= most:
+                    return SearchState(k, skipped + batches)
+        return SearchState()
+
+    def _tried(self, guesses: Iterator[Floats], most: int | None) -> int:
+        """Keep what comes of guesses until `most` were made; the number of batches."""
+        batches = 0
+
+        def allowed() -> Iterator[Floats]:
+            nonlocal batches
+            for batch in guesses:
+                if most is not None and self.report.made >= most:
+                    return
+                batches += 1
+                yield batch
+
+        self._keep(self._descended(self._shortlist(allowed())))
+        return batches
 
     def candidates(self, count: int) -> list[Candidate]:
         """Distinct poses, best first."""
@@ -243,10 +316,15 @@ class _Run:
             order = np.argsort(-ranks, kind="stable")
             order = order[unlike(self._body, poses[order], budget.distinct)][:most]
             poses, ranks = poses[order], ranks[order]
-            if ranks.max(initial=0.0) > checked + 1 and self._is_found(poses[: budget.checked]):
+            improved, checked = (
+                ranks.max(initial=0.0) > checked + 1,
+                max(checked, float(ranks.max(initial=0.0))),
+            )
+            if improved and self._is_found(poses[: budget.checked]):
+                poses, ranks = poses[budget.checked :], ranks[budget.checked :]
                 break
-            checked = max(checked, ranks.max(initial=0.0))
-        return np.asarray(poses[ranks > ranks.max(initial=0.0) - budget.behind])
+        best = max(checked, ranks.max(initial=0.0))
+        return np.asarray(poses[ranks > best - budget.behind])
 
     def _count(self, poses: Floats, chosen: NDArray[np.intp] | None = None) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
