@@ -19,7 +19,7 @@ from mixpose.search.evidence import evidence
 from mixpose.search.guesses import from_slips, from_spread_orientations, kinds_of_guesses
 from mixpose.search.inlier_counts import LabelImage, count_inliers, label_images
 from mixpose.search.refinement import Descent, Stage, first_of_each, unlike
-from mixpose.search.spread import far_apart
+from mixpose.search.spread import sparse
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -182,6 +182,10 @@ class _Run:
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         self._by_evidence = len(self._images) == len(detections)
         self._descent = Descent(detections, body, constraint.free, budget.descent)
+        few = sparse(body, budget.descent_features)
+        self._quick_descent = self._descent
+        if few is not body:
+            self._quick_descent = Descent(detections, few, constraint.free, budget.descent)
         self._poses = np.zeros((0, 4, 4))
         self._ranks = np.zeros(0)
         self.report = SearchReport()
@@ -200,7 +204,7 @@ class _Run:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
         best = np.argsort(-self._ranks, kind="stable")[: budget.finalists]
-        self._keep(self._refined(self._poses[best], budget.final_plan))
+        self._keep(self._refined(self._descent, self._poses[best], budget.final_plan))
         return after
 
     def _sharp(self, state: SearchState) -> SearchState:
@@ -268,7 +272,7 @@ class _Run:
         if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming:
             best = self._poses[self._ranks.argmax()]
             explainable = sum(min(image.count, len(self._body)) for image in self._images)
-            explained = int(self._count(best[None])[0]) / max(explainable, 1)
+            explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
             return max(self._coverage(), explained) >= self._budget.sufficient
         return self._coverage() >= self._budget.convincing
 
@@ -283,15 +287,17 @@ class _Run:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
-        return self._refined(guesses, plan)
+        return self._refined(self._quick_descent, guesses, plan)
 
-    def _refined(self, poses: Floats, plan: Sequence[tuple[float, int]]) -> Floats:
+    def _refined(
+        self, descent: Descent, poses: Floats, plan: Sequence[tuple[float, int]]
+    ) -> Floats:
         count = len(self._detections)
         stages = [
             Stage((factor,) * count, steps, left)
             for (factor, steps), left in zip(plan, self._budget.survivors)
         ]
-        return self._descent.refine(poses, stages) if len(poses) else poses
+        return descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""
@@ -308,7 +314,7 @@ class _Run:
         most = max(most, budget.min_shortlist)
         for batch in guesses:
             allowed = self._promising(self._constraint.apply(batch))
-            rank = self._count(allowed)
+            rank = self._count(self._body, allowed)
             if len(ranks) == most:
                 better = rank > ranks[-1]
                 allowed, rank = allowed[better], rank[better]
@@ -326,20 +332,18 @@ class _Run:
         best = max(checked, ranks.max(initial=0.0))
         return np.asarray(poses[ranks > best - budget.behind])
 
-    def _count(self, poses: Floats, chosen: NDArray[np.intp] | None = None) -> Floats:
+    def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
-        body, few = self._body, slice(None) if chosen is None else chosen
-        normals = None if body.normals is None else body.normals[few]
         together = self._budget.max_together
-        counts, near = count_inliers(self._images, body.means[few], normals, poses, together)
+        counts, near = count_inliers(self._images, body.means, body.normals, poses, together)
         return np.asarray(counts.sum(axis=0) + 0.1 * near)
 
     def _promising(self, poses: Floats) -> Floats:
         """The better of many guesses, judged by some features where the body has many."""
-        few = far_apart(self._body.means, self._budget.test_features)
+        few = sparse(self._body, self._budget.test_features)
         self.report = replace(self.report, made=self.report.made + len(poses))
-        if len(few) < len(self._body) and len(poses) > self._budget.shortlist:
-            rank = self._count(poses, few)
+        if few is not self._body and len(poses) > self._budget.shortlist:
+            rank = self._count(few, poses)
             poses = poses[np.argsort(-rank, kind="stable")[: self._budget.shortlist]]
         self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
