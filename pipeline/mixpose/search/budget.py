@@ -136,7 +136,9 @@ class SearchBudget:
     final_plan: tuple[tuple[float, int], ...] = _because(
         ((1.5, 1), (1.0, 2)), "the same for the best, where detections err by as much as σ_ε"
     )
-    finalists: int = _because(16, "poses refined by the final plan, too")
+    finalists: int = _because(
+        16, "poses refined by the final plan, and rivals of a pose beyond doubt"
+    )
     checked: int = _because(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
     peaks: PeakOptions = PeakOptions()

@@ -180,7 +180,7 @@ class _Run:
         if is_pointlike(body):
             self._images = label_images(detections, budget.gate)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = len(self._images) == len(detections)
+        self._by_evidence = bool(self._images) and all(one.rays is not None for one in detections)
         self._descent = Descent(detections, body, constraint.free, budget.descent)
         few = sparse(body, budget.descent_features)
         self._quick_descent = self._descent
@@ -327,7 +327,8 @@ class _Run:
                 max(checked, float(ranks.max(initial=0.0))),
             )
             if improved and self._is_found(poses[: budget.checked]):
-                poses, ranks = poses[budget.checked :], ranks[budget.checked :]
+                rest = slice(budget.checked, budget.checked + budget.finalists)
+                poses, ranks = poses[rest], ranks[rest]
                 break
         best = max(checked, ranks.max(initial=0.0))
         return np.asarray(poses[ranks > best - budget.behind])
@@ -353,7 +354,7 @@ class _Run:
         budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._rank(guesses).max() < budget.beyond_doubt / 4:
+        if self._rank(guesses).max() < budget.beyond_doubt / 2:
             return False
         self._keep(self._descended(guesses))
         return self._ranks.max() > budget.beyond_doubt and self._is_settled()
