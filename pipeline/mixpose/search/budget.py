@@ -64,7 +64,9 @@ class SearchBudget:
     max_triangles: int = _because(120_000, "of features kept for a body: all of 50 features")
     triangles_alike: int = _because(16, "of features tried for three points, the nearest in shape")
     min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
-    batch: int = _because(1000, "triples of points between two looks at what was found")
+    batch: int = _because(
+        100, "triples of points first looked at together, then twice as many, up to 8 times"
+    )
     subsample: int = _because(8, "features far apart that stand for a body beside a point")
     max_anchors: int = _because(16, "points with which two rays are combined, the most promising")
     max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
@@ -139,6 +141,7 @@ class SearchBudget:
     finalists: int = _because(
         16, "poses refined by the final plan, and rivals of a pose beyond doubt"
     )
+    improvement: float = _because(1.1, "factor in detections explained for another such look")
     checked: int = _because(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
     peaks: PeakOptions = PeakOptions()

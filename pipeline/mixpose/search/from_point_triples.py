@@ -164,8 +164,10 @@ def _point_triples(
     triples = _combinations(first)
     if first < len(found):
         triples = np.concatenate([triples, _near_triples(found.points, reach, budget, rng)])
-    for start in range(0, len(triples), budget.batch):
-        batch = triples[start : start + budget.batch]
+    end = 0
+    while end < len(triples):
+        start, end = end, min(end + max(end, budget.batch), end + 8 * budget.batch)
+        batch = triples[start:end]
         shared = [_share_a_ray(found, batch[:, i], batch[:, j]) for i, j in _SIDES]
         yield batch[~np.any(shared, axis=0)]
 

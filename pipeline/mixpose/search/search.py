@@ -309,7 +309,7 @@ class _Run:
     def _shortlist(self, guesses: Iterator[Floats]) -> Floats:
         """The guesses that explain most distinct detections, and among equals most closely."""
         budget = self._budget
-        poses, ranks, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0
+        poses, ranks, best, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0
         most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
         most = max(most, budget.min_shortlist)
         for batch in guesses:
@@ -322,15 +322,13 @@ class _Run:
             order = np.argsort(-ranks, kind="stable")
             order = order[unlike(self._body, poses[order], budget.distinct)][:most]
             poses, ranks = poses[order], ranks[order]
-            improved, checked = (
-                ranks.max(initial=0.0) > checked + 1,
-                max(checked, float(ranks.max(initial=0.0))),
-            )
+            best = float(ranks.max(initial=0.0))
+            improved = best > budget.improvement * checked + 1
+            checked = best if improved else checked
             if improved and self._is_found(poses[: budget.checked]):
                 rest = slice(budget.checked, budget.checked + budget.finalists)
                 poses, ranks = poses[rest], ranks[rest]
                 break
-        best = max(checked, ranks.max(initial=0.0))
         return np.asarray(poses[ranks > best - budget.behind])
 
     def _count(self, body: Body, poses: Floats) -> Floats:
