@@ -129,14 +129,14 @@ class SearchBudget:
         "power of that blur, steps and survivors of each stage: 3 ranges 6/0/0 99 of 100",
     )
     descent_plan: tuple[tuple[float, int], ...] = _because(
-        ((1.5, 2), (0.75, 2), (0.4, 2)),
+        ((1.5, 2), (0.75, 1), (0.4, 2)),
         "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
     )
     wide_plan: tuple[tuple[float, int], ...] = _because(
         ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
     )
     final_plan: tuple[tuple[float, int], ...] = _because(
-        ((1.5, 1), (1.0, 2)), "the same for the best, where detections err by as much as σ_ε"
+        ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"
     )
     finalists: int = _because(
         16, "poses refined by the final plan, and rivals of a pose beyond doubt"
