@@ -5,9 +5,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
 from mixpose.search import SearchBudget
-from mixpose.search.from_point_triples import from_point_triples
+from mixpose.search.budget import PeakOptions
+from mixpose.search.detections import sensor_detections
+from mixpose.search.from_point_triples import (
+    by_promise,
+    feature_triangles,
+    from_point_triples,
+)
 from mixpose.search.triangulation import triangulate
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
 
@@ -56,3 +65,33 @@ def test_three_points_in_space_give_the_pose() -> None:
     guesses = np.concatenate(list(from_point_triples(found, body, SearchBudget(), rng)))
     error = np.abs(guesses - T).max(axis=(1, 2))
     assert error.min() < 1e-6
+
+
+def test_triangles_of_features_are_ordered_and_not_flat() -> None:
+    corners = [[0.0, 0, 0], [30, 0, 0], [0, 40, 0], [60, 0, 0]]
+    body = Body("four", tuple(PointFeature(np.array(point)) for point in corners))
+    triangles = feature_triangles(body, 1000, 0.05)
+    # of four triples three are no line, in six orders each
+    assert len(triangles.corners) == 18
+    away, index = triangles.tree.query([30.0, 40.0, 50.0])
+    assert away < 1e-9
+    assert triangles.corners[index].tolist() == [0, 1, 2]
+
+
+def test_points_that_more_cameras_confirm_come_first() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-100, 100, (5, 3))
+    third = from_parts(Rotation.from_euler("x", 90, degrees=True).as_matrix(), [0, 0, 1000.0])
+    sensors = [*cameras("pinhole"), PinholeCamera(K, np.zeros(0), (1280, 1024), third)]
+    views = []
+    for k, camera in enumerate(sensors):
+        false = rng.uniform([0, 0], [1280, 1024], (40, 2))
+        y = np.concatenate([false, camera.project(points)[0]])
+        views.append(View(str(k), camera, Observation(PointPattern(y, np.ones(45)), 1.0)))
+    body = Body("five", tuple(PointFeature(point) for point in points))
+    detections = sensor_detections(views, body, PeakOptions())
+    rays = [each.rays for each in detections if each.rays is not None]
+    found = by_promise(triangulate(rays, [3.0] * 3, 0.02), detections, 3.0, 10)
+    off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)
+    # 40 false detections a view leave a point by chance that three confirm now and then
+    assert np.sum(off < 0.1) >= 4

@@ -8,14 +8,8 @@ Every guess is judged on all sensors, and the best descend through narrowing blu
 from __future__ import annotations
 
 from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
-from mixpose.search.search import (
-    Candidate,
-    SearchReport,
-    SearchResult,
-    SearchState,
-    search,
-    search_frame,
-)
+from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
+from mixpose.search.search import search, search_frame
 
 __all__ = [
     "LIVE",

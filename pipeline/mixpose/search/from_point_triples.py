@@ -195,7 +195,7 @@ def _near_triples(
     second, third = (
         pairs[begin + (rng.random(len(first)) * counts[first]).astype(np.intp), 1] for _ in range(2)
     )
-    return np.stack([first, second, third], axis=1)[second != third]
+    return np.asarray(np.stack([first, second, third], axis=1)[second != third])
 
 
 def _share_a_ray(found: TriangulatedPoints, i: Indices, j: Indices) -> NDArray[np.bool_]:

@@ -56,7 +56,7 @@ def _problems(
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
-    fix a pose best, and of which the outermost are likely the same.
+    fix a pose best, and of which the outermost are likely the same; then near ones at random.
     """
     n, M = len(features), len(rays)
     if comb(M, 3) * perm(n, 3) <= most:
