@@ -133,7 +133,8 @@ class SearchBudget:
         "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
     )
     wide_plan: tuple[tuple[float, int], ...] = _because(
-        ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
+        ((3.0, 1), (1.5, 2), (1.0, 3)),
+        "the same where not all sensors are cameras",
     )
     final_plan: tuple[tuple[float, int], ...] = _because(
         ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"

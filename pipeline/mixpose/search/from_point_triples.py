@@ -144,6 +144,8 @@ def by_promise(
             error += np.where(met, away / reach, 0.0)
         error /= np.maximum(support, 1.0)
     order = np.lexsort((error, -support))
+    if len(detections) == 2:  # every feature once
+        return found.select(order[:count])
     kept: list[int] = []
     left = np.ones(len(found), dtype=np.bool_)
     for k in order:
