@@ -78,7 +78,7 @@ class MatchedObjective:
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
         poses = T_world_object.reshape(-1, 4, 4)
-        return self.shares(poses).sum(axis=0).reshape(T_world_object.shape[:-2])
+        return np.asarray(self.shares(poses).sum(axis=0).reshape(T_world_object.shape[:-2]))
 
     def shares(self, poses: Floats, *, whole: bool = False) -> Floats:
         """ω_l S_l (L, H) at poses (H, 4, 4).
@@ -167,17 +167,18 @@ def matched_objective(
         at = projection.project(near[None])
         dimensions = projection.dimensions.tolist()
         places = [y[0][seen[0]][:, :m] for y, seen, m in zip(at.y, at.seen, dimensions)]
-    energies = [one.energy(sigma) for one, sigma in zip(observations, sigmas, strict=True)]
+    energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
     variances = 2 * np.square(sigmas)
     tops = np.array([peak(v, m) for v, m in zip(variances, projection.dimensions)])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
-    columns = (np.asarray(each, dtype=np.float64)[:, None] for each in (variances, tops, energies))
     return MatchedObjective(
-        tuple(views),
-        projection,
-        matched_atlas(observations, sigmas, steps_per_sigma, places, around),
-        *columns,
-        weights[:, None],
+        views=tuple(views),
+        projection=projection,
+        atlas=matched_atlas(observations, sigmas, steps_per_sigma, places, around),
+        variances=variances[:, None],
+        tops=tops[:, None],
+        energies=energies[:, None],
+        weights=weights[:, None],
     )
