@@ -50,7 +50,7 @@ class AcceptanceRules:
     disagreeing: float = constant(
         25.0,
         "residual variance over that of the other sensors from which one that meets the body is "
-        "left out: five times their deviation; web cams a frame late have three times and still help",
+        "left out: five times their deviation; web cams a frame late have three and still help",
     )
     same_rotation_deg: float = constant(1.0, "poses nearer than this are one, unless both fit")
     same_distance: float = constant(0.02, "the same, of the body's radius")
