@@ -13,4 +13,4 @@ T = TypeVar("T")
 
 def constant(value: T, why: str) -> T:
     """A field with a default and the reason for it: a derivation, a test or a measured row."""
-    return field(default=value, metadata={"why": why})  # type: ignore[return-value]
+    return field(default=value, metadata={"why": why})

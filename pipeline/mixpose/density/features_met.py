@@ -128,7 +128,7 @@ def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) 
     Images that overlap are detected as one, in the middle.  The two count as one feature that was
     met there: half of each, with the offset of their middle.
     """
-    shares, offsets, partner = (each.copy() for each in found)
+    shares, offsets, partner = found.shares.copy(), found.offsets.copy(), found.partner.copy()
     single = shares > 0
     for i in np.flatnonzero(shares == 0).tolist():
         seen = np.flatnonzero(single)

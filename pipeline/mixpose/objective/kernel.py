@@ -117,7 +117,7 @@ def _are_apart(y: Floats, variances: Floats) -> bool:
     away = y[:, :, :, None] - y[:, :, None]
     away *= away
     close = away[..., 0] + away[..., 1] < (-2 * _NEGLIGIBLE) * variances[..., None, None]
-    return int(np.count_nonzero(close)) <= L * H * n  # each is close to itself
+    return bool(np.count_nonzero(close) <= L * H * n)  # each is close to itself
 
 
 def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:

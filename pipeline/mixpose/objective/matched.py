@@ -74,7 +74,7 @@ class MatchedObjective:
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
         poses = T_world_object.reshape(-1, 4, 4)
-        return self.shares(poses).sum(axis=0).reshape(T_world_object.shape[:-2])
+        return np.asarray(self.shares(poses).sum(axis=0).reshape(T_world_object.shape[:-2]))
 
     def shares(self, poses: Floats, *, whole: bool = False) -> Floats:
         """ω_l S_l (L, H) at poses (H, 4, 4).
@@ -162,11 +162,12 @@ def matched_objective(
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
-    columns = (np.asarray(each, dtype=np.float64)[:, None] for each in (variances, tops, energies))
     return MatchedObjective(
-        tuple(views),
-        projection,
-        matched_atlas(observations, sigmas, steps_per_sigma, places, around),
-        *columns,
-        weights[:, None],
+        views=tuple(views),
+        projection=projection,
+        atlas=matched_atlas(observations, sigmas, steps_per_sigma, places, around),
+        variances=variances[:, None],
+        tops=tops[:, None],
+        energies=np.array(energies)[:, None],
+        weights=weights[:, None],
     )
