@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.search.alignment import align_triples
-from mixpose.search.p3p import depths
+from mixpose.search.p3p import SIDES, depths
 
 
 def random_problems(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -21,9 +21,13 @@ def random_problems(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
     return body.transpose(1, 2, 0), lines, squared, distance.T
 
 
+def cosines_of(lines: np.ndarray) -> np.ndarray:
+    return np.array([(lines[i] * lines[j]).sum(axis=0) for i, j in SIDES])
+
+
 def test_the_true_distances_are_among_the_solutions_of_every_problem() -> None:
     _, lines, squared, truth = random_problems(5000)
-    found, which = depths(lines, squared)
+    found, which = depths(cosines_of(lines), squared)
     error = np.abs(found - truth[:, which]).max(axis=0)
     nearest = np.full(truth.shape[1], np.inf)
     np.minimum.at(nearest, which, error)
@@ -34,7 +38,7 @@ def test_the_true_distances_are_among_the_solutions_of_every_problem() -> None:
 
 def test_every_solution_satisfies_the_projection_equations() -> None:
     body, lines, squared, _ = random_problems(2000)
-    found, which = depths(lines, squared)
+    found, which = depths(cosines_of(lines), squared)
     T = align_triples(body[:, :, which], lines[:, :, which] * found[:, None])
     points = np.einsum("kij,njk->nik", T[:, :3, :3], body[:, :, which]) + T[:, :3, 3].T
     directions = points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -47,7 +51,7 @@ def test_every_solution_satisfies_the_projection_equations() -> None:
 
 def test_no_problem_has_more_than_four_solutions() -> None:
     _, lines, squared, _ = random_problems(2000)
-    _, which = depths(lines, squared)
+    _, which = depths(cosines_of(lines), squared)
     assert np.bincount(which).max() <= 4
 
 
@@ -55,7 +59,7 @@ def test_impossible_triangles_have_no_solution() -> None:
     # three lines within a degree cannot hold a triangle with sides 1, 1, 10
     lines = np.array([[0, 0, 1.0], [0.01, 0, 1], [0, 0.01, 1]])
     lines /= np.linalg.norm(lines, axis=1, keepdims=True)
-    found, which = depths(lines[:, :, None], np.array([[1.0], [1.0], [100.0]]))
+    found, which = depths(cosines_of(lines[:, :, None]), np.array([[1.0], [1.0], [100.0]]))
     assert found.shape == (3, 0)
     assert len(which) == 0
 

@@ -20,8 +20,8 @@ from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
-from mixpose.objective import MatchedObjective, View, build_objective, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.objective import MatchedObjective, Objective, View, build_objective, matched_objective
+from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
 
@@ -34,8 +34,8 @@ def _value_error(steps_per_sigma: float) -> float:
 
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_value_error(STEPS_PER_SIGMA))
-# after a step that gains 3e-5, 0.008 σ long, 1e-4 σ are left to go
-SHARP = NewtonOptions(iterations=40, tolerance=3e-5, value_error=_value_error(STEPS_PER_SIGMA))
+# after a step that gains 1e-6, 0.002 σ long, a twentieth of it is left to go: residuals draw it
+SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=_value_error(LAST_STEPS))
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_value_error(FINE_STEPS))
 
 
@@ -110,14 +110,13 @@ def fit_near(
     sparse = all(view.observation.is_sparse for view in views)
     ascent = None
     if matched and sparse and not has_likelihood(views):
-        finest = finest or matched_objective(
-            views, body, [view.observation.sigma for view in views]
-        )
+        sigmas = [view.observation.sigma for view in views]
+        finest = finest or matched_objective(views, body, sigmas, steps_per_sigma=LAST_STEPS)
         here = finest.linearise(T_start)
         if here.value >= rules.near * len(views):
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
-        ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, rules)
+        ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     T, is_freed = ascent.state, False
     if matched and has_likelihood(views):
         T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free))
@@ -131,6 +130,7 @@ def _through_blurs(
     uncertainty: Floats,
     options: EstimatorOptions,
     samples: Floats,
+    finest: MatchedObjective | None,
     rules: FitRules,
 ) -> Ascent[Floats]:
     """The ascent at one blur after the other."""
@@ -142,8 +142,9 @@ def _through_blurs(
     for k, sigmas in enumerate(schedule):
         last = k == len(schedule) - 1
         newton = (FINE if fine else SHARP) if last else COARSE
-        objective = build_objective(
-            options.objective, views, body, samples, sigmas, ascent.state, last and fine
-        )
+        objective: Objective | None = finest if last else None
+        if objective is None:
+            name, near = options.objective, ascent.state
+            objective = build_objective(name, views, body, samples, sigmas, near, last)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     return ascent

@@ -7,7 +7,18 @@ Every guess is judged on all sensors, and the best descend through narrowing blu
 
 from __future__ import annotations
 
-from mixpose.search.budget import SearchBudget
-from mixpose.search.search import Candidate, SearchReport, search
+from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
+from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
+from mixpose.search.search import search, search_frame
 
-__all__ = ["Candidate", "SearchBudget", "SearchReport", "search"]
+__all__ = [
+    "LIVE",
+    "THOROUGH",
+    "Candidate",
+    "SearchBudget",
+    "SearchReport",
+    "SearchResult",
+    "SearchState",
+    "search",
+    "search_frame",
+]

@@ -39,6 +39,15 @@ class EvidenceOptions:
 
 
 @dataclass(frozen=True)
+class LabelOptions:
+    """How finely detections are drawn to be counted."""
+
+    cells: float = _because(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
+    max_pages: int = _because(1_000_000, "of 16² cells per camera; larger planes get coarser")
+    min_cosine: float = _because(0.1, "to the middle of the rays: at 84° a ray misses the plane")
+
+
+@dataclass(frozen=True)
 class DescentOptions:
     """How guesses are refined."""
 
@@ -58,27 +67,37 @@ class SearchBudget:
         None, "guesses of one search, counted and not timed, so that results repeat; None: thorough"
     )
     gate: float = _because(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
-    max_points: int = _because(200, "triangulated points kept, the most promising first")
+    max_points: int = _because(1000, "triangulated points kept, the most promising first")
     max_prosac_points: int = _because(50, "of them all triples are tried: 19,600, which take 0.1 s")
-    random_triples: int = _because(20_000, "triples of all points that are tried after them")
+    random_triples: int = _because(20_000, "triples of points near each other tried after them")
     max_triangles: int = _because(120_000, "of features kept for a body: all of 50 features")
     triangles_alike: int = _because(16, "of features tried for three points, the nearest in shape")
     min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
-    batch: int = _because(1000, "triples of points between two looks at what was found")
-    subsample: int = _because(10, "features far apart that stand for a body in guesses and tests")
-    max_anchors: int = _because(24, "points with which two rays are combined, least error first")
-    max_rays: int = _because(20, "rays of a camera that are combined with a point, far apart")
-    max_pairs: int = _because(20_000, "pairs of places on rays for one point as one feature")
-    max_problems: int = _because(250_000, "triples of rays as triples of features, of one camera")
+    batch: int = _because(
+        100, "triples of points first looked at together, then twice as many, up to 8 times"
+    )
+    subsample: int = _because(8, "features far apart that stand for a body beside a point")
+    max_ray_points: int = _because(16, "points with which two rays are combined, the most promising")
+    max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
+    max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
+    max_problems: int = _because(
+        250_000, "triples of rays as triples of features, of one camera alone"
+    )
+    max_shared_problems: int = _because(
+        100_000, "the same for several cameras together, of which one hit of one is enough"
+    )
     exhaustive: int = _because(
         8, "features, and half as many again rays, of which all triples are tried first"
+    )
+    crowds: tuple[int, ...] = _because(
+        (8, 16, 32), "nearest detections among which triples are drawn: a body is seen in one place"
     )
     chunk: int = _because(4096, "problems solved together: numbers stay in the cache")
     min_pixels: float = _because(3.0, "apart in the image, for two features to be told apart")
     min_sine: float = _because(0.02, "of the angle between rays: below it no depth is fixed")
     max_together: int = _because(100_000, "features times poses tested together: cache size")
     test_features: int = _because(16, "features by which many guesses are compared at first")
-    shortlist: int = _because(300, "guesses refined; fewer for bodies of more than 8 features")
+    shortlist: int = _because(150, "guesses refined; fewer for bodies of more than 8 features")
     min_shortlist: int = _because(40, "guesses refined at least, for bodies of many features")
     behind: float = _because(3.0, "detections that a refined guess may explain less than the best")
     distinct: float = _because(0.05, "of the body's radius: guesses nearer to each other are one")
@@ -91,6 +110,20 @@ class SearchBudget:
     overwhelming: float = _because(
         24.0, "evidence in nats that leaves no doubt: a million guesses make 14"
     )
+    descent_features: int = _because(
+        32,
+        "features by which guesses descend: the final plan takes all; 100/40 absent 2 times faster",
+    )
+    survivors: tuple[int, ...] = _because(
+        (150, 150, 150), "guesses left after each blur of a plan; fewer lose 1 % of 5/1/5"
+    )
+    min_recurrence: float = _because(
+        0.3, "share of a body met a step aside, from which slips are looked for: 1/N at random"
+    )
+    beyond_doubt: float = _because(
+        32.0, "the same for a kind of guess to be cut short: a wrong pose reached 26 in 8/4/8"
+    )
+    min_slip_features: int = _because(16, "of a body: with fewer, all poses a step off are met")
     max_slip_features: int = _because(120, "of a body up to which shifts by a grid step are tried")
     place_steps: int = _because(12, "Newton steps from a start to where the body's middle is")
     turn_steps: int = _because(3, "Newton steps of the place for an assumed orientation")
@@ -108,21 +141,29 @@ class SearchBudget:
         "power of that blur, steps and survivors of each stage: 3 ranges 6/0/0 99 of 100",
     )
     descent_plan: tuple[tuple[float, int], ...] = _because(
-        ((1.5, 2), (0.75, 2), (0.4, 2)),
+        ((1.5, 2), (0.75, 1), (0.4, 2)),
         "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
     )
     wide_plan: tuple[tuple[float, int], ...] = _because(
-        ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
+        ((3.0, 1), (1.5, 2), (1.0, 3)),
+        "the same where not all sensors are cameras",
     )
     final_plan: tuple[tuple[float, int], ...] = _because(
-        ((1.5, 1), (1.0, 2)), "the same for the best, where detections err by as much as σ_ε"
+        ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"
     )
-    finalists: int = _because(16, "poses refined by the final plan, too")
+    finalists: int = _because(
+        16, "poses refined by the final plan, and rivals of a pose beyond doubt"
+    )
+    improvement: float = _because(1.1, "factor in detections explained for another such look")
     checked: int = _because(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
+    labels: LabelOptions = LabelOptions()
     peaks: PeakOptions = PeakOptions()
     evidence: EvidenceOptions = EvidenceOptions()
 
 
 THOROUGH = SearchBudget()
 """Everything is tried."""
+
+LIVE = SearchBudget(max_guesses=4000, chunk=1024, shortlist=16, min_shortlist=8, finalists=4)
+"""For each frame of a live stream: 4,000 guesses and the rest of the last batch."""

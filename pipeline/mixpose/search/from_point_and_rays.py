@@ -1,8 +1,8 @@
-"""Guesses of several cameras from one point in space and two more rays.
+"""Guesses of several cameras from one triangulated point and two more rays.
 
 Where cameras see different features, few points in space are known.  From one of them a feature
-at a known distance lies where its ray cuts a sphere; two such features must be as far
-apart as they are on the body.
+at a known distance lies where its ray cuts a sphere; two such features must be as far apart as
+they are on the body.
 """
 
 from __future__ import annotations
@@ -15,79 +15,80 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.search.alignment import align_triples
+from mixpose.search.budget import SearchBudget
 from mixpose.search.triangulation import TriangulatedPoints
 from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
+Indices: TypeAlias = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class _Lines:
-    """Lines of sight of all cameras, without those that make up the anchor."""
+class _NearRays:
+    """Rays of all cameras that pass a point, the nearest, without those that made it."""
 
     origins: Floats
     directions: Floats
-    along: Floats  # where they pass the anchor
+    along: Floats  # where they pass the point
     across: Floats  # how far from it
-    error: Floats  # length by which a point on the line may be off
+    error: Floats  # length by which a place on the ray may be off
     central: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class _Spots:
-    """Where features may be: on a line, at the right distance from the anchor."""
+class _Places:
+    """Where features may be: on a ray, at the right distance from the point."""
 
     points: Floats
-    feature: NDArray[np.intp]
-    line: NDArray[np.intp]
+    feature: Indices
+    ray: Indices
     error: Floats
 
 
 def from_point_and_rays(
     found: TriangulatedPoints,
-    lines: Sequence[Rays],
+    rays: Sequence[Rays],
     gates: Sequence[float],
     features: Floats,
-    max_pairs: int,
+    budget: SearchBudget,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
-    """Poses (K, 4, 4) with one point in space as a certain feature, anchor by anchor.
+    """Poses (K, 4, 4) with one point in space as each feature, point by point.
 
     Parameters
     ----------
     found : TriangulatedPoints
-        The points in space.
-    lines : sequence of Rays
+        Most promising first.
+    rays : sequence of Rays
         One per camera.
     gates : sequence of float
         Largest error of a detection per camera, in px.
     features : (n, 3) array
         Of the body.
+    budget : SearchBudget
+    skipped : int
+        Points left out, as they were tried before.
     """
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-    for p in range(len(found)):
-        around = _lines_around(found, p, lines, gates)
+    for p in range(skipped, min(len(found), budget.max_ray_points)):
+        near = _rays_near(found, p, rays, gates, budget.max_rays)
+        body, world = [], []
         for i in range(len(features)):
-            spots = _spots(found.points[p], around, distances[i], i)
-            a, b = _agreeing(spots, distances, max_pairs)
-            if len(a) == 0:
-                continue
-            body = np.stack(
-                [
-                    np.tile(features[i], (len(a), 1)),
-                    features[spots.feature[a]],
-                    features[spots.feature[b]],
-                ]
-            )
-            anchor = np.tile(found.points[p], (len(a), 1))
-            world = np.stack([anchor, spots.points[a], spots.points[b]])
-            yield align_triples(body.transpose(0, 2, 1), world.transpose(0, 2, 1))
+            places = _places(found.points[p], near, distances[i], i)
+            a, b = _agreeing(places, distances, budget.max_pairs)
+            first = np.full(len(a), i)
+            body.append(features[np.stack([first, places.feature[a], places.feature[b]])])
+            point = np.broadcast_to(found.points[p], (len(a), 3))
+            world.append(np.stack([point, places.points[a], places.points[b]]))
+        triples = [np.concatenate(each, axis=1).transpose(0, 2, 1) for each in (body, world)]
+        yield align_triples(*triples)
 
 
-def _lines_around(
-    found: TriangulatedPoints, p: int, lines: Sequence[Rays], gates: Sequence[float]
-) -> _Lines:
+def _rays_near(
+    found: TriangulatedPoints, p: int, rays: Sequence[Rays], gates: Sequence[float], count: int
+) -> _NearRays:
     parts = []
-    for k, each in enumerate(lines):
+    for k, each in enumerate(rays):
         used = found.rays[p][found.sensors[p] == k]
         rest = each.select(np.setdiff1d(np.arange(len(each)), used))
         away = found.points[p] - rest.origins
@@ -97,36 +98,40 @@ def _lines_around(
         error = np.hypot(error, found.tolerance[p])
         central = np.full(len(rest), rest.central)
         parts.append((rest.origins, rest.directions, along, across, error, central))
-    return _Lines(*(np.concatenate(column) for column in zip(*parts)))
+    together = [np.concatenate(column) for column in zip(*parts)]
+    nearest = np.argsort(together[3], kind="stable")[:count]
+    return _NearRays(*(column[nearest] for column in together))
 
 
-def _spots(anchor: Floats, around: _Lines, distances: Floats, i: int) -> _Spots:
-    """Where lines cut the spheres on which the other features lie."""
-    half2 = distances[None] ** 2 - around.across[:, None] ** 2
-    near_rim = np.abs(around.across[:, None] - distances[None]) <= around.error[:, None]
+def _places(point: Floats, near: _NearRays, distances: Floats, i: int) -> _Places:
+    """Where rays cut the spheres about the point on which the other features lie."""
+    half2 = distances[None] ** 2 - near.across[:, None] ** 2
+    at_rim = np.abs(near.across[:, None] - distances[None]) <= near.error[:, None]
     half = np.sqrt(np.maximum(half2, 0.0))
-    cuts = (half2 >= 0) | near_rim
+    cuts = (half2 >= 0) | at_rim
     cuts[:, i] = False
-    line, feature = np.nonzero(cuts)
-    both = np.concatenate([half[line, feature], -half[line, feature]])
-    line, feature = np.tile(line, 2), np.tile(feature, 2)
-    place = around.along[line] + both
-    ahead = ~around.central[line] | (place > 0)
-    line, feature, place = line[ahead], feature[ahead], place[ahead]
-    points = around.origins[line] + place[:, None] * around.directions[line]
-    return _Spots(points, feature, line, around.error[line])
+    ray, feature = np.nonzero(cuts)
+    both = np.concatenate([half[ray, feature], -half[ray, feature]])
+    ray, feature = np.tile(ray, 2), np.tile(feature, 2)
+    place = near.along[ray] + both
+    ahead = ~near.central[ray] | (place > 0)
+    ray, feature, place = ray[ahead], feature[ahead], place[ahead]
+    points = near.origins[ray] + place[:, None] * near.directions[ray]
+    return _Places(points, feature, ray, near.error[ray])
 
 
-def _agreeing(
-    spots: _Spots, distances: Floats, most: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pairs of spots of two features and two lines that are the right distance apart."""
-    x = spots.points
+def _agreeing(places: _Places, distances: Floats, most: int) -> tuple[Indices, Indices]:
+    """Pairs of places of two features and two rays that are best the right distance apart."""
+    x = places.points
     squares = (x * x).sum(axis=1)
     apart = np.sqrt(np.maximum(squares[:, None] + squares[None] - 2 * x @ x.T, 0.0))
-    wanted = distances[np.ix_(spots.feature, spots.feature)]
-    error = np.sqrt(0.5) * (spots.error[:, None] + spots.error[None])
-    good = (np.abs(apart - wanted) <= error) & (wanted > 0)
-    good &= spots.line[:, None] != spots.line[None]
+    wanted = distances[np.ix_(places.feature, places.feature)]
+    error = np.sqrt(0.5) * (places.error[:, None] + places.error[None])
+    off = np.abs(apart - wanted)
+    good = (off <= error) & (wanted > 0)
+    good &= places.ray[:, None] != places.ray[None]
     a, b = np.nonzero(np.triu(good, 1))
-    return a[:most], b[:most]
+    if len(a) > most:
+        best = np.argpartition(off[a, b], most)[:most]
+        a, b = a[best], b[best]
+    return a, b

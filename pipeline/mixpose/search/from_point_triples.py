@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
+from itertools import combinations, islice
 from typing import TypeAlias
 
 import numpy as np
@@ -75,6 +75,7 @@ def from_point_triples(
     body: Body,
     budget: SearchBudget,
     rng: np.random.Generator,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) of triples of points, batch by batch.
 
@@ -86,21 +87,25 @@ def from_point_triples(
     budget : SearchBudget
     rng : numpy Generator
         Draws among the triples of all points where they are too many.
+    skipped : int
+        Batches left out, as they were tried before.
     """
     triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
-    if not len(triangles.corners):
+    if not len(triangles.corners) or len(found) < 3:
         return
-    for drawn in _point_triples(found, budget, rng):
-        wide = _is_wide(_sides(found.points, drawn), budget.min_height)
-        triples = drawn[wide]
-        sides = _sides(found.points, triples)
-        if not len(triples):
-            continue
+    longest = float(triangles.sides.max())
+    for drawn in islice(_point_triples(found, longest, budget, rng), skipped, None):
+        sides = _sides(found.points, drawn)
+        slack = 2 * found.tolerance[drawn].max(axis=1)
+        possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
+        triples, sides = drawn[possible], sides[possible]
         tolerance = found.tolerance[triples]
         allowed = np.stack([np.hypot(tolerance[:, i], tolerance[:, j]) for i, j in _SIDES], axis=1)
         k = min(budget.triangles_alike, len(triangles.corners))
         away, index = triangles.tree.query(
-            sides, k=np.arange(1, k + 1), distance_upper_bound=float(allowed.max()) * np.sqrt(3)
+            sides,
+            k=np.arange(1, k + 1),
+            distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
         )
         which, rank = np.nonzero(np.isfinite(away))
         chosen = index[which, rank]
@@ -139,6 +144,8 @@ def by_promise(
             error += np.where(met, away / reach, 0.0)
         error /= np.maximum(support, 1.0)
     order = np.lexsort((error, -support))
+    if len(detections) == 2:  # every feature once
+        return found.select(order[:count])
     kept: list[int] = []
     left = np.ones(len(found), dtype=np.bool_)
     for k in order:
@@ -152,39 +159,55 @@ def by_promise(
 
 
 def _point_triples(
-    found: TriangulatedPoints, budget: SearchBudget, rng: np.random.Generator
+    found: TriangulatedPoints, reach: float, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[Indices]:
     """Batches of triples (K, 3) of points that share no ray, the most promising first."""
-    P = len(found)
-    first = min(P, budget.max_prosac_points)
-    if first < 3:
-        return
-    excluded = _share_a_ray(found)
+    first = min(len(found), budget.max_prosac_points)
     triples = _combinations(first)
-    if first < P:
-        triples = np.concatenate([triples, rng.integers(0, P, (budget.random_triples, 3))])
-    for start in range(0, len(triples), budget.batch):
-        i, j, k = triples[start : start + budget.batch].T
-        good = ~(excluded[i, j] | excluded[i, k] | excluded[j, k])
-        yield np.stack([i, j, k], axis=1)[good]
+    if first < len(found):
+        triples = np.concatenate([triples, _near_triples(found.points, reach, budget, rng)])
+    end = 0
+    while end < len(triples):
+        start, end = end, min(end + max(end, budget.batch), end + 8 * budget.batch)
+        batch = triples[start:end]
+        shared = [_share_a_ray(found, batch[:, i], batch[:, j]) for i, j in _SIDES]
+        yield batch[~np.any(shared, axis=0)]
 
 
 @lru_cache(maxsize=64)
 def _combinations(count: int) -> Indices:
-    """Triples below a number, those of the first first."""
-    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp)
+    """Triples (K, 3) of numbers below `count`, those of the first numbers first."""
+    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
     return triples[np.argsort(triples[:, 2], kind="stable")]
 
 
-def _share_a_ray(found: TriangulatedPoints) -> NDArray[np.bool_]:
-    """Pairs of points (P, P) that share a ray: at most one of them is a feature."""
-    shared = np.eye(len(found), dtype=np.bool_)
-    for a in range(2):
-        for b in range(2):
-            shared |= (found.sensors[:, a, None] == found.sensors[None, :, b]) & (
-                found.rays[:, a, None] == found.rays[None, :, b]
-            )
-    return shared
+def _near_triples(
+    points: Floats, reach: float, budget: SearchBudget, rng: np.random.Generator
+) -> Indices:
+    """Triples (K, 3) drawn among points (P, 3) that are within reach of the first of them."""
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    counts = np.bincount(pairs[:, 0], minlength=len(points))
+    crowded = np.flatnonzero(counts > 1)
+    if not len(crowded):
+        return np.zeros((0, 3), dtype=np.intp)
+    first = rng.choice(crowded, budget.random_triples)
+    begin = (np.cumsum(counts) - counts)[first]
+    second, third = (
+        pairs[begin + (rng.random(len(first)) * counts[first]).astype(np.intp), 1] for _ in range(2)
+    )
+    return np.asarray(np.stack([first, second, third], axis=1)[second != third])
+
+
+def _share_a_ray(found: TriangulatedPoints, i: Indices, j: Indices) -> NDArray[np.bool_]:
+    """Whether points share a ray: then at most one of them is a feature."""
+    same = [
+        (found.sensors[i, a] == found.sensors[j, b]) & (found.rays[i, a] == found.rays[j, b])
+        for a in range(2)
+        for b in range(2)
+    ]
+    return np.asarray(np.any(same, axis=0))
 
 
 def _sides(points: Floats, triples: Indices) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations, permutations
+from itertools import combinations, islice, permutations
 from math import comb, perm
 from typing import TypeAlias
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mixpose.search.alignment import align_triples
 from mixpose.search.budget import SearchBudget
-from mixpose.search.p3p import depths
+from mixpose.search.p3p import SIDES, depths
 from mixpose.search.spread import far_apart
 from mixpose.sensors import Rays
 
@@ -21,94 +21,117 @@ Indices: TypeAlias = NDArray[np.intp]
 
 
 def from_three_rays(
-    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
+    rays: Rays,
+    features: Floats,
+    most: int,
+    budget: SearchBudget,
+    rng: np.random.Generator,
+    skipped: int = 0,
 ) -> Iterator[Floats]:
     """Poses (K, 4, 4) from triples of one camera's rays, chunk by chunk.
 
     Parameters
     ----------
-    lines : Rays
+    rays : Rays
     features : (n, 3) array
         Of the body.
+    most : int
+        Problems solved.
     budget : SearchBudget
     rng : numpy Generator
         Order of the triples.
+    skipped : int
+        Chunks left out, as they were tried before.
     """
-    if len(lines) < 3 or len(features) < 3:
+    if len(rays) < 3 or len(features) < 3:
         return
-    solve = _perspective if lines.central else _orthographic
-    for detections, corners in _problems(lines, features, budget, rng):
-        yield solve(lines, features, detections, corners, budget.min_pixels)
+    solve = _perspective if rays.central else _orthographic
+    for detections, corners in islice(_problems(rays, features, most, budget, rng), skipped, None):
+        yield solve(rays, features, detections, corners, budget.min_pixels)
 
 
 def _problems(
-    lines: Rays, features: Floats, budget: SearchBudget, rng: np.random.Generator
+    rays: Rays, features: Floats, most: int, budget: SearchBudget, rng: np.random.Generator
 ) -> Iterator[tuple[Indices, Indices]]:
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
-    fix a pose best, and of which the outermost are likely the same.
+    fix a pose best, and of which the outermost are likely the same; then near ones at random.
     """
-    n, M = len(features), len(lines)
-    if comb(M, 3) * perm(n, 3) <= budget.max_problems:
-        yield from _all_problems(np.arange(M), np.arange(n), budget, rng)
+    n, M = len(features), len(rays)
+    if comb(M, 3) * perm(n, 3) <= most:
+        yield from _all_problems(np.arange(M), np.arange(n), most, budget, rng)
         return
-    spread_lines = far_apart(lines.pixels, int(1.5 * budget.exhaustive))
-    yield from _all_problems(spread_lines, far_apart(features, budget.exhaustive), budget, rng)
-    for _ in range(budget.max_problems // budget.chunk // 2):
-        yield _drawn(M, budget.chunk, rng), _drawn(n, budget.chunk, rng)
+    spread_rays = far_apart(rays.pixels, int(1.5 * budget.exhaustive))
+    yield from _all_problems(
+        spread_rays, far_apart(features, budget.exhaustive), most // 2, budget, rng
+    )
+    nearest = np.argsort(np.linalg.norm(rays.pixels[:, None] - rays.pixels, axis=2), axis=1)
+    for k in range(most // budget.chunk // 2):
+        crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]
+        first = rng.integers(0, M, budget.chunk)
+        chosen = _drawn(min(crowd, M) - 1, 2, budget.chunk, rng) + 1
+        yield (
+            np.stack([first, nearest[first, chosen[0]], nearest[first, chosen[1]]]),
+            _drawn(n, 3, budget.chunk, rng),
+        )
 
 
 def _all_problems(
-    detections: Indices, features: Indices, budget: SearchBudget, rng: np.random.Generator
+    detections: Indices,
+    features: Indices,
+    most: int,
+    budget: SearchBudget,
+    rng: np.random.Generator,
 ) -> Iterator[tuple[Indices, Indices]]:
     by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
     by_feature = np.array(list(permutations(features, 3)), dtype=np.intp).T
     total = by_detection.shape[1] * by_feature.shape[1]
-    order = rng.permutation(total)[: budget.max_problems]
+    order = rng.permutation(total)[:most]
     for start in range(0, len(order), budget.chunk):
         a, b = np.divmod(order[start : start + budget.chunk], by_feature.shape[1])
         yield by_detection[:, a], by_feature[:, b]
 
 
-def _drawn(count: int, problems: int, rng: np.random.Generator) -> Indices:
-    """Random triples (3, K) of different indices."""
-    return np.argsort(rng.random((problems, count)), axis=1)[:, :3].T
+def _drawn(count: int, size: int, problems: int, rng: np.random.Generator) -> Indices:
+    """Random tuples (size, problems) of different numbers below `count`."""
+    return np.argsort(rng.random((problems, count)), axis=1)[:, :size].T
 
 
 def _perspective(
-    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
+    rays: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
 ) -> Floats:
-    directions = lines.directions.T[:, detections].transpose(1, 0, 2)
-    body = features.T[:, corners].transpose(1, 0, 2)
-    sides = [body[i] - body[j] for i, j in ((0, 1), (0, 2), (1, 2))]
-    squared = np.array([(side * side).sum(axis=0) for side in sides])
-    distances, which = depths(directions, squared)
+    distance2 = ((features[:, None] - features) ** 2).sum(axis=-1)
+    between = rays.directions @ rays.directions.T
+    cosines = np.array([between[detections[i], detections[j]] for i, j in SIDES])
+    squared = np.array([distance2[corners[i], corners[j]] for i, j in SIDES])
+    distances, which = depths(cosines, squared)
     # smaller than this in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > min_pixels * lines.slope * distances.min(axis=0)
+    near = largest > min_pixels * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
-    world = lines.origins[0][:, None] + directions[:, :, which] * distances[:, None]
-    return align_triples(body[:, :, which], world)
+    directions = np.array([rays.directions.T[:, each] for each in detections[:, which]])
+    body = np.array([features.T[:, each] for each in corners[:, which]])
+    return align_triples(body, rays.origins[0][:, None] + directions * distances[:, None])
 
 
 def _orthographic(
-    lines: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
+    rays: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
 ) -> Floats:
-    """Three parallel lines: the sides' lengths give depth differences, which must add up.
+    """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
     body = features.T[:, corners].transpose(1, 0, 2)
-    seen = lines.origins.T[:, detections].transpose(1, 0, 2)
-    tolerance = 3 * min_pixels * lines.offset
+    seen = rays.origins.T[:, detections].transpose(1, 0, 2)
+    tolerance = 3 * min_pixels * rays.offset
     rise = []
-    for i, j in ((0, 1), (0, 2), (1, 2)):
+    for i, j in SIDES:
         side, flat = body[j] - body[i], seen[j] - seen[i]
         length2, flat2 = (side * side).sum(axis=0), (flat * flat).sum(axis=0)
         possible = np.sqrt(flat2) <= np.sqrt(length2) + tolerance
         rise.append(np.where(possible, np.sqrt(np.maximum(length2 - flat2, 0.0)), np.nan))
-    direction = lines.directions[0][:, None]
+    direction = rays.directions[0][:, None]
     poses = []
     for sign in (1.0, -1.0):
         off = np.abs(np.abs(rise[1] - sign * rise[0]) - rise[2])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -23,6 +24,7 @@ from mixpose.search.triangulation import triangulate
 from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
+Kind: TypeAlias = Callable[[int], Iterator[Floats]]
 
 
 def kinds_of_guesses(
@@ -30,25 +32,36 @@ def kinds_of_guesses(
     body: Body,
     constraint: Constraint,
     budget: SearchBudget,
-    rng: np.random.Generator,
-) -> list[Iterator[Floats]]:
-    """Kinds of guesses from rays, the quickest first; each yields poses (K, 4, 4) in batches.
+    seed: int,
+) -> list[Kind]:
+    """Kinds of guesses from rays, the quickest first.
 
-    Points in space; one such point and two rays; three rays of one camera.  Of many detections,
-    one point is as good as another, and three rays of one camera come before it.
+    Points in space; one such point and two rays; three rays of one camera.
+
+    Returns
+    -------
+    list of callable
+        Each takes a number of batches to skip, and yields poses (K, 4, 4) batch by batch, always
+        the same.
     """
     seen = [each for each in detections if each.rays is not None and len(each.rays)]
-    rays = [each.rays for each in seen if each.rays is not None]
-    kinds = []
+    rays, gates = _rays_and_gates(seen, budget)
+    kinds: list[Kind] = []
     if constraint.turns.sum() < 2:
-        kinds.append(_from_restricted_turns(seen, body, constraint, budget))
-    single = [from_three_rays(each, body.means, budget, rng) for each in rays]
-    if len(rays) < 2:
-        return [*kinds, *single]
-    points = _from_points(seen, body, budget, rng)
-    anchors = _from_anchors(seen, body, budget)
-    many = max(len(each) for each in rays) > budget.max_rays
-    return [*kinds, points, *single, anchors] if many else [*kinds, points, anchors, *single]
+        kinds.append(partial(_from_restricted_turns, seen, body, constraint, budget))
+    most = budget.max_problems
+    if len(rays) > 1:
+        most = budget.max_shared_problems // len(rays)
+        found = triangulate(rays, gates, budget.min_sine)
+        found = by_promise(found, seen, budget.gate, budget.max_points)
+        few = body.means[far_apart(body.means, budget.subsample)]
+        kinds.append(partial(from_point_triples, found, body, budget, np.random.default_rng(seed)))
+        kinds.append(partial(from_point_and_rays, found, rays, gates, few, budget))
+    kinds += [
+        partial(from_three_rays, each, body.means, most, budget, np.random.default_rng(seed))
+        for each in rays
+    ]
+    return kinds
 
 
 def _rays_and_gates(
@@ -58,40 +71,19 @@ def _rays_and_gates(
     return rays, [budget.gate * each.sigma for each in detections]
 
 
-def _from_points(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    budget: SearchBudget,
-    rng: np.random.Generator,
-) -> Iterator[Floats]:
-    found = triangulate(*_rays_and_gates(detections, budget), budget.min_sine)
-    found = by_promise(found, detections, budget.gate, budget.max_points)
-    yield from from_point_triples(found, body, budget, rng)
-
-
-def _from_anchors(
-    detections: Sequence[SensorDetections], body: Body, budget: SearchBudget
-) -> Iterator[Floats]:
-    rays, gates = _rays_and_gates(detections, budget)
-    rays = [each.select(far_apart(each.pixels, budget.max_rays)) for each in rays]
-    found = triangulate(rays, gates, budget.min_sine)
-    found = found.select(np.argsort(found.tolerance)[: budget.max_anchors])
-    features = body.means[far_apart(body.means, budget.subsample)]
-    yield from from_point_and_rays(found, rays, gates, features, budget.max_pairs)
-
-
 def _from_restricted_turns(
     detections: Sequence[SensorDetections],
     body: Body,
     constraint: Constraint,
     budget: SearchBudget,
+    skipped: int,
 ) -> Iterator[Floats]:
     """Guesses for at most one free axis: all headings, one feature on one ray or point."""
     turns = spread_turns(constraint.turns, budget.heading_step)
     rotations = turns @ constraint.T_reference[:3, :3]
     rays, gates = _rays_and_gates(detections, budget)
     if constraint.shifts.sum() <= 2:
-        yield from on_rays(rays, body, rotations, constraint)
+        yield from on_rays(rays[skipped:], body, rotations, constraint)
     elif len(rays) >= 2:
         yield on_points(triangulate(rays, gates, budget.min_sine), body, rotations)
 

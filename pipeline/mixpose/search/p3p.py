@@ -1,6 +1,6 @@
-"""Poses of three points from three lines of sight that meet in one centre (P3P), in bulk.
+"""Poses of three points from three rays that meet in one centre (P3P), in bulk.
 
-The distances λ along the lines solve three quadratic equations
+The distances λ along the rays solve three quadratic equations
 ``λ_i² + λ_j² − 2 λ_i λ_j cos_ij = d_ij²``.  Two combinations without constant term are conics in
 the ratios of the λ; a member of their pencil that falls apart into two lines (a root of a cubic)
 is cut with another, which leaves two quadratic equations: at most four solutions
@@ -26,16 +26,16 @@ _ROUNDING = 1e-9  # a discriminant this little below zero is a double root
 _INEXACT = 1e-3  # share of the squared distances that a solution may miss them by
 
 # A symmetric 3x3 matrix is its entries (00, 01, 02, 11, 12, 22); sides are (01, 02, 12).
-_SIDES = ((0, 1), (0, 2), (1, 2))
+SIDES = ((0, 1), (0, 2), (1, 2))
 
 
-def depths(directions: Floats, squared: Floats) -> tuple[Floats, Indices]:
+def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
     """Distances from the centre to three points of a triangle.
 
     Parameters
     ----------
-    directions : (3, 3, K) array
-        Unit vectors of three lines of sight: line, coordinate, problem.
+    cosines : (3, K) array
+        Of the angles between rays 0 and 1, 0 and 2, 1 and 2.
     squared : (3, K) array
         Squared distances between points 0 and 1, 0 and 2, 1 and 2.
 
@@ -46,7 +46,6 @@ def depths(directions: Floats, squared: Floats) -> tuple[Floats, Indices]:
     (S,) int array
         The problem that it solves.
     """
-    cosines = np.array([(directions[i] * directions[j]).sum(axis=0) for i, j in _SIDES])
     with np.errstate(all="ignore"):
         D1, D2 = _conics(cosines, squared)
         gamma = _pencil_root(D1, D2)
@@ -196,7 +195,7 @@ def _polish(found: Floats, cosines: Floats, squared: Floats) -> tuple[Floats, Ma
 def _law_residuals(x: Floats, cosines: Floats, squared: Floats) -> tuple[Floats, list[Floats]]:
     """Residuals (3, K) of the laws of sides 01, 02, 12, and their slopes by either distance."""
     residuals, slopes = [], []
-    for k, (i, j) in enumerate(_SIDES):
+    for k, (i, j) in enumerate(SIDES):
         along_i, along_j = x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]
         residuals.append(x[i] * along_i + x[j] * along_j - squared[k])
         slopes += [2 * along_i, 2 * along_j]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -19,48 +19,10 @@ from mixpose.search.evidence import evidence
 from mixpose.search.guesses import from_slips, from_spread_orientations, kinds_of_guesses
 from mixpose.search.inlier_counts import LabelImage, count_inliers, label_images
 from mixpose.search.refinement import Descent, Stage, first_of_each, unlike
-from mixpose.search.spread import far_apart
+from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
+from mixpose.search.spread import sparse
 
 Floats: TypeAlias = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A pose that may explain the views.
-
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    score : float
-        Matched objective at the finest blur, summed over views, every detection counting alike:
-        (k/n)² per view with k of n features met exactly.
-    evidence : float
-        What candidates are ranked by: logarithm of the odds that this is not chance; with
-        ranges among the sensors, the score.
-    """
-
-    T_world_object: Floats
-    score: float
-    evidence: float = 0.0
-
-
-@dataclass(frozen=True)
-class SearchReport:
-    """What a search cost.
-
-    Attributes
-    ----------
-    made : int
-        Guesses.
-    tested : int
-        Guesses counted on all features and sensors.
-    refined : int
-        Guesses that descended.
-    """
-
-    made: int = 0
-    tested: int = 0
-    refined: int = 0
 
 
 def search(
@@ -73,7 +35,30 @@ def search(
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
 ) -> list[Candidate]:
-    """Find poses that explain the views, without a start.
+    """Find poses that explain the views, without a start; arguments as of `search_frame`.
+
+    Returns
+    -------
+    list of Candidate
+        Best first, no two alike modulo the body's symmetries; empty where nothing was seen.
+    """
+    return search_frame(
+        views, body, free=free, T_reference=T_reference, count=count, seed=seed, budget=budget
+    ).candidates
+
+
+def search_frame(
+    views: Sequence[View],
+    body: Body,
+    *,
+    free: NDArray[np.bool_],
+    T_reference: Floats | None,
+    count: int = 8,
+    seed: int = 0,
+    budget: SearchBudget = THOROUGH,
+    state: SearchState | None = None,
+) -> SearchResult:
+    """Find poses that explain the views of one frame, without a start.
 
     Parameters
     ----------
@@ -89,11 +74,8 @@ def search(
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
-
-    Returns
-    -------
-    list of Candidate
-        Best first, no two alike modulo the body's symmetries; empty where nothing was seen.
+    state : SearchState or None
+        Of the frame before, where its budget was used up.
 
     Raises
     ------
@@ -108,11 +90,11 @@ def search(
         )
     detections = sensor_detections(views, body, budget.peaks)
     if not detections:
-        return []
+        return SearchResult([], SearchReport(), SearchState())
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
     run = _Run(detections, body, Constraint(free, reference), budget, seed)
-    run.find()
-    return run.candidates(count)
+    after = run.find(state or SearchState())
+    return SearchResult(run.candidates(count), run.report, after)
 
 
 class _Run:
@@ -130,37 +112,70 @@ class _Run:
         self._body = body
         self._constraint = constraint
         self._budget = budget
-        self._rng = np.random.default_rng(seed)
+        self._seed = seed
         self._images: list[LabelImage] = []
         if is_pointlike(body):
-            self._images = label_images(detections, budget.gate)
+            self._images = label_images(detections, budget.gate, budget.labels)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = len(self._images) == len(detections)
+        self._by_evidence = bool(self._images) and all(one.rays is not None for one in detections)
         self._descent = Descent(detections, body, constraint.free, budget.descent)
+        few = sparse(body, budget.descent_features)
+        self._quick_descent = self._descent
+        if few is not body:
+            self._quick_descent = Descent(detections, few, constraint.free, budget.descent)
         self._poses = np.zeros((0, 4, 4))
         self._ranks = np.zeros(0)
         self.report = SearchReport()
 
-    def find(self) -> None:
-        """Make as many kinds of guesses as are needed."""
+    def find(self, state: SearchState) -> SearchState:
+        """Make as many kinds of guesses as are needed and allowed."""
         budget = self._budget
-        if self._images:
-            kinds = kinds_of_guesses(
-                self._detections, self._body, self._constraint, budget, self._rng
-            )
-            for guesses in kinds:
-                self._keep(self._descended(self._shortlist(guesses)))
-                if self._is_settled():
-                    break
-        if not self._by_evidence or not self.report.made:
-            if self._coverage() < budget.sufficient:
-                self._keep(self._blunt())
-        slippery = 2 * budget.exhaustive <= len(self._body) <= budget.max_slip_features
-        if len(self._poses) and self._images and slippery:
+        after = self._sharp(state) if self._images else SearchState()
+        if (not self._by_evidence or not self.report.made) and (
+            self._coverage() < budget.sufficient
+        ):
+            self._keep(self._blunt())
+        slippery = self._body.recurrence >= budget.min_recurrence
+        slippery &= budget.min_slip_features <= len(self._body) <= budget.max_slip_features
+        if slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
         best = np.argsort(-self._ranks, kind="stable")[: budget.finalists]
-        self._keep(self._refined(self._poses[best], budget.final_plan))
+        self._keep(self._refined(self._descent, self._poses[best], budget.final_plan))
+        return after
+
+    def _sharp(self, state: SearchState) -> SearchState:
+        """Guesses from rays, kind after kind; those after the first from where they stopped."""
+        kinds = kinds_of_guesses(
+            self._detections, self._body, self._constraint, self._budget, self._seed
+        )
+        most = self._budget.max_guesses
+        if len(kinds) > 1:
+            self._tried(kinds[0](0), None if most is None else most // 2)
+        for k, kind in enumerate(kinds[1:] or kinds):
+            if self._is_settled():
+                break
+            if k >= state.kind:
+                skipped = state.batch if k == state.kind else 0
+                batches = self._tried(kind(skipped), most)
+                if most is not None and self.report.made >= most:
+                    return SearchState(k, skipped + batches)
+        return SearchState()
+
+    def _tried(self, guesses: Iterator[Floats], most: int | None) -> int:
+        """Keep what comes of guesses until `most` were made; the number of batches."""
+        batches = 0
+
+        def allowed() -> Iterator[Floats]:
+            nonlocal batches
+            for batch in guesses:
+                if most is not None and self.report.made >= most:
+                    return
+                batches += 1
+                yield batch
+
+        self._keep(self._descended(self._shortlist(allowed())))
+        return batches
 
     def candidates(self, count: int) -> list[Candidate]:
         """Distinct poses, best first."""
@@ -186,12 +201,17 @@ class _Run:
         return np.asarray(self._descent.objective().shares(poses).sum(axis=0))
 
     def _is_settled(self) -> bool:
-        """Whether no other kind of guess is needed."""
-        overwhelming = (
-            len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming
-        )
-        wanted = self._budget.sufficient if overwhelming else self._budget.convincing
-        return self._coverage() >= wanted
+        """Whether no other kind of guess is needed.
+
+        Where the evidence of several cameras is overwhelming, only a pose that explains most of
+        the detections could still be better.
+        """
+        if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming:
+            best = self._poses[self._ranks.argmax()]
+            explainable = sum(min(image.count, len(self._body)) for image in self._images)
+            explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
+            return max(self._coverage(), explained) >= self._budget.sufficient
+        return self._coverage() >= self._budget.convincing
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
@@ -204,12 +224,17 @@ class _Run:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
-        return self._refined(guesses, plan)
+        return self._refined(self._quick_descent, guesses, plan)
 
-    def _refined(self, poses: Floats, plan: Sequence[tuple[float, int]]) -> Floats:
+    def _refined(
+        self, descent: Descent, poses: Floats, plan: Sequence[tuple[float, int]]
+    ) -> Floats:
         count = len(self._detections)
-        stages = [Stage((factor,) * count, steps, len(poses)) for factor, steps in plan]
-        return self._descent.refine(poses, stages) if len(poses) else poses
+        stages = [
+            Stage((factor,) * count, steps, left)
+            for (factor, steps), left in zip(plan, self._budget.survivors)
+        ]
+        return descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""
@@ -221,12 +246,12 @@ class _Run:
     def _shortlist(self, guesses: Iterator[Floats]) -> Floats:
         """The guesses that explain most distinct detections, and among equals most closely."""
         budget = self._budget
-        poses, ranks, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0
+        poses, ranks, best, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0
         most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
         most = max(most, budget.min_shortlist)
         for batch in guesses:
             allowed = self._promising(self._constraint.apply(batch))
-            rank = self._count(allowed)
+            rank = self._count(self._body, allowed)
             if len(ranks) == most:
                 better = rank > ranks[-1]
                 allowed, rank = allowed[better], rank[better]
@@ -234,25 +259,27 @@ class _Run:
             order = np.argsort(-ranks, kind="stable")
             order = order[unlike(self._body, poses[order], budget.distinct)][:most]
             poses, ranks = poses[order], ranks[order]
-            if ranks.max(initial=0.0) > checked + 1 and self._is_found(poses[: budget.checked]):
+            best = float(ranks.max(initial=0.0))
+            improved = best > budget.improvement * checked + 1
+            checked = best if improved else checked
+            if improved and self._is_found(poses[: budget.checked]):
+                rest = slice(budget.checked, budget.checked + budget.finalists)
+                poses, ranks = poses[rest], ranks[rest]
                 break
-            checked = max(checked, ranks.max(initial=0.0))
-        return np.asarray(poses[ranks > ranks.max(initial=0.0) - budget.behind])
+        return np.asarray(poses[ranks > best - budget.behind])
 
-    def _count(self, poses: Floats, chosen: NDArray[np.intp] | None = None) -> Floats:
+    def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
-        body, few = self._body, slice(None) if chosen is None else chosen
-        normals = None if body.normals is None else body.normals[few]
         together = self._budget.max_together
-        counts, near = count_inliers(self._images, body.means[few], normals, poses, together)
+        counts, near = count_inliers(self._images, body.means, body.normals, poses, together)
         return np.asarray(counts.sum(axis=0) + 0.1 * near)
 
     def _promising(self, poses: Floats) -> Floats:
         """The better of many guesses, judged by some features where the body has many."""
-        few = far_apart(self._body.means, self._budget.test_features)
+        few = sparse(self._body, self._budget.test_features)
         self.report = replace(self.report, made=self.report.made + len(poses))
-        if len(few) < len(self._body) and len(poses) > self._budget.shortlist:
-            rank = self._count(poses, few)
+        if few is not self._body and len(poses) > self._budget.shortlist:
+            rank = self._count(few, poses)
             poses = poses[np.argsort(-rank, kind="stable")[: self._budget.shortlist]]
         self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
@@ -262,7 +289,7 @@ class _Run:
         budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._rank(guesses).max() < budget.overwhelming / 2:
+        if self._rank(guesses).max() < budget.beyond_doubt / 2:
             return False
         self._keep(self._descended(guesses))
-        return self._is_settled()
+        return self._ranks.max() > budget.beyond_doubt and self._is_settled()

@@ -18,7 +18,7 @@ from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
 from mixpose.objective import MatchedObjective, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
+from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
 from mixpose.records import SensorReport
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
@@ -102,7 +102,7 @@ class FrameData:
     ) -> MatchedObjective:
         """The matched objective at σ_ε, or at a share of it."""
         sigmas = [narrowed * view.observation.sigma for view in self.views]
-        steps = FINE_STEPS if fine else STEPS_PER_SIGMA
+        steps = FINE_STEPS if fine else LAST_STEPS
         return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
 
     def without(self, names: Mapping[str, str]) -> FrameData:

@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import GridPattern, PointPattern
+from mixpose.rigid import from_rotation_vector, transform
+from mixpose.search.budget import PeakOptions
+from mixpose.search.detections import peaks, sensor_detections
+from mixpose.search.inlier_counts import count_inliers, label_images
+from mixpose.search.orientations import spread_rotations, spread_turns
+from mixpose.sensors import PinholeCamera
+
+TRUTH = from_rotation_vector([0.3, -0.2, 0.5], [5.0, -3.0, 8.0])
+
+
+def seen_by(cameras: list[PinholeCamera], body: Body) -> list[View]:
+    return [
+        View(str(k), camera, Observation(PointPattern(y, np.linspace(1, 2, len(y))), 2.0))
+        for k, camera in enumerate(cameras)
+        for y in (camera.project(transform(TRUTH, body.means))[0],)
+    ]
+
+
+def test_features_that_share_a_detection_count_once(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    views = seen_by(pinhole_cameras, paper_body)
+    images = label_images(sensor_detections(views, paper_body, PeakOptions()), 3.0)
+    collapsed = TRUTH.copy()
+    # far behind its place the whole body falls within one disk
+    collapsed[:3, 3] = [50.0, 4e6, 40.0]
+    counts, _ = count_inliers(images, paper_body.means, None, np.array([TRUTH, collapsed]), 100_000)
+    assert counts[:, 0].tolist() == [6, 6]
+    assert counts[0, 1] <= 1
+
+
+def test_peaks_of_an_image_are_found_between_pixels() -> None:
+    places = np.array([[20.3, 30.7], [60.1, 12.4]])
+    v, u = np.mgrid[:64, :80]
+    image = sum(np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 2.0**2) for x, y in places)
+    pattern = GridPattern(np.asarray(image, dtype=np.float32), np.array([100.0, 50.0]), 1.0)
+    found = peaks(pattern, 1.5, PeakOptions())
+    order = np.argsort(found[:, 0])
+    # the vertex of a parabola through a Gaussian of 2.5 px is off by less than 0.02 px
+    np.testing.assert_allclose(found[order], places + pattern.origin, atol=0.02)
+
+
+def test_spread_rotations_leave_no_large_gap() -> None:
+    rotations = Rotation.from_matrix(spread_rotations(4608))
+    for probe in Rotation.random(50, rng=np.random.default_rng(0)):
+        # 4608 balls of 8° radius would fill the orientations; the worst gap is under twice that
+        assert np.degrees((rotations * probe.inv()).magnitude().min()) < 16
+
+
+def test_turns_keep_to_the_free_axes() -> None:
+    about_z = spread_turns(np.array([False, False, True]), 0.1)
+    assert np.abs(about_z[:, 2] - [0.0, 0.0, 1.0]).max() < 1e-12
+    assert len(about_z) == 63
+    assert spread_turns(np.zeros(3, dtype=np.bool_), 0.1).shape == (1, 3, 3)

@@ -1,0 +1,97 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import PointPattern
+from mixpose.rigid import from_parts
+from mixpose.search import SearchBudget
+from mixpose.search.budget import PeakOptions
+from mixpose.search.detections import sensor_detections
+from mixpose.search.from_point_triples import (
+    by_promise,
+    feature_triangles,
+    from_point_triples,
+)
+from mixpose.search.triangulation import triangulate
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
+
+K = np.array([[900.0, 2.0, 639.5], [0, 880.0, 511.5], [0, 0, 1]])
+
+
+def poses() -> tuple[np.ndarray, np.ndarray]:
+    """Two cameras at right angles, a unit of 1000 from the middle."""
+    first = from_parts(np.eye(3), [0, 0, 1000.0])
+    second = from_parts(Rotation.from_euler("y", 90, degrees=True).as_matrix(), [0, 0, 1000.0])
+    return first, second
+
+
+def cameras(kind: str) -> list[Sensor]:
+    made: list[Sensor] = []
+    for T in poses():
+        if kind == "pinhole":
+            made.append(PinholeCamera(K, np.array([-0.2, 0.05, 1e-3, -1e-3]), (1280, 1024), T))
+        elif kind == "fisheye":
+            made.append(FisheyeCamera(K, np.array([0.05, -0.01, 0.0, 0.0]), (1280, 1024), T))
+        else:
+            made.append(ParallelBeam(0.5, np.array([640.0, 512.0]), (1280, 1024), T))
+    return made
+
+
+@pytest.mark.parametrize("kind", ["pinhole", "fisheye", "parallel"])
+def test_rays_of_two_cameras_meet_in_the_point_that_both_see(kind: str) -> None:
+    points = np.random.default_rng(1).uniform(-100, 100, (10, 3))
+    rays = [camera.rays(camera.project(points)[0]) for camera in cameras(kind)]
+    found = triangulate([each for each in rays if each is not None], [1.0, 1.0], 0.02)
+    same = found.rays[:, 0] == found.rays[:, 1]
+    assert same.sum() == 10
+    np.testing.assert_allclose(found.points[same], points[found.rays[same, 0]], atol=0.02)
+    # rays of different points rarely meet
+    assert (~same).sum() < 10
+
+
+def test_three_points_in_space_give_the_pose() -> None:
+    rng = np.random.default_rng(2)
+    features = rng.uniform(-100, 100, (6, 3))
+    T = from_parts(Rotation.random(rng=rng).as_matrix(), [10.0, -20.0, 5.0])
+    world = features @ T[:3, :3].T + T[:3, 3]
+    rays = [camera.rays(camera.project(world[:4])[0]) for camera in cameras("parallel")]
+    found = triangulate([each for each in rays if each is not None], [0.1, 0.1], 0.02)
+    body = Body("six", tuple(PointFeature(point) for point in features))
+    guesses = np.concatenate(list(from_point_triples(found, body, SearchBudget(), rng)))
+    error = np.abs(guesses - T).max(axis=(1, 2))
+    assert error.min() < 1e-6
+
+
+def test_triangles_of_features_are_ordered_and_not_flat() -> None:
+    corners = [[0.0, 0, 0], [30, 0, 0], [0, 40, 0], [60, 0, 0]]
+    body = Body("four", tuple(PointFeature(np.array(point)) for point in corners))
+    triangles = feature_triangles(body, 1000, 0.05)
+    # of four triples three are no line, in six orders each
+    assert len(triangles.corners) == 18
+    away, index = triangles.tree.query([30.0, 40.0, 50.0])
+    assert away < 1e-9
+    assert triangles.corners[index].tolist() == [0, 1, 2]
+
+
+def test_points_that_more_cameras_confirm_come_first() -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-100, 100, (5, 3))
+    third = from_parts(Rotation.from_euler("x", 90, degrees=True).as_matrix(), [0, 0, 1000.0])
+    sensors = [*cameras("pinhole"), PinholeCamera(K, np.zeros(0), (1280, 1024), third)]
+    views = []
+    for k, camera in enumerate(sensors):
+        false = rng.uniform([0, 0], [1280, 1024], (40, 2))
+        y = np.concatenate([false, camera.project(points)[0]])
+        views.append(View(str(k), camera, Observation(PointPattern(y, np.ones(45)), 1.0)))
+    body = Body("five", tuple(PointFeature(point) for point in points))
+    detections = sensor_detections(views, body, PeakOptions())
+    rays = [each.rays for each in detections if each.rays is not None]
+    found = by_promise(triangulate(rays, [3.0] * 3, 0.02), detections, 3.0, 10)
+    off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)
+    # 40 false detections a view leave a point by chance that three confirm now and then
+    assert np.sum(off < 0.1) >= 4
