@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.fit import blur_schedule
-from mixpose.judgement import DetectionModel, Judged, Noise, NoiseModel, Prior, enlargement
+from mixpose.judgement import DetectionModel, Judged, Noise, NoiseModel, Prior
 from mixpose.objective import Quadratic, View
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
@@ -157,7 +157,7 @@ def judge_ranges(
     # a direction that the data leave open is as uncertain as before
     covariance[inner] = np.linalg.inv(information[inner] + np.diag(1 / known.spread[free] ** 2))
     volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-    covariance *= enlargement(int(free.sum()), rules.stated_degrees + before.degrees)
+    covariance *= model.enlargement(int(free.sum()), rules.stated_degrees + before.degrees)
     return replace(
         judged,
         covariance=covariance,
