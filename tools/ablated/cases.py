@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from benchmarks.search_cases import Row, absent, trial
 from numpy.typing import NDArray
 
-from benchmarks.search_cases import Row, absent, trial
+from mixpose.fit import EstimatorOptions
 from mixpose.judgement import Judged
 from mixpose.objective import View
 from mixpose.poses.evaluate import normalised_error_squared
 from mixpose.records import Estimate
 from mixpose.rigid import rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate
-from mixpose.fit import EstimatorOptions
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.doubt import is_doubtful
@@ -152,7 +152,7 @@ def _outcome(
 
 
 def search_case(row: Row, trials: int) -> Case:
-    """A row of the search benchmark: each frame the first of a recording, a third without a body."""
+    """A row of the search benchmark: first frames, a third of them without a body."""
     present = [trial(row, seed) for seed in range(trials)]
     empty = [absent(row, FRESH + seed) for seed in range(-(-trials // 2))]
     recordings = []

@@ -8,15 +8,12 @@ from typing import Any
 
 from mixpose.judgement import DetectionModel
 from mixpose.tracking import Rules, Tracker
-from mixpose.tracking.proposers import (
-    Proposer,
-    Refinement,
-    merged_pair,
-    mirrored,
-    multistart,
-    searched,
-    without_outlier,
-)
+from mixpose.tracking.proposers import Proposer, Refinement
+from mixpose.tracking.proposers.merged_pair import merged_pair
+from mixpose.tracking.proposers.mirrored import mirrored
+from mixpose.tracking.proposers.multistart import multistart
+from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.without_outlier import without_outlier
 
 FREE = 0.0
 NEVER = float("inf")

@@ -105,9 +105,7 @@ def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -
     return share > rules.convincing and is_sure(judged, free, rules)
 
 
-def decide(
-    ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules
-) -> Verdict:
+def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
     best = next((one for one in ranked if is_possible(one, free, rules)), None)
     if best is None:

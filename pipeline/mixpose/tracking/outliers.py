@@ -21,9 +21,7 @@ def has_outlier(judged: Judged, rules: ProposalRules) -> bool:
     )
 
 
-def least_squares_step(
-    associations: Sequence[Association], free: NDArray[np.bool_]
-) -> Floats:
+def least_squares_step(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:
     """The step (6,) to where the features were met, merged ones in their middle."""
     rows = [(np.sqrt(one.shares) / one.sigma)[:, None] for one in associations]
     J = np.concatenate(
