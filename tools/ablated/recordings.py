@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from benchmarks.recordings import EYES, MARKERS
+from benchmarks.recordings import MARKERS
 from benchmarks.search_cases import looking_at
 from scipy.spatial.transform import Rotation
 
@@ -19,6 +19,7 @@ from mixpose.runner import begin, observe, open_sources
 from mixpose.session import load_session
 from mixpose.simulation import SimulationOptions, simulate
 
+EYES = ([0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [-0.8, -0.6, 0.0])
 SYNTHETIC = Path(__file__).resolve().parents[2] / "data" / "synthetic"
 
 
@@ -77,6 +78,7 @@ class Simulated:
     distance: float
     options: SimulationOptions
     limits: tuple[float, float] = (1.0, 5.0)
+    knocked_deg: float = 0.0  # by which the last camera was turned after its calibration
 
 
 SIMULATED = (
@@ -91,6 +93,12 @@ SIMULATED = (
     # one camera's depth errs by some per cent where so few pixels show the tilt
     Simulated("flat, one camera", FLAT, 1, 1500.0,
               SimulationOptions(40, seed=4, hidden=0.05, clutter=1, pixel_noise=0.3), (5.0, 50.0)),
+    Simulated("flat and small", FLAT, 1, 6000.0,
+              SimulationOptions(20, seed=6, hidden=0.05, clutter=1, pixel_noise=0.3),
+              (20.0, 400.0)),
+    Simulated("a knocked camera", MARKERS, 3, 1000.0,
+              SimulationOptions(20, seed=7, hidden=0.1, clutter=2, pixel_noise=0.3),
+              knocked_deg=2.0),
     Simulated("spots that touch", MARKERS, 2, 9000.0,
               SimulationOptions(30, seed=5, noise=1.0, spot_sigma=2.0), (3.0, 10.0)),
 )  # fmt: skip
@@ -115,11 +123,13 @@ def simulated_cases(folder: Path) -> Iterator[Case]:
         plain, made = folder / f"{one.name}.toml", folder / one.name
         plain.write_text(_session_text(one), encoding="utf-8")
         simulate(load_session(plain), made, one.options)
+        if one.knocked_deg:
+            (made / "session.toml").write_text(_session_text(one, one.knocked_deg))
         source = Source(f"{one.name}/session.toml", "truth.jsonl", *one.limits)
         yield replace(_case(folder, source), name=one.name)
 
 
-def _session_text(one: Simulated) -> str:
+def _session_text(one: Simulated, knocked_deg: float = 0.0) -> str:
     turn = Rotation.from_euler("xyz", [0.2, -0.3, 0.4]).as_rotvec().tolist()
     lines = [
         'unit = "mm"', "[object]", 'name = "body"', f"points = {one.points}",
@@ -127,7 +137,9 @@ def _session_text(one: Simulated) -> str:
         "rotation_deg = 10", "distance = 20",
     ]  # fmt: skip
     for k, eye in enumerate(EYES[: one.cameras]):
-        T = looking_at(one.distance / 1000.0 * np.array(eye), np.zeros(3))
+        T = looking_at(one.distance * np.array(eye), np.zeros(3))
+        if k == one.cameras - 1:
+            T[:3] = Rotation.from_euler("y", knocked_deg, degrees=True).as_matrix() @ T[:3]
         source = f"c{k}_*.png" if one.name == "spots that touch" else f"c{k}.csv"
         lines += [
             "[[sensor]]", f'name = "c{k}"', 'model = "pinhole"', f'source = "{source}"',

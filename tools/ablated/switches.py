@@ -14,6 +14,7 @@ from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.without_outlier import without_outlier
+from mixpose.tracking.proposers.without_sensor import without_sensor
 
 FREE = 0.0
 NEVER = float("inf")
@@ -91,6 +92,7 @@ SWITCHES = (
     Switch("no mirrored", without_proposer(mirrored)),
     Switch("no without_outlier", without_refinement(without_outlier)),
     Switch("no merged_pair", without_refinement(merged_pair)),
+    Switch("no without_sensor", without_refinement(without_sensor)),
     Switch("nothing merged", ruled("judgement.association", merged=False)),
     Switch("misses free", free_misses),
     Switch("unseen free", ruled("judgement.detection", log_unseen=FREE)),
