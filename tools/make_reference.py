@@ -92,7 +92,8 @@ COMMANDS_HEAD = f"""\
 
 {MADE_BY}
 
-Every command also takes `--debug`, which shows the traceback of an error. The exit status is 0
+Every command also takes `--debug`, which shows the traceback of an error; `run` then also names
+the proposer (`docs/method.md`) of each pose that was not predicted. The exit status is 0
 (done; a lost frame is a result), 2 (the session file or the options are wrong), 3 (the recording
 cannot be read; poses already estimated stay written) or 130 (interrupted, everything so far
 written). An error is one line on standard error.
@@ -197,6 +198,8 @@ def command_reference() -> str:
         hints = get_type_hints(function, include_extras=True)
         usage, entries, options = [f"mixpose {command.name or function.__name__}"], [], []
         for name, parameter in inspect.signature(function).parameters.items():
+            if hints[name] is typer.Context:
+                continue
             kind, info = get_args(hints[name])
             if isinstance(info, typer.models.ArgumentInfo):
                 needed = parameter.default is inspect.Parameter.empty

@@ -63,8 +63,6 @@ class Fit:
     converged : bool
     iterations : int
         Evaluations at the finest blur.
-    proposer : str
-        Where the start came from.
     freed : bool
         Whether the body did not fit, and the pose was fitted to freed features.
     """
@@ -73,7 +71,6 @@ class Fit:
     value: float
     converged: bool
     iterations: int
-    proposer: str = ""
     freed: bool = False
 
 
