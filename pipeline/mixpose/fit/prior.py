@@ -127,9 +127,7 @@ def likelihood_near(
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
 
-def cell_variances(
-    energies: Floats, shares: Floats, cells: NDArray[np.intp]
-) -> Floats:
+def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) -> Floats:
     """Variance of a cell's noise times the size of a cell (L,), from the energy left unexplained.
 
     Parameters
@@ -181,9 +179,7 @@ def most_probable(
     return _highest(likelihood, prior, [T], _NATS)
 
 
-def _highest(
-    likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float
-) -> Floats:
+def _highest(likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float) -> Floats:
     """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
     information = prior.information()
 

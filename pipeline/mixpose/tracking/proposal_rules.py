@@ -16,6 +16,9 @@ class ProposalRules:
         "share of a body met a step aside from which it may be followed there: a chessboard has "
         "0.8, markers at random 1/N",
     )
+    slipped: float = constant(
+        0.5, "of a feature, more that are missed and more beside it that belong to none: a step"
+    )
     drawn: int = constant(
         512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
     )

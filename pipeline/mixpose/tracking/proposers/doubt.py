@@ -5,8 +5,6 @@ from __future__ import annotations
 from mixpose.judgement import Judged, convinces
 from mixpose.tracking.likelihood import FrameData
 
-_HALF = 0.5  # of a feature: less is no difference
-
 
 def is_doubtful(data: FrameData, ranked: list[Judged]) -> bool:
     """Whether no pose convinces, or the best may have slipped by a step of its grid."""
@@ -24,6 +22,7 @@ def _has_slipped(judged: Judged, data: FrameData) -> bool:
         before = data.track.tallies.get(one.name)
         if before is None:
             continue
-        if one.missed > before.missed + _HALF and one.surplus > before.surplus + _HALF:
+        least = data.rules.proposals.slipped
+        if one.missed > before.missed + least and one.surplus > before.surplus + least:
             return True
     return False
