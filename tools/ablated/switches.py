@@ -11,7 +11,6 @@ from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
-from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.without_outlier import without_outlier
 from mixpose.tracking.proposers.without_sensor import without_sensor
@@ -87,7 +86,6 @@ def unfused(tracker: Tracker) -> Tracker:
 
 
 SWITCHES = (
-    Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
     Switch("no mirrored", without_proposer(mirrored)),
     Switch("no without_outlier", without_refinement(without_outlier)),
