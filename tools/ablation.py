@@ -35,7 +35,7 @@ SLOW = {"3 ranges 6/0/0": 4}
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=16, help="frames with the body per row")
+    parser.add_argument("--trials", type=int, default=12, help="frames with the body per row")
     parser.add_argument(
         "--recordings",
         type=Path,

@@ -52,8 +52,8 @@ REAL = (
     Source("disk_effector/bed.toml", "truth_bed.jsonl", 1.0, 5.0, alone=True),
     Source("led_tee/session.toml", "truth.jsonl", 3.0, 0.02, alone=True),
     Source("stereo_chessboard/session.toml", "truth.jsonl", 1.0, 5.0),
-    Source("webcams4_a/session_reference.toml", "truth.jsonl", 3.0, 0.02, frames=20),
-    Source("uwb_trolley/session.toml", "truth.jsonl", 20.0, 0.2, frames=60),
+    Source("webcams4_a/session_reference.toml", "truth.jsonl", 3.0, 0.02, frames=12),
+    Source("uwb_trolley/session.toml", "truth.jsonl", 20.0, 0.2, frames=40),
 )
 
 MADE = (
@@ -64,8 +64,8 @@ MADE = (
 )
 
 BOARD = [[25.0 * i, 25.0 * j, 0.0] for i in range(6) for j in range(4)]
-FLAT = [[-60.0, -40.0, 0.0], [70.0, -55.0, 0.0], [20.0, 65.0, 0.0], [-75.0, 30.0, 0.0],
-        [5.0, -10.0, 0.0], [80.0, 35.0, 0.0]]  # fmt: skip
+FLAT = [[-60.0, 0.0, -40.0], [70.0, 0.0, -55.0], [20.0, 0.0, 65.0], [-75.0, 0.0, 30.0],
+        [5.0, 0.0, -10.0], [80.0, 0.0, 35.0]]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ SIMULATED = (
               SimulationOptions(20, seed=7, hidden=0.1, clutter=2, pixel_noise=0.3),
               knocked_deg=2.0),
     Simulated("spots that touch", MARKERS, 2, 9000.0,
-              SimulationOptions(30, seed=5, noise=1.0, spot_sigma=2.0), (3.0, 10.0)),
+              SimulationOptions(15, seed=5, noise=1.0, spot_sigma=2.0), (3.0, 10.0)),
 )  # fmt: skip
 
 
