@@ -312,6 +312,19 @@ def test_debug_shows_the_traceback(recording: Path) -> None:
     assert "Traceback" in result.stderr
 
 
+def test_debug_names_the_proposer_of_poses_that_were_not_predicted(recording: Path) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    head, _, rest = text.partition("[start]")
+    session.write_text(head + rest[rest.index("[extract]") :], encoding="utf-8")
+    result = mixpose("run", session, "--stop", "3", "--debug")
+    told = [line for line in result.stderr.splitlines() if "came from" in line]
+    # without a start the first pose is searched for; the others follow it
+    assert told == ["mixpose: frame 0: ok, the pose came from: searched"]
+    assert "came from" not in mixpose("run", session, "--stop", "3").stderr
+    assert "searched" not in result.stdout
+
+
 def test_an_interrupt_leaves_whole_lines_and_status_130(recording: Path) -> None:
     poses = recording / "poses.jsonl"
     command = [

@@ -94,6 +94,7 @@ def test_cameras_get_a_picture_per_stage_and_a_sheet(
         assert picture is not None
         assert picture.std() > 3, path.name  # something is on it
     out = capsys.readouterr().out
+    assert "\nthe pose came from: predicted\n" in out
     # marker 1 is hidden in the left view of this frame, and a false spot is lit
     assert "left: 7 features found; the pose has 7 of 7 in view, 6 of them met" in out
     assert "not met and dark there: feature 1; hidden" in out

@@ -40,6 +40,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
         sensors={"left": SensorReport(True, 0.8, 0.2), "right": SensorReport(False)},
         hypotheses=(Hypothesis(T, 0.7),),
         latency_ms=2.0,
+        proposer="searched",
     )
     path = tmp_path / "poses.jsonl"
     symmetries = {"tracker": np.stack([np.eye(4), T])}
@@ -53,7 +54,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     (line,) = back.poses
     assert line.line == 2
     for name, value in asdict(estimate).items():
-        if name != "hypotheses":
+        if name not in ("hypotheses", "proposer"):
             assert np.array_equal(np.asarray(asdict(line)[name]), np.asarray(value)), name
     assert np.array_equal(line.hypotheses[0].T_world_object, T)
     assert line.hypotheses[0].weight == 0.7

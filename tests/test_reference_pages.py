@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
 from mixpose.session import load_session
 from mixpose.session.schema_common import Table
+from mixpose.tracking import Rules
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -51,6 +55,24 @@ def test_the_smallest_session_on_the_page_can_be_read(tmp_path: Path) -> None:
     (tmp_path / "session.toml").write_text(text, encoding="utf-8")
     session = load_session(tmp_path / "session.toml")
     assert (len(session.body), len(session.sensors)) == (4, 1)
+
+
+def test_every_rule_of_a_tracker_is_on_the_page_of_constants_with_a_reason() -> None:
+    page = (ROOT / "docs" / "constants.md").read_text(encoding="utf-8")
+    groups: list[Any] = [Rules()]
+    seen = 0
+    while groups:
+        group = groups.pop()
+        for field in dataclasses.fields(group):
+            value = getattr(group, field.name)
+            if dataclasses.is_dataclass(value):
+                groups.append(value)
+                continue
+            section = page.partition(f"### `{type(group).__name__}`")[2].partition("###")[0]
+            (row,) = re.findall(rf"\| `{field.name}` \| `.*` \| (.*) \|\n", section)
+            assert row.strip(), field.name
+            seen += 1
+    assert seen > 100
 
 
 def test_every_command_and_option_is_on_the_page() -> None:

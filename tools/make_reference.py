@@ -1,4 +1,4 @@
-"""Write docs/session.md and docs/commands.md from the code, so that they say what it does.
+"""Write docs/session.md, docs/commands.md and docs/constants.md from the code.
 
     python tools/make_reference.py [--check]
 
@@ -8,17 +8,23 @@ With --check nothing is written; the exit status is 1 where a file is not up to 
 from __future__ import annotations
 
 import ast
+import dataclasses
+import importlib
 import inspect
+import pkgutil
 import re
 import sys
 import textwrap
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
+from types import ModuleType
 from typing import Any, get_args, get_type_hints
 
 import typer
 from pydantic.fields import FieldInfo
 
+import mixpose
 from mixpose.cli.app import app
 from mixpose.extraction import ExtractOptions
 from mixpose.session.schema import (
@@ -92,10 +98,22 @@ COMMANDS_HEAD = f"""\
 
 {MADE_BY}
 
-Every command also takes `--debug`, which shows the traceback of an error. The exit status is 0
+Every command also takes `--debug`, which shows the traceback of an error; `run` then also names
+the proposer (`docs/method.md`) of each pose that was not predicted. The exit status is 0
 (done; a lost frame is a result), 2 (the session file or the options are wrong), 3 (the recording
 cannot be read; poses already estimated stay written) or 130 (interrupted, everything so far
 written). An error is one line on standard error.
+"""
+
+CONSTANTS_HEAD = f"""\
+# Constants
+
+{MADE_BY}
+
+Numbers that are believed rather than measured or derived on the spot, with their reasons.  They are
+fields of frozen dataclasses; `mixpose.tracking.Rules` holds those that a `Tracker` goes by, and
+`Tracker.create(..., rules=...)` takes others.  They are no options of a session.  Rows like 8/4/8
+are those of `python tools/benchmark.py search`: features, hidden, false.
 """
 
 
@@ -197,6 +215,8 @@ def command_reference() -> str:
         hints = get_type_hints(function, include_extras=True)
         usage, entries, options = [f"mixpose {command.name or function.__name__}"], [], []
         for name, parameter in inspect.signature(function).parameters.items():
+            if hints[name] is typer.Context:
+                continue
             kind, info = get_args(hints[name])
             if isinstance(info, typer.models.ArgumentInfo):
                 needed = parameter.default is inspect.Parameter.empty
@@ -235,7 +255,66 @@ def _word_for(kind: Any) -> str:
     return next((words[each] for each in (kind, *get_args(kind)) if each in words), "")
 
 
-PAGES = {"session.md": session_reference, "commands.md": command_reference}
+def constants_reference() -> str:
+    """The text of docs/constants.md."""
+    parts = [CONSTANTS_HEAD]
+    for module, tables in tables_of_constants().items():
+        parts.append(f"## `{module}`\n")
+        for table in tables:
+            parts.append(f"### `{table.__name__}`\n\n{_prose(_first_line(table))}\n")
+            rows = ["| field | default | why |", "| --- | --- | --- |"]
+            rows += [
+                f"| `{field.name}` | {_number(field.default)} | {_cell(field.metadata['why'])} |"
+                for field in dataclasses.fields(table)
+                if "why" in field.metadata
+            ]
+            parts.append("\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+def tables_of_constants() -> dict[str, list[type]]:
+    """Dataclasses with a `mixpose.constants.constant`, by the module that they stand in."""
+    found: dict[str, list[type]] = {}
+    for module in _modules():
+        for table in vars(module).values():
+            if not (inspect.isclass(table) and dataclasses.is_dataclass(table)):
+                continue
+            reasoned = any("why" in field.metadata for field in dataclasses.fields(table))
+            if reasoned and table.__module__ == module.__name__:
+                found.setdefault(module.__name__, []).append(table)
+    return found
+
+
+def _modules() -> Iterator[ModuleType]:
+    """Modules of the package that hold constants, by name."""
+    for info in sorted(pkgutil.walk_packages(mixpose.__path__, "mixpose."), key=lambda i: i.name):
+        path = Path(*mixpose.__path__, *info.name.split(".")[1:]).with_suffix(".py")
+        if path.exists() and "mixpose.constants" in path.read_text(encoding="utf-8"):
+            yield importlib.import_module(info.name)
+
+
+def _first_line(table: type) -> str:
+    return (inspect.getdoc(table) or "").partition("\n")[0]
+
+
+def _number(value: Any) -> str:
+    """A default as it is written in code."""
+    if isinstance(value, tuple):
+        items = ", ".join(_number(each).strip("`") for each in value)
+        return f"`({items}{',' * (len(value) == 1)})`"
+    return f"`{value:.4g}`" if isinstance(value, float) else f"`{value}`"
+
+
+def _cell(text: str) -> str:
+    """Words for a cell of a table."""
+    return text.replace("|", "\\|")
+
+
+PAGES = {
+    "session.md": session_reference,
+    "commands.md": command_reference,
+    "constants.md": constants_reference,
+}
 
 
 def main(arguments: list[str]) -> int:

@@ -149,6 +149,9 @@ class Estimate:
         In the order and axes of `mixpose.rigid`, squared lengths and radians.
     score : float
         0 to 1: how well the predicted densities meet the observed ones, over all sensors.
+    proposer : str
+        Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
+        part of the pose line.
     """
 
     frame: int
@@ -161,3 +164,4 @@ class Estimate:
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...] = ()
     latency_ms: float = field(default=0.0, compare=False)
+    proposer: str = field(default="", compare=False)

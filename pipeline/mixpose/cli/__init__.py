@@ -19,7 +19,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit status.
 
     Errors that a user can mend are one line on standard error; ``--debug`` shows the traceback
-    before it.  A request to end (SIGTERM, SIGHUP) is taken like an interrupt from the keyboard.
+    before it, and what a command has to say beyond its results.  A request to end (SIGTERM, SIGHUP)
+    is taken like an interrupt from the keyboard.
     """
     _replace_closed_streams()
     try:
@@ -73,7 +74,7 @@ def _status(arguments: list[str]) -> int:
     arguments = [argument for argument in arguments if argument != "--debug"] or ["--help"]
     try:
         outcome = typer.main.get_command(app).main(
-            args=arguments, prog_name="mixpose", standalone_mode=False
+            args=arguments, prog_name="mixpose", standalone_mode=False, obj=debug
         )
     except MixposeError as error:
         _show_traceback(debug)

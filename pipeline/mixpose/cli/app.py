@@ -60,6 +60,7 @@ def _common(
 
 @app.command()
 def run(
+    context: typer.Context,
     sessions: Annotated[
         list[Path], typer.Argument(metavar="SESSION.toml", help="One session file or several.")
     ],
@@ -97,7 +98,8 @@ def run(
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
-    request = RunRequest(output, format.value, tuple(source or ()), selection, resume, overlay)
+    sources, debug = tuple(source or ()), bool(context.obj)
+    request = RunRequest(output, format.value, sources, selection, resume, overlay, debug)
     if len(sessions) > 1:
         from mixpose.cli.several import run_sessions  # noqa: PLC0415
 

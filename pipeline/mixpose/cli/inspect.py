@@ -134,6 +134,8 @@ def _summary(
         weights = ", ".join(f"{one.weight:.2g}" for one in estimate.hypotheses)
         head += f"; {len(estimate.hypotheses)} poses with weights {weights}, the first is shown"
     lines = [head]
+    if estimate.proposer:
+        lines.append(f"the pose came from: {estimate.proposer}")
     for finding in findings:
         lines += describe(finding, session.body, session.unit)
     if estimate.status == "lost":

@@ -43,6 +43,13 @@ def warn_of_sources(sources: Mapping[str, Source]) -> None:
             warn(f"sensor {name!r}: {caution}")
 
 
+def origin_of(estimate: Estimate) -> str:
+    """A frame's status, and which proposer its pose came from."""
+    if not estimate.proposer:
+        return estimate.status
+    return f"{estimate.status}, the pose came from: {estimate.proposer}"
+
+
 class Summary:
     """Counts frames as they pass, and says in the end what became of them."""
 

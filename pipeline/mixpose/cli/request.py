@@ -21,3 +21,4 @@ class RunRequest:
     selection: Selection
     resume: bool
     overlay: Path | None = None
+    debug: bool = False

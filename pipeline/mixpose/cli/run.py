@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from mixpose import __version__
-from mixpose.cli.notices import Summary, say, warn_of_sources
+from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
 from mixpose.cli.output import Output, refuse_to_overwrite
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
@@ -19,6 +19,7 @@ from mixpose.records import Estimate, Floats
 from mixpose.runner import Watch, open_sources, run
 from mixpose.selection import Selection
 from mixpose.session import Session, load_session
+from mixpose.tracking.proposers.predicted import predicted
 
 SWITCH_S = 1e-4
 """After so long a thread that has decoded a frame is let on; Python's own 5 ms is a whole frame."""
@@ -56,6 +57,8 @@ def run_session(path: Path, request: RunRequest) -> None:
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
             summary.add(estimate)
+            if request.debug and estimate.proposer != predicted.__name__:
+                say(f"frame {estimate.frame}: {origin_of(estimate)}")
     if resumed and not summary.statuses:
         say(f"nothing left to do: {request.output} has all frames asked for already")
         return

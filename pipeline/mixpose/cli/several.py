@@ -106,7 +106,7 @@ def _command(session: Path, output: Path, request: RunRequest) -> list[str]:
     options += [f"--start={chosen.start}"] if chosen.start is not None else []
     options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
     options += ["--resume"] if request.resume else []
-    options += ["--debug"] if "--debug" in sys.argv else []
+    options += ["--debug"] if request.debug else []
     return [sys.executable, "-m", "mixpose", "run", *options, "--", str(session)]
 
 

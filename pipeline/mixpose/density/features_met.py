@@ -36,6 +36,12 @@ class AssociationRules:
         "σ_ε: features crowd at least over so wide a region, so that two that are close do not "
         "make the density of clutter infinite",
     )
+    crowded: bool = constant(
+        True, "whether clutter is as dense as detections around the body, where they are denser"
+    )
+    merged: bool = constant(
+        True, "whether two features may share one detection: blobs that touch have one centre"
+    )
     slip: float = constant(
         0.25,
         "of the body's size in the image: around its box, a grid shifted by a step has detections "
@@ -97,7 +103,7 @@ def features_met(
     reach = rules.reach_squared * variance
     shares, offsets = _nearest(observation.pattern, y, weights, reach)
     alone = np.arange(len(y))
-    if np.count_nonzero(shares) == len(shares):
+    if not rules.merged or np.count_nonzero(shares) == len(shares):
         return FeaturesMet(shares, offsets, alone)
     return _run_together(FeaturesMet(shares, offsets, alone), y, weights, reach)
 
@@ -208,7 +214,7 @@ def crowding(
     pattern = observation.pattern
     count = float(len(pattern.points)) if isinstance(pattern, PointPattern) else participation
     overall = count / _area(upper - lower, smallest)
-    if not isinstance(pattern, PointPattern) or not len(y):
+    if not rules.crowded or not isinstance(pattern, PointPattern) or not len(y):
         return count, overall
     near, far = y.min(axis=0), y.max(axis=0)
     half = np.maximum(far - near, smallest) / 2

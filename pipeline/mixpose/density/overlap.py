@@ -15,7 +15,8 @@ Indices: TypeAlias = NDArray[np.intp]
 REACH = 7.5
 """Standard deviations beyond which two features do not overlap: e^-28."""
 
-_DENSE = 48  # up to here all pairs at once are faster than a search for neighbours
+ALL_PAIRS = 48
+"""Points up to which all pairs at once are faster than a search for neighbours."""
 
 
 def peak(variance: float, dimension: int) -> float:
@@ -25,13 +26,13 @@ def peak(variance: float, dimension: int) -> float:
 
 def close_pairs(points: Floats, variance: float) -> Indices:
     """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
-    if len(points) <= _DENSE:
+    if len(points) <= ALL_PAIRS:
         return _all_pairs(len(points))
     pairs = cKDTree(points).query_pairs(REACH * np.sqrt(variance), output_type="ndarray")
     return np.asarray(pairs, dtype=np.intp)
 
 
-@lru_cache(maxsize=_DENSE)
+@lru_cache(maxsize=ALL_PAIRS)
 def _all_pairs(count: int) -> Indices:
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     pairs.flags.writeable = False

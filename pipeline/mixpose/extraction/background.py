@@ -8,6 +8,7 @@ so many pixels.  Features up to half the shorter side are taken out by medians o
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -15,34 +16,46 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
+
 # (H, W) uint8, uint16 or float32, as OpenCV takes and gives them.
 Grey: TypeAlias = NDArray[np.integer[Any] | np.floating[Any]]
 
-TILES_PER_SHORT_SIDE = 5
-LEAST_TILE_PX = 16
 SAMPLES_PER_TILE_SIDE = 16
 
 # Sides of images and windows for which the places of samples are kept.
 PLACES = 64
 
-# Noise is measured between pixels so far apart: interpolated or compressed pixels are more
-# alike than noise would make them.
-NOISE_SPACING_PX = 3
+
+@dataclass(frozen=True)
+class BackgroundRules:
+    """What is background, and what is noise."""
+
+    tiles_per_short_side: int = constant(
+        5, "tiles of which medians are taken: light changes over a frame, not over fewer px"
+    )
+    min_tile: int = constant(16, "px: a smaller tile is filled by a feature")
+    noise_spacing: int = constant(
+        3,
+        "px between which noise is measured: interpolated or compressed neighbours are more alike "
+        "than noise would make them",
+    )
 
 
-def background_tiles(image: Grey) -> Grey:
+def background_tiles(image: Grey, rules: BackgroundRules = BackgroundRules()) -> Grey:
     """Coarse map of the background.
 
     Parameters
     ----------
     image : (H, W) uint8, uint16 or float32
+    rules : BackgroundRules
 
     Returns
     -------
     (rows, columns) array of the type of the image
         Medians of the tiles into which the image divides.
     """
-    tile = tile_side(image)
+    tile = tile_side(image, rules)
     rows, v = _sample_places(image.shape[0], tile)
     columns, u = _sample_places(image.shape[1], tile)
     # First rows, then columns: several times as fast as both at once, and two to three times as
@@ -84,14 +97,15 @@ def _about(pixels: slice, tile: int) -> tuple[slice, slice]:
     )
 
 
-def noise_of(image: Grey) -> float:
+def noise_of(image: Grey, rules: BackgroundRules = BackgroundRules()) -> float:
     """Robust standard deviation of a pixel of an image (H, W), shading and features apart."""
-    if image.shape[1] <= 2 * NOISE_SPACING_PX:
+    spacing = rules.noise_spacing
+    if image.shape[1] <= 2 * spacing:
         return 0.0 if image.dtype == np.float32 else 1.0
-    tile = tile_side(image)
+    tile = tile_side(image, rules)
     _, v = _sample_places(image.shape[0], tile)
-    _, u = _sample_places(image.shape[1] - 2 * NOISE_SPACING_PX, tile)
-    places = np.concatenate([u + shift * NOISE_SPACING_PX for shift in range(3)])
+    _, u = _sample_places(image.shape[1] - 2 * spacing, tile)
+    places = np.concatenate([u + shift * spacing for shift in range(3)])
     exact = np.int16 if image.dtype == np.uint8 else np.float32
     rows: NDArray[Any] = image[v][:, places].astype(exact).reshape(v.size, 3, u.size)
     # A straight slope of light has no second difference, whose variance is 6 times a pixel's.
@@ -119,10 +133,10 @@ def _counted(deviations: Grey, least: float) -> float:
     return float(counts @ np.arange(counts.size) / counts.sum())
 
 
-def tile_side(image: Grey) -> int:
+def tile_side(image: Grey, rules: BackgroundRules) -> int:
     """About how wide and high a tile is, in px."""
     height, width = image.shape
-    return max(int(min(height, width)) // TILES_PER_SHORT_SIDE, LEAST_TILE_PX)
+    return max(int(min(height, width)) // rules.tiles_per_short_side, rules.min_tile)
 
 
 @lru_cache(maxsize=PLACES)

@@ -21,9 +21,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.extraction.contours import (
     Box,
     Contour,
+    ContourRules,
     cut_out,
     filled_area,
     neighbours,
@@ -31,27 +33,35 @@ from mixpose.extraction.contours import (
     outlines,
     pieces,
 )
-from mixpose.extraction.ellipse import Ellipse, distances, find_rim, is_waisted
+from mixpose.extraction.ellipse import Ellipse, EllipseRules, distances, find_rim, is_waisted
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.single_spots import all_spots
-from mixpose.extraction.spots import LEAST_STEP_SHARE, come_apart
-from mixpose.extraction.threshold import Foreground, Window, above, foreground
+from mixpose.extraction.spots import SpotRules, come_apart
+from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
 from mixpose.records import Image, PointPattern
 
-# Up to this area the centroid of the grey values is the better centre, above it the rim.
-SMALL_AREA_PX = 100.0
 
-# Least share of its convex hull that a blob fills, if it has no elliptical rim.
-LEAST_SOLIDITY = 0.9
+@dataclass(frozen=True)
+class BlobRules:
+    """What a blob is."""
 
-# The step at its outline is taken between rings of this width.
-STEP_PX = 3
-
-# What has no shape is searched again at a level higher by this factor.
-LEVEL_RATIO = 1.4
-
-# Something this much brighter than the rest of a blob may be the feature, the rest what it lights.
-CORE_RATIO = 3.0
+    threshold: ThresholdRules = ThresholdRules()
+    contours: ContourRules = ContourRules()
+    spots: SpotRules = SpotRules()
+    rims: EllipseRules = EllipseRules()
+    small_area: float = constant(
+        100.0, "px up to which the centroid of grey values is the better centre, above it the rim"
+    )
+    solidity: float = constant(
+        0.9, "of its convex hull, that a blob without an elliptical rim fills"
+    )
+    step: int = constant(3, "px, width of the rings between which the step at an outline is taken")
+    level_ratio: float = constant(
+        1.4, "by which the level is higher at which what has no shape is searched again"
+    )
+    core_ratio: float = constant(
+        3.0, "peak by median from which a core may be the feature, the rest what it lights"
+    )
 
 
 @dataclass(frozen=True)
@@ -64,7 +74,9 @@ class Blob:
     rim: Ellipse | None = None
 
 
-def extract_blobs(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
+def extract_blobs(
+    image: Image, options: ExtractOptions, window: Window, rules: BlobRules = BlobRules()
+) -> PointPattern:
     """Centres of the blobs in a window.
 
     Parameters
@@ -73,18 +85,21 @@ def extract_blobs(image: Image, options: ExtractOptions, window: Window) -> Poin
     options : ExtractOptions
     window : (u0, v0, u1, v1)
         Non-empty box inside the image, u1 and v1 exclusive.
+    rules : BlobRules
 
     Returns
     -------
     PointPattern
         Points in pixels of the whole image, each of weight 1; none where nothing is found.
     """
-    blobs = find_blobs(foreground(image, options, window), options)
+    blobs = find_blobs(foreground(image, options, window, rules.threshold), options, rules)
     points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
     return PointPattern(points + window[:2], np.ones(len(points)))
 
 
-def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
+def find_blobs(
+    scene: Foreground, options: ExtractOptions, rules: BlobRules = BlobRules()
+) -> list[Blob]:
     """The blobs of a foreground.
 
     Parameters
@@ -92,9 +107,10 @@ def find_blobs(scene: Foreground, options: ExtractOptions) -> list[Blob]:
     scene : Foreground
     options : ExtractOptions
         `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
+    rules : BlobRules
     """
     contours = outlines(scene)
-    blobs = _search(scene, contours, scene.level, options.min_area, islands=True)
+    blobs = _search(scene, contours, scene.level, options.min_area, rules, islands=True)
     largest = math.inf if options.max_area is None else options.max_area
     return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
 
@@ -104,6 +120,7 @@ def _search(
     contours: Sequence[Contour],
     level: float,
     min_area: float,
+    rules: BlobRules,
     *,
     islands: bool = False,
 ) -> list[Blob]:
@@ -119,39 +136,50 @@ def _search(
         # A contour of n pixels encloses less than n² of them: noise is soon done with.
         if len(contour) ** 2 < min_area or (area := filled_area(contour)) < min_area:
             continue
-        if area <= SMALL_AREA_PX:
+        if area <= rules.small_area:
             small.append(contour)
             small_areas.append(area)
-        elif (disk := _disk(scene, contour, level)) is not None:
+        elif (disk := _disk(scene, contour, level, rules)) is not None:
             blobs.append(disk)
         else:
             shapeless.append(contour)
-    for area, spots in zip(small_areas, all_spots(scene, small, small_areas, level), strict=True):
+    found = all_spots(scene, small, small_areas, level, rules.spots)
+    for area, spots in zip(small_areas, found, strict=True):
         blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
-    for group in neighbours(shapeless):
-        whole = _disk(scene, np.concatenate(group), level) if len(group) > 1 else None
+    for group in neighbours(shapeless, rules.contours):
+        whole = _disk(scene, np.concatenate(group), level, rules) if len(group) > 1 else None
         if whole is not None:
             blobs.append(whole)
             continue
         for contour in group:
-            blobs += _other(scene, contour, level, min_area, islands=islands)
+            blobs += _other(scene, contour, level, min_area, rules, islands=islands)
     return blobs
 
 
-def _disk(scene: Foreground, contour: Contour, level: float) -> Blob | None:
+def _disk(scene: Foreground, contour: Contour, level: float, rules: BlobRules) -> Blob | None:
     """A blob whose rim is an ellipse, even if part of it is hidden or out of the window."""
-    rim = find_rim(scene.grey, contour, level)
-    if rim is None or not rim.good or is_waisted(scene.grey, rim.ellipse):
+    rim = find_rim(scene.grey, contour, level, rules.rims)
+    if (
+        rim is None
+        or not rim.is_good(rules.rims)
+        or is_waisted(scene.grey, rim.ellipse, rules.rims)
+    ):
         return None
     if scene.judged:
         patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
-        if rim.contrast < LEAST_STEP_SHARE * _brightness(scene, patch, inside)[0]:
+        if rim.contrast < rules.spots.min_step * _brightness(scene, patch, inside)[0]:
             return None
     return Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
 
 
 def _other(
-    scene: Foreground, contour: Contour, level: float, min_area: float, *, islands: bool
+    scene: Foreground,
+    contour: Contour,
+    level: float,
+    min_area: float,
+    rules: BlobRules,
+    *,
+    islands: bool,
 ) -> list[Blob]:
     """A large blob without an elliptical rim if it is compact, or else the blobs inside of it."""
     box = cv2.boundingRect(contour)
@@ -163,7 +191,7 @@ def _other(
         for piece in pieces(above(patch, level) & inside, corner)
         if tuple(cv2.boundingRect(piece)) != tuple(box)
     ]
-    found = _search(scene, within, level, min_area) if islands else []
+    found = _search(scene, within, level, min_area, rules) if islands else []
     whole = [] if on_border(scene, box) else [_hull_blob(contour)]
     if not scene.judged:
         return whole + found
@@ -171,17 +199,17 @@ def _other(
     typical, peak = _brightness(scene, patch, inside)
     stands_out = (
         typical >= scene.least_peak
-        and cv2.contourArea(contour) >= LEAST_SOLIDITY * cv2.contourArea(cv2.convexHull(contour))
-        and _step(scene, contour, box) >= LEAST_STEP_SHARE * typical
+        and cv2.contourArea(contour) >= rules.solidity * cv2.contourArea(cv2.convexHull(contour))
+        and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
     )
     inner: list[Blob] = []
-    for part, higher in come_apart(scene, contour, patch, inside, level):
-        inner += _search(scene, pieces(part, corner), higher, min_area)
-    higher = LEVEL_RATIO * level
-    clear = stands_out and peak < CORE_RATIO * typical
+    for part, higher in come_apart(scene, contour, patch, inside, level, rules.spots):
+        inner += _search(scene, pieces(part, corner), higher, min_area, rules)
+    higher = rules.level_ratio * level
+    clear = stands_out and peak < rules.core_ratio * typical
     if not inner and not clear and higher < peak:
         brighter = pieces(above(patch, higher) & inside, corner)
-        inner = _search(scene, brighter, higher, min_area)
+        inner = _search(scene, brighter, higher, min_area, rules)
     return found + (inner or (whole if stands_out else []))
 
 
@@ -202,10 +230,10 @@ def _brightness(
     return float(np.median(values)), float(values.max())
 
 
-def _step(scene: Foreground, contour: Contour, box: Box) -> float:
+def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:
     """How much brighter a blob is a little inside of its outline than a little outside."""
-    patch, inside, _ = cut_out(scene, contour, box, STEP_PX + 1)
-    around = np.ones((2 * STEP_PX + 1, 2 * STEP_PX + 1), np.uint8)
+    patch, inside, _ = cut_out(scene, contour, box, width + 1)
+    around = np.ones((2 * width + 1, 2 * width + 1), np.uint8)
     rim = inside - cv2.erode(inside, around)
     surroundings = cv2.dilate(inside, around) - inside
     return float(cv2.mean(patch, rim)[0] - cv2.mean(patch, surroundings)[0])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.extraction.threshold import Foreground, above
 
 # (n, 1, 2) int32: the outermost pixels of a connected area, (u, v), in order, as OpenCV has them.
@@ -20,10 +22,15 @@ Box: TypeAlias = Sequence[int]
 # Rows are left out where that leaves at most this share of them.
 MOST_ROWS_SHARE = 0.5
 
-# Parts of a broken rim are apart by at most this share of their length, and 2 px.
-GAP_SHARE = 0.1
-GAP_PX = 2
 CONTOUR_SAMPLES = 64
+
+
+@dataclass(frozen=True)
+class ContourRules:
+    """Which outlines may be parts of one."""
+
+    gap: float = constant(0.1, "of their length, that parts of a broken rim are apart at most")
+    gap_px: float = constant(2.0, "px more: a pixel lost on each side")
 
 
 def outlines(scene: Foreground) -> list[Contour]:
@@ -122,13 +129,15 @@ def on_border(scene: Foreground, box: Box) -> bool:
     return bool(u == 0 or v == 0 or u + width == columns or v + height == rows)
 
 
-def neighbours(contours: Sequence[Contour]) -> list[list[Contour]]:
+def neighbours(
+    contours: Sequence[Contour], rules: ContourRules = ContourRules()
+) -> list[list[Contour]]:
     """Groups of contours that nearly touch: perhaps the parts of one broken rim."""
     groups: list[list[Contour]] = []
     for contour in contours:
         apart, together = [], [contour]
         for group in groups:
-            if any(_near(contour, other) for other in group):
+            if any(_near(contour, other, rules) for other in group):
                 together += group
             else:
                 apart.append(group)
@@ -136,11 +145,11 @@ def neighbours(contours: Sequence[Contour]) -> list[list[Contour]]:
     return groups
 
 
-def _near(a: Contour, b: Contour) -> bool:
+def _near(a: Contour, b: Contour, rules: ContourRules) -> bool:
     """Whether the gap between two contours is small beside them."""
     ua, va, wa, ha = cv2.boundingRect(a)
     ub, vb, wb, hb = cv2.boundingRect(b)
-    gap = GAP_SHARE * min(max(wa, ha), max(wb, hb)) + GAP_PX
+    gap = rules.gap * min(max(wa, ha), max(wb, hb)) + rules.gap_px
     if max(ua - ub - wb, ub - ua - wa, va - vb - hb, vb - va - ha) > gap:
         return False
     # Some points of each are enough: between them a contour comes closer by half a step.

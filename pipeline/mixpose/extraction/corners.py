@@ -11,40 +11,52 @@ after half a turn.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.errors import SessionError
-from mixpose.extraction.background import Grey, noise_of
+from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.sampling import sample
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
 
-# Blur before the Hessian, in px: enough against noise, little enough for fields of 8 px.
-SIGMA_PX = 1.5
 BAND_ROWS = 48
-# Two corners are not closer than this.
-SPACING_PX = 3
-
-RING_RADII_PX = (3.0, 5.0)
 RING_SAMPLES = 32
-LEAST_SYMMETRY = 0.9
-MARGIN_PX = 6
-
-# Saddles of noise: steps of 0.3 standard deviations of a pixel at this blur, seldom of five
-# times that.
-NOISE_FACTOR = 2.5
-# "auto" keeps what has at least this share of the clearest corner's step.
-FAINT_SHARE = 0.2
 # Candidates that are looked at together.
 BATCH = 256
 
 
-def extract_corners(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
+@dataclass(frozen=True)
+class CornerRules:
+    """Which saddles are corners."""
+
+    background: BackgroundRules = BackgroundRules()
+    blur: float = constant(
+        1.5, "px before the Hessian: enough against noise, little enough for fields of 8 px"
+    )
+    spacing: int = constant(3, "px: two corners are not closer")
+    ring_radii: tuple[float, ...] = constant(
+        (3.0, 5.0), "px, of the rings that must cross four fields: within fields of 8 px"
+    )
+    symmetry: float = constant(0.9, "of a ring, that stays the same after half a turn")
+    margin: int = constant(6, "px to the border: rings and quadratics fit in")
+    noise_factor: float = constant(
+        2.5,
+        "of the noise, for a corner's step: saddles of noise have 0.3 at this blur, seldom five "
+        "times that",
+    )
+    faint: float = constant(0.2, "of the clearest corner's step, that `auto` keeps")
+
+
+def extract_corners(
+    image: Image, options: ExtractOptions, window: Window, rules: CornerRules = CornerRules()
+) -> PointPattern:
     """Saddle points of the grey values in a window.
 
     Parameters
@@ -55,6 +67,7 @@ def extract_corners(image: Image, options: ExtractOptions, window: Window) -> Po
         Corners have neither polarity nor area.
     window : (u0, v0, u1, v1)
         Non-empty box inside the image, u1 and v1 exclusive.
+    rules : CornerRules
 
     Returns
     -------
@@ -74,28 +87,29 @@ def extract_corners(image: Image, options: ExtractOptions, window: Window) -> Po
         )
     u0, v0, u1, v1 = window
     crop = image[v0:v1, u0:u1].astype(np.float32)
-    corners = _find(crop, threshold) if min(crop.shape) > 2 * MARGIN_PX else np.empty((0, 2))
+    large = min(crop.shape) > 2 * rules.margin
+    corners = _find(crop, threshold, rules) if large else np.empty((0, 2))
     return PointPattern(corners + np.array([u0, v0]), np.ones(len(corners)))
 
 
-def _find(grey: Grey, threshold: str | float) -> Floats:
-    blurred = cv2.GaussianBlur(grey, (0, 0), SIGMA_PX, borderType=cv2.BORDER_REPLICATE)
+def _find(grey: Grey, threshold: str | float, rules: CornerRules) -> Floats:
+    blurred = cv2.GaussianBlur(grey, (0, 0), rules.blur, borderType=cv2.BORDER_REPLICATE)
     # Rings are sampled with little blur only, as they are thin; single pixels are noisy.
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)
-    rough, steps = _peaks(blurred)
+    rough, steps = _peaks(blurred, rules)
     order = np.argsort(-steps, kind="stable")
-    order = order[steps[order] > NOISE_FACTOR * noise_of(grey)]
+    order = order[steps[order] > rules.noise_factor * noise_of(grey, rules.background)]
     corners, clearest = [np.empty((0, 2))], 0.0
     for first in range(0, len(order), BATCH):
         # The clearest first: what is too faint beside them need not be looked at.
         batch = order[first : first + BATCH]
-        batch = batch[steps[batch] >= FAINT_SHARE * clearest]
+        batch = batch[steps[batch] >= rules.faint * clearest]
         fitted_corners, fitted = stationary_points(blurred, rough[batch], _is_saddle)
-        crossed, differences = _four_fields(smooth, fitted_corners)
+        crossed, differences = _four_fields(smooth, fitted_corners, rules)
         if isinstance(threshold, str):
             found_steps = steps[batch][fitted][crossed]
             clearest = max(clearest, found_steps.max(initial=0.0))
-            corners.append(fitted_corners[crossed][found_steps >= FAINT_SHARE * clearest])
+            corners.append(fitted_corners[crossed][found_steps >= rules.faint * clearest])
         else:
             corners.append(fitted_corners[crossed & (differences >= threshold)])
     return np.concatenate(corners)
@@ -109,30 +123,31 @@ def saddle_strength(blurred: Grey) -> Grey:
     return np.asarray(cv2.subtract(cv2.multiply(d_uv, d_uv), cv2.multiply(d_uu, d_vv)))
 
 
-def _peaks(blurred: Grey) -> tuple[Floats, Floats]:
+def _peaks(blurred: Grey, rules: CornerRules) -> tuple[Floats, Floats]:
     """Places (n, 2) of the clearest saddles about, away from the border, and their steps (n,).
 
     A step is the difference of grey between the fields of a sharp corner that would make such a
     saddle.  The work is done in bands of rows, which stay in the cache: 1.9 ms of 640 x 512 px,
     where `skimage.feature.peak_local_max` finds the same in 130 ms.
     """
-    box = np.ones((2 * SPACING_PX + 1, 2 * SPACING_PX + 1), np.uint8)
+    margin, spacing = rules.margin, rules.spacing
+    box = np.ones((2 * spacing + 1, 2 * spacing + 1), np.uint8)
     height, width = blurred.shape
-    columns = np.s_[MARGIN_PX : width - MARGIN_PX]
+    columns = np.s_[margin : width - margin]
     places, strengths = [], []
-    for top in range(MARGIN_PX, height - MARGIN_PX, BAND_ROWS):
-        bottom = min(top + BAND_ROWS, height - MARGIN_PX)
+    for top in range(margin, height - margin, BAND_ROWS):
+        bottom = min(top + BAND_ROWS, height - margin)
         # Derivatives and maxima need rows on either side.
-        first = top - SPACING_PX - 1
-        strength = saddle_strength(blurred[first : bottom + SPACING_PX + 1])
+        first = top - spacing - 1
+        strength = saddle_strength(blurred[first : bottom + spacing + 1])
         rows = np.s_[top - first : bottom - first]
         highest = cv2.dilate(strength, box)[rows, columns]
         strength = strength[rows, columns]
         v, u = np.nonzero((strength == highest) & (strength > 0))
-        places.append(np.stack([u + MARGIN_PX, v + top], axis=-1))
+        places.append(np.stack([u + margin, v + top], axis=-1))
         strengths.append(strength[v, u])
     # Between fields of grey ±c/2 the mixed second derivative at the corner is c / (π σ²).
-    steps = math.pi * SIGMA_PX**2 * np.sqrt(np.concatenate(strengths).astype(np.float64))
+    steps = math.pi * rules.blur**2 * np.sqrt(np.concatenate(strengths).astype(np.float64))
     return np.concatenate(places).astype(np.float64), steps
 
 
@@ -141,13 +156,15 @@ def _is_saddle(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
     return 4 * uu * vv - uv * uv < 0
 
 
-def _four_fields(smooth: Grey, corners: Floats) -> tuple[NDArray[np.bool_], Floats]:
+def _four_fields(
+    smooth: Grey, corners: Floats, rules: CornerRules
+) -> tuple[NDArray[np.bool_], Floats]:
     """Whether four fields meet at corners (n, 2), and the step of grey between them (n,)."""
     angles = np.arange(RING_SAMPLES) * (2 * np.pi / RING_SAMPLES)
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     crossed = np.ones(len(corners), dtype=np.bool_)
     difference = np.zeros(len(corners))
-    for radius in RING_RADII_PX:
+    for radius in rules.ring_radii:
         samples = sample(smooth, corners[:, None] + radius * ring)
         low, high = samples.min(axis=1, initial=np.inf), samples.max(axis=1, initial=-np.inf)
         bright = samples > ((low + high) / 2)[:, None]
@@ -155,6 +172,6 @@ def _four_fields(smooth: Grey, corners: Floats) -> tuple[NDArray[np.bool_], Floa
         around = samples - samples.mean(axis=1, keepdims=True)
         even = around + np.roll(around, RING_SAMPLES // 2, axis=1)
         symmetry = (even**2).sum(axis=1) / np.maximum(4 * (around**2).sum(axis=1), 1e-12)
-        crossed &= (crossings == 4) & (symmetry >= LEAST_SYMMETRY)
+        crossed &= (crossings == 4) & (symmetry >= rules.symmetry)
         difference = high - low
     return crossed, difference

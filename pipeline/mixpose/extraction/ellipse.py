@@ -20,35 +20,42 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.extraction.background import Grey
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.sampling import sample
 from mixpose.records import Floats
 
-# Directions in which the rim is looked for, and how far: a share of the minor half-axis.
+# Directions in which the rim is looked for.
 DIRECTIONS = 72
-REACH_SHARE = 0.15
-LEAST_REACH_PX = 3
-MOST_REACH_PX = 6
-
-# A rim is an ellipse if most of it lies on one, to within what pixels and print allow.
-LEAST_COVERAGE = 0.6
-LEAST_TOLERANCE_PX = 0.5
-SPREAD_PX = 0.6
-HOPELESS_SHARE = 0.15
-MOST_OBLIQUE = 0.15
-
-# Two spots that touch: along and across the middle of an ellipse that is long.
-LONG = 1.35
-WAIST = 0.7
-DIP_SHARE = 0.1
-RIDGE_SHARE = 0.03
-
-# An arc of three in so many of the rim may be hidden at one place.
-HIDDEN_ARCS = 8
 
 _ANGLES = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
+
+@dataclass(frozen=True)
+class EllipseRules:
+    """When a rim is an ellipse."""
+
+    reach: float = constant(0.15, "of the minor half-axis, how far a rim is looked for")
+    min_reach: int = constant(3, "px, the least: an edge is as wide as optics blur it")
+    max_reach: int = constant(6, "px, the most: beyond it are neighbours")
+    coverage: float = constant(0.6, "of the directions, that have an edge on the ellipse")
+    tolerance: float = constant(
+        0.5, "px within which an edge is on the ellipse at least: pixels and print allow for it"
+    )
+    spread: float = constant(0.6, "px, median distance of corners of the hull from their ellipse")
+    hopeless: float = constant(
+        0.15, "of the minor half-axis: points farther from it on average are on no ellipse"
+    )
+    oblique: float = constant(0.15, "width by length: a disk seen at less than 9° is not located")
+    long: float = constant(1.35, "length by width from which an ellipse may be two spots")
+    waist: float = constant(
+        0.7, "of the minor half-axis, where the waist of two spots is looked at"
+    )
+    dip: float = constant(0.1, "of the height, that the middle is dimmer than either half")
+    ridge: float = constant(0.03, "of the height, that it is brighter than beside: two, not a ring")
+    hidden_arcs: int = constant(8, "arcs, of which three that follow each other may be hidden")
 
 
 @dataclass(frozen=True)
@@ -85,13 +92,18 @@ class Rim:
     residual: float
     contrast: float
 
-    @property
-    def good(self) -> bool:
+    def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
         """Whether the rim is an ellipse."""
-        return self.coverage >= LEAST_COVERAGE and self.residual <= tolerance(self.ellipse) / 2
+        near = self.residual <= tolerance(self.ellipse, rules) / 2
+        return self.coverage >= rules.coverage and near
 
 
-def find_rim(signal: Grey, outline: Contour, least_contrast: float) -> Rim | None:
+def find_rim(
+    signal: Grey,
+    outline: Contour,
+    least_contrast: float,
+    rules: EllipseRules = EllipseRules(),
+) -> Rim | None:
     """The elliptical rim of a bright feature.
 
     Parameters
@@ -102,6 +114,7 @@ def find_rim(signal: Grey, outline: Contour, least_contrast: float) -> Rim | Non
         Contour of the feature, in pixels of the signal.
     least_contrast : float
         An edge is a step of the signal by at least this.
+    rules : EllipseRules
 
     Returns
     -------
@@ -111,22 +124,24 @@ def find_rim(signal: Grey, outline: Contour, least_contrast: float) -> Rim | Non
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
     hull = cv2.convexHull(outline)[:, 0].astype(np.float64)
-    rim = _rim_near(signal, fit_ellipse(hull), least_contrast)
+    rim = _rim_near(signal, fit_ellipse(hull, rules), least_contrast, rules)
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
-    return None if rim is None else _rim_near(signal, rim.ellipse, least_contrast)
+    return None if rim is None else _rim_near(signal, rim.ellipse, least_contrast, rules)
 
 
-def _rim_near(signal: Grey, ellipse: Ellipse | None, least_contrast: float) -> Rim | None:
+def _rim_near(
+    signal: Grey, ellipse: Ellipse | None, least_contrast: float, rules: EllipseRules
+) -> Rim | None:
     if ellipse is None:
         return None
-    edges, found, steps = _edges(signal, ellipse, least_contrast)
-    if np.count_nonzero(found) < LEAST_COVERAGE / 2 * DIRECTIONS:
+    edges, found, steps = _edges(signal, ellipse, least_contrast, rules)
+    if np.count_nonzero(found) < rules.coverage / 2 * DIRECTIONS:
         return None
-    better = fit_ellipse(edges[found])
+    better = fit_ellipse(edges[found], rules)
     if better is None:
         return None
     distance = np.abs(distances(better, edges))
-    on_rim = found & (distance <= tolerance(better))
+    on_rim = found & (distance <= tolerance(better, rules))
     count = np.count_nonzero(on_rim)
     if count == 0:
         return None
@@ -135,27 +150,28 @@ def _rim_near(signal: Grey, ellipse: Ellipse | None, least_contrast: float) -> R
     return Rim(better, count / DIRECTIONS, residual, _median(steps[on_rim]))
 
 
-def is_waisted(signal: Grey, ellipse: Ellipse) -> bool:
+def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRules()) -> bool:
     """Whether a long ellipse is two spots that touch: dim in the middle, but not hollow."""
     a, b = ellipse.half_axes
-    if max(a, b) < LONG * min(a, b):
+    if max(a, b) < rules.long * min(a, b):
         return False
     directions = _turn(ellipse.angle).T * np.array([[a], [b]])
     major, minor = directions if a >= b else directions[::-1]
-    along = np.stack([0 * major, major / 2, -major / 2, WAIST * minor, -WAIST * minor])
+    along = np.stack([0 * major, major / 2, -major / 2, rules.waist * minor, -rules.waist * minor])
     middle, one, other, *sides = sample(signal, (ellipse.centre + along)[:, None])[:, 0]
     height = max(one, other) - min(sides)
-    dips = min(one, other) - middle > DIP_SHARE * height
-    return bool(dips and middle - max(sides) > RIDGE_SHARE * height)
+    dips = min(one, other) - middle > rules.dip * height
+    return bool(dips and middle - max(sides) > rules.ridge * height)
 
 
-def fit_ellipse(points: Floats) -> Ellipse | None:
+def fit_ellipse(points: Floats, rules: EllipseRules = EllipseRules()) -> Ellipse | None:
     """Ellipse through points, of which some may lie elsewhere.
 
     Parameters
     ----------
     points : (n, 2) float64
         Points in order along the ellipse.
+    rules : EllipseRules
 
     Returns
     -------
@@ -163,23 +179,23 @@ def fit_ellipse(points: Floats) -> Ellipse | None:
         None for less than six points, or where they are not on an ellipse.
     """
     best, best_spread = None, np.inf
-    for start in _starts(points):
-        ellipse = _fit(start)
+    for start in _starts(points, rules):
+        ellipse = _fit(start, rules)
         if ellipse is None:
             continue
         spread = _median(np.abs(distances(ellipse, points)))
         if spread < best_spread:
             best, best_spread = ellipse, spread
-        if spread < SPREAD_PX:
+        if spread < rules.spread:
             break
-    if best is None or best_spread > SPREAD_PX + HOPELESS_SHARE * min(best.half_axes):
+    if best is None or best_spread > rules.spread + rules.hopeless * min(best.half_axes):
         return None
     for _ in range(3):
         if best is None:
             return None
         distance = np.abs(distances(best, points))
-        near = distance <= max(SPREAD_PX, 3.0 * _median(distance))
-        best = _fit(points[near])
+        near = distance <= max(rules.spread, 3.0 * _median(distance))
+        best = _fit(points[near], rules)
     return best
 
 
@@ -188,25 +204,25 @@ def _median(values: Floats) -> float:
     return float(np.partition(values, middle)[middle])
 
 
-def tolerance(ellipse: Ellipse) -> float:
+def tolerance(ellipse: Ellipse, rules: EllipseRules) -> float:
     """Distance in px within which an edge counts as on the ellipse."""
     minor = min(ellipse.half_axes)
     # A tenth of small ones, whose shape pixels blur; of large ones what print and lens bend.
-    return max(LEAST_TOLERANCE_PX, min(0.1 * minor, 1.0), 0.02 * minor)
+    return max(rules.tolerance, min(0.1 * minor, 1.0), 0.02 * minor)
 
 
-def _starts(points: Floats) -> Iterator[Floats]:
+def _starts(points: Floats, rules: EllipseRules) -> Iterator[Floats]:
     """All points, then all but each of some arcs, one of which may be hidden."""
     yield points
     count = len(points)
-    shown = count - 3 * count // HIDDEN_ARCS
+    shown = count - 3 * count // rules.hidden_arcs
     around = np.concatenate([points, points])
-    for k in range(HIDDEN_ARCS):
-        first = k * count // HIDDEN_ARCS
+    for k in range(rules.hidden_arcs):
+        first = k * count // rules.hidden_arcs
         yield around[first : first + shown]
 
 
-def _fit(points: Floats) -> Ellipse | None:
+def _fit(points: Floats, rules: EllipseRules) -> Ellipse | None:
     if len(points) < 6:
         return None
     # Near the origin, as OpenCV works in single precision.
@@ -214,7 +230,7 @@ def _fit(points: Floats) -> Ellipse | None:
     (u, v), (width, height), degrees = cv2.fitEllipseAMS((points - middle).astype(np.float32))
     half_axes = (width / 2, height / 2)
     sound = math.isfinite(u + v + width + height + degrees) and min(half_axes) > 0
-    if not sound or min(half_axes) < MOST_OBLIQUE * max(half_axes):
+    if not sound or min(half_axes) < rules.oblique * max(half_axes):
         return None
     return Ellipse((u + middle[0], v + middle[1]), half_axes, math.radians(degrees))
 
@@ -239,7 +255,7 @@ def _turn(angle: float) -> Floats:
 
 
 def _edges(
-    signal: Grey, ellipse: Ellipse, least_contrast: float
+    signal: Grey, ellipse: Ellipse, least_contrast: float, rules: EllipseRules
 ) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """Edges along the normals of an ellipse.
 
@@ -257,7 +273,7 @@ def _edges(
     on_rim = ellipse.centre + (_CIRCLE * axes) @ turn.T
     normals = (_CIRCLE / axes) @ turn.T
     normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
-    reach = int(np.clip(REACH_SHARE * axes.min(), LEAST_REACH_PX, MOST_REACH_PX))
+    reach = int(np.clip(rules.reach * axes.min(), rules.min_reach, rules.max_reach))
     # Half steps, so that the fall between samples is known at the ellipse itself.
     offsets = np.arange(-reach - 1.5, reach + 2)
     places = on_rim[:, None] + normals[:, None] * offsets[:, None]

@@ -14,35 +14,49 @@ at six times); `skimage.feature.blob_log` gives whole pixels (0.4 px) in three t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.errors import SessionError
-from mixpose.extraction.background import Grey, noise_of
+from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
 
-# Width of the spots where the user gives none.  From 0.7 to 1.5 times the width of the filter all
-# spots were found; the response to others is lower by 4 s² σ² / (s² + σ²)².
-WIDTH_PX = 3.0
 
-# Six standard deviations: less than one maximum of noise in a hundred frames of 2 megapixels.
-NOISE_FACTOR = 6.0
-# "auto" keeps what has at least this share of the clearest spot's height.
-FAINT_SHARE = 0.2
-# A spot nearer than this to the border is cut by it, in widths.
-MARGIN_WIDTHS = 2.0
-# Samples of the quadratic are apart by this share of the width.
-STEP_SHARE = 1 / 3
-# Curvatures of a spot differ by less than this factor; along an edge there is hardly any.
-MOST_OBLONG = 5.0
+@dataclass(frozen=True)
+class LaplacianRules:
+    """Which maxima of the filter are spots."""
+
+    background: BackgroundRules = BackgroundRules()
+    width: float = constant(
+        3.0,
+        "px, of spots where the session gives none: filters find all from 0.7 to 1.5 times their "
+        "width; the response to others is lower by 4 s² σ² / (s² + σ²)²",
+    )
+    noise_factor: float = constant(
+        6.0, "of the response's noise: less than one maximum of it in a hundred frames of 2 Mpx"
+    )
+    faint: float = constant(0.2, "of the clearest spot's height, that `auto` keeps")
+    margin: float = constant(2.0, "widths: a spot nearer to the border is cut by it")
+    step: float = constant(1 / 3, "of the width, between samples of the quadratic")
+    oblong: float = constant(
+        5.0, "by which curvatures of a spot differ at most: along an edge there is hardly any"
+    )
 
 
-def extract_log(image: Image, options: ExtractOptions, window: Window) -> PointPattern:
+def extract_log(
+    image: Image,
+    options: ExtractOptions,
+    window: Window,
+    rules: LaplacianRules = LaplacianRules(),
+) -> PointPattern:
     """Centres of unsharp or faint spots in a window.
 
     Parameters
@@ -53,6 +67,7 @@ def extract_log(image: Image, options: ExtractOptions, window: Window) -> PointP
         least height of a spot above what surrounds it, in grey values.  Areas do not matter.
     window : (u0, v0, u1, v1)
         Non-empty box inside the image, u1 and v1 exclusive.
+    rules : LaplacianRules
 
     Returns
     -------
@@ -71,11 +86,13 @@ def extract_log(image: Image, options: ExtractOptions, window: Window) -> PointP
             ' allowed are "auto" and a grey level, the least height of a spot'
         )
     u0, v0, u1, v1 = window
-    spots = _find(image[v0:v1, u0:u1], options)
+    spots = _find(image[v0:v1, u0:u1], options, rules)
     return PointPattern(spots + np.array([u0, v0]), np.ones(len(spots)))
 
 
-def spot_strength(image: Image, options: ExtractOptions) -> Grey:
+def spot_strength(
+    image: Image, options: ExtractOptions, rules: LaplacianRules = LaplacianRules()
+) -> Grey:
     """Height of the Gaussian spot about each pixel that would make the filter's response there.
 
     Parameters are those of `extract_log`.
@@ -85,7 +102,7 @@ def spot_strength(image: Image, options: ExtractOptions) -> Grey:
     (H, W) float32
         In grey values; of spots of the given polarity positive.
     """
-    width = _width(options)
+    width = options.spot_sigma or rules.width
     grey = image.astype(np.float32)
     blurred = cv2.GaussianBlur(grey, (0, 0), width, borderType=cv2.BORDER_REFLECT)
     response = cv2.Laplacian(blurred, cv2.CV_32F, ksize=1, borderType=cv2.BORDER_REFLECT)
@@ -93,19 +110,20 @@ def spot_strength(image: Image, options: ExtractOptions) -> Grey:
     return np.asarray(response * np.float32(towards * 2 * width**2))
 
 
-def _width(options: ExtractOptions) -> float:
-    return options.spot_sigma or WIDTH_PX
-
-
-def _find(image: Image, options: ExtractOptions) -> Floats:
+def _find(image: Image, options: ExtractOptions, rules: LaplacianRules) -> Floats:
     from skimage.feature import peak_local_max  # noqa: PLC0415 (0.04 s to import)
 
-    width = _width(options)
-    margin = math.ceil(MARGIN_WIDTHS * width)
+    width = options.spot_sigma or rules.width
+    margin = math.ceil(rules.margin * width)
     if min(image.shape) <= 2 * margin:
         return np.empty((0, 2))
-    strength = spot_strength(image, options)
-    least = NOISE_FACTOR * 2 * noise_of(image) / (math.sqrt(2 * math.pi) * width)
+    strength = spot_strength(image, options, rules)
+    least = (
+        rules.noise_factor
+        * 2
+        * noise_of(image, rules.background)
+        / (math.sqrt(2 * math.pi) * width)
+    )
     if not isinstance(options.threshold, str):
         least = max(least, options.threshold)
     # A comparison with `cv2.dilate` takes a fifth of the time (7 to 32 ms of 1600 x 1200 px), but
@@ -115,13 +133,14 @@ def _find(image: Image, options: ExtractOptions) -> Floats:
     )
     if isinstance(options.threshold, str):
         heights = strength[places[:, 0], places[:, 1]]
-        places = places[heights >= FAINT_SHARE * heights.max(initial=0)]
+        places = places[heights >= rules.faint * heights.max(initial=0)]
     rough = places[:, ::-1].astype(np.float64)
-    spots, _ = stationary_points(strength, rough, _round, max(STEP_SHARE * width, 1.0))
+    wanted = partial(_is_round, rules.oblong)
+    spots, _ = stationary_points(strength, rough, wanted, max(rules.step * width, 1.0))
     return spots
 
 
-def _round(uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
+def _is_round(oblong: float, uu: Floats, uv: Floats, vv: Floats) -> NDArray[np.bool_]:
     """Whether a quadratic has a maximum that is not a ridge."""
     trace, determinant = uu + vv, uu * vv - uv * uv / 4
-    return (trace < 0) & (trace**2 < (MOST_OBLONG + 1) ** 2 / MOST_OBLONG * determinant)
+    return (trace < 0) & (trace**2 < (oblong + 1) ** 2 / oblong * determinant)

@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.spots import (
-    CENTROID_SHARE,
-    LEAST_STEP_SHARE,
-    MARGIN_PX,
-    PROMINENCE_SHARE,
-    find_spots,
-    is_long,
-    monomials,
-)
+from mixpose.extraction.spots import SpotRules, find_spots, is_long, monomials
 from mixpose.extraction.threshold import Foreground
 from mixpose.records import Floats
 
@@ -33,39 +25,43 @@ Spots = list[tuple[float, float]]
 
 
 def all_spots(
-    scene: Foreground, contours: Sequence[Contour], areas: Sequence[float], level: float
+    scene: Foreground,
+    contours: Sequence[Contour],
+    areas: Sequence[float],
+    level: float,
+    rules: SpotRules = SpotRules(),
 ) -> list[Spots]:
     """What `find_spots` gives for each of several small blobs."""
     found: list[Spots | None] = [None] * len(contours)
-    usual = _usual(scene, contours) if level > 0 and len(contours) >= FEWEST else []
+    usual = _usual(scene, contours, rules) if level > 0 and len(contours) >= FEWEST else []
     if len(usual) >= FEWEST:
         boxes = np.array([box for _, box in usual])
         own_areas = np.array([areas[k] for k, _ in usual])
-        centres, sure, bright = _together(scene, boxes, own_areas, level)
+        centres, sure, bright = _together(scene, boxes, own_areas, level, rules)
         for (k, _), centre, one, stands_out in zip(
             usual, centres.tolist(), sure.tolist(), bright.tolist(), strict=True
         ):
             if one and not stands_out:
                 found[k] = []
-            elif one and not (scene.judged and is_long(contours[k])):
+            elif one and not (scene.judged and is_long(contours[k], rules)):
                 found[k] = [(centre[0], centre[1])]
     return [
-        find_spots(scene, contour, area, level) if spots is None else spots
+        find_spots(scene, contour, area, level, rules) if spots is None else spots
         for spots, contour, area in zip(found, contours, areas, strict=True)
     ]
 
 
 def _usual(
-    scene: Foreground, contours: Sequence[Contour]
+    scene: Foreground, contours: Sequence[Contour], rules: SpotRules
 ) -> list[tuple[int, tuple[int, int, int, int]]]:
     """Which contours are small, bright enough and well inside of the window, with their boxes."""
     rows, columns = scene.grey.shape
-    inner_v, inner_u = rows - WIDEST_PX - MARGIN_PX, columns - WIDEST_PX - MARGIN_PX
+    inner_v, inner_u = rows - WIDEST_PX - rules.margin, columns - WIDEST_PX - rules.margin
     usual = []
     for k, contour in enumerate(contours):
         u, v, width, height = cv2.boundingRect(contour)
         small = width <= WIDEST_PX and height <= WIDEST_PX
-        if small and MARGIN_PX <= u < inner_u and MARGIN_PX <= v < inner_v:
+        if small and rules.margin <= u < inner_u and rules.margin <= v < inner_v:
             highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
             if highest - scene.zero >= scene.least_peak:
                 usual.append((k, (u, v, width, height)))
@@ -73,11 +69,11 @@ def _usual(
 
 
 def _together(
-    scene: Foreground, boxes: NDArray[np.intp], areas: Floats, level: float
+    scene: Foreground, boxes: NDArray[np.intp], areas: Floats, level: float, rules: SpotRules
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Centres (K, 2), which of them need no mask, and which of them stand out."""
-    first_u, first_v = (boxes[:, :2] - MARGIN_PX).T
-    width, height = (boxes[:, 2:] + 2 * MARGIN_PX).T
+    first_u, first_v = (boxes[:, :2] - rules.margin).T
+    width, height = (boxes[:, 2:] + 2 * rules.margin).T
     each = np.arange(len(boxes))
     side = np.arange(int(max(width.max(), height.max())))
     in_row, in_column = side < width[:, None], side < height[:, None]
@@ -96,11 +92,9 @@ def _together(
     peak = signal.max(axis=(1, 2)).astype(np.float64)
     bright = np.ones(len(boxes), dtype=np.bool_)
     if scene.judged:
-        bright = (peak - base >= LEAST_STEP_SHARE * peak) & (
-            peak - level >= PROMINENCE_SHARE * peak
-        )
+        bright = (peak - base >= rules.min_step * peak) & (peak - level >= rules.prominence * peak)
     base = np.minimum(base, level)
-    cut = np.maximum(level, base + CENTROID_SHARE * (peak - base)).astype(np.float32)
+    cut = np.maximum(level, base + rules.centroid * (peak - base)).astype(np.float32)
     weights = np.maximum(signal - cut[:, None, None], 0)
     moments = weights.reshape(len(boxes), -1) @ monomials(side.size, side.size).T
     total = moments[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import cast
 
@@ -9,36 +10,44 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.constants import constant
 from mixpose.extraction.contours import Contour, filled, on_border, signal_about
 from mixpose.extraction.threshold import Foreground, above
 from mixpose.records import Floats
-
-# The background of a spot is looked for this far around it.
-MARGIN_PX = 3
-
-# The centroid leaves out what is below this share of the peak: halo, flare, noise.  More would
-# pull the centre towards pixels, less lets in more noise.
-CENTROID_SHARE = 0.1
-
-# The step at the rim, as a share of the whole signal, tells things from tips of soft light.
-LEAST_STEP_SHARE = 0.4
-
-# Spots that touch: longer than wide, and apart at a level that rises by a ratio.  Either peak
-# must rise above that level by a share of itself, and out of the noise.  With a share of 0.2 and a
-# ratio of 1.1 equal spots part at 3 instead of 4 times their width, but 0.14 px off: poses of
-# `data/synthetic/one_camera_video` are none the better (0.0084 to 0.0082 degrees).
-LONG = 1.35
-LEVEL_RATIO = 1.25
-MOST_PARTS = 8
-PROMINENCE_SHARE = 0.3
-PROMINENCE_NOISE_FACTOR = 4.0
 
 # Patches of so many shapes are prepared for.
 SHAPES = 256
 
 
+@dataclass(frozen=True)
+class SpotRules:
+    """What a small blob is, and which are several that touch.
+
+    Of equal spots, a prominence of 0.2 and a ratio of 1.1 part those that are 3 instead of 4 times
+    their width apart, but 0.14 px off: poses of `data/synthetic/one_camera_video` are none the
+    better (0.0084 to 0.0082 degrees).
+    """
+
+    margin: int = constant(3, "px around a spot in which its background is looked for")
+    centroid: float = constant(
+        0.1,
+        "of the peak, below which is left out of the centroid as halo, flare and noise: more would "
+        "pull it towards pixels, less lets in more noise",
+    )
+    min_step: float = constant(0.4, "at the rim, of the whole signal: tips of soft light have less")
+    long: float = constant(1.35, "length by width from which a blob may be several that touch")
+    level_ratio: float = constant(1.25, "from level to level at which they may come apart")
+    max_parts: int = constant(8, "into which a blob comes apart: more are noise")
+    prominence: float = constant(0.3, "of itself, that a part's peak rises above that level")
+    prominence_noise_factor: float = constant(4.0, "the same, of the noise")
+
+
 def find_spots(
-    scene: Foreground, contour: Contour, area: float, level: float
+    scene: Foreground,
+    contour: Contour,
+    area: float,
+    level: float,
+    rules: SpotRules = SpotRules(),
 ) -> list[tuple[float, float]]:
     """Centre of a small blob, or the centres of the blobs that touch in it.
 
@@ -50,6 +59,7 @@ def find_spots(
     area : float
         Number of pixels that it encloses.
     level : float
+    rules : SpotRules
 
     Returns
     -------
@@ -62,7 +72,7 @@ def find_spots(
     highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1] - scene.zero
     if highest < scene.least_peak or on_border(scene, box):
         return []
-    patch, corner = signal_about(scene, box, MARGIN_PX)
+    patch, corner = signal_about(scene, box, rules.margin)
     frame = patch.take(_border(*patch.shape))
     frame.partition(frame.size // 2)
     base = float(frame[frame.size // 2])
@@ -70,17 +80,17 @@ def find_spots(
     alone = np.count_nonzero(patch > level) == area
     inside = None if alone else filled(contour, patch.shape, corner)
     peak = cv2.minMaxLoc(patch, inside)[1]
-    if scene.judged and peak - base < LEAST_STEP_SHARE * peak:
+    if scene.judged and peak - base < rules.min_step * peak:
         return []
-    if scene.judged and peak - level < PROMINENCE_SHARE * peak:
+    if scene.judged and peak - level < rules.prominence * peak:
         return []
     base = min(base, level)
-    parts = come_apart(scene, contour, patch, inside, level)
+    parts = come_apart(scene, contour, patch, inside, level, rules)
     centres = []
     whole: list[tuple[NDArray[np.uint8] | None, float]] = [(inside, level)]
     for part, valley in parts or whole:
         top = cv2.minMaxLoc(patch, part)[1] if parts else peak
-        cut = max(valley, base + CENTROID_SHARE * (top - base))
+        cut = max(valley, base + rules.centroid * (top - base))
         weights = np.maximum(patch - np.float32(cut), 0)
         if part is not None:
             weights *= part
@@ -117,6 +127,7 @@ def come_apart(
     patch: NDArray[np.float32],
     inside: NDArray[np.uint8] | None,
     level: float,
+    rules: SpotRules,
 ) -> list[tuple[NDArray[np.uint8], float]]:
     """Parts of a long blob that come apart at a higher level.
 
@@ -135,6 +146,7 @@ def come_apart(
         1 inside of the blob, else 0; None where nothing else is above the level.
     level : float
         Level of the contour.
+    rules : SpotRules
 
     Returns
     -------
@@ -142,28 +154,28 @@ def come_apart(
         (h, w) uint8 mask of each part, and the level that sets them apart; none if none does,
         or if what is above the level is all that is asked for.
     """
-    if not (scene.judged and is_long(contour)):
+    if not (scene.judged and is_long(contour, rules)):
         return []
     signal = patch if inside is None else patch * inside
-    least_rise = PROMINENCE_NOISE_FACTOR * scene.noise
-    highest = (1 - PROMINENCE_SHARE) * float(signal.max())
-    while (level := level * LEVEL_RATIO) < highest:
+    least_rise = rules.prominence_noise_factor * scene.noise
+    highest = (1 - rules.prominence) * float(signal.max())
+    while (level := level * rules.level_ratio) < highest:
         count, labels = cv2.connectedComponents((signal > level).view(np.uint8))
-        if not 2 < count <= MOST_PARTS + 1:
+        if not 2 < count <= rules.max_parts + 1:
             continue
         parts = [(labels == k).view(np.uint8) for k in range(1, count)]
         tops = [cv2.minMaxLoc(signal, part)[1] for part in parts]
         prominent = [
             (part, level)
             for part, top in zip(parts, tops, strict=True)
-            if top >= scene.least_peak and top - level >= max(PROMINENCE_SHARE * top, least_rise)
+            if top >= scene.least_peak and top - level >= max(rules.prominence * top, least_rise)
         ]
         if len(prominent) > 1:
             return prominent
     return []
 
 
-def is_long(contour: Contour) -> bool:
+def is_long(contour: Contour, rules: SpotRules) -> bool:
     """Whether a blob is so long that it may be several."""
     _, (a, b), _ = cv2.minAreaRect(contour)
-    return bool(max(a, b) + 1 > LONG * (min(a, b) + 1))
+    return bool(max(a, b) + 1 > rules.long * (min(a, b) + 1))

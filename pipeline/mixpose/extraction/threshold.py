@@ -13,7 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.extraction.background import Grey, background_tiles, noise_of, spread_out
+from mixpose.constants import constant
+from mixpose.extraction.background import (
+    BackgroundRules,
+    Grey,
+    background_tiles,
+    noise_of,
+    spread_out,
+)
 from mixpose.extraction.options import ExtractOptions
 from mixpose.records import Image
 
@@ -21,32 +28,42 @@ Window: TypeAlias = tuple[int, int, int, int]
 
 RULES = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 
-# How much is looked at around a window to know its background.
-LEAST_MARGIN_PX = 64
-
 # Rows that are searched for the peak first: it is in one of the brightest, as a rule.
 PEAK_ROWS = 4
 BLOCK_ROWS = 64
 
-# Detection level of "auto" and "local": above the noise, and above what is faint beside the
-# brightest thing in view (reflections, lens flare, dimly lit surroundings).
-NOISE_FACTOR = 5.0
-FAINT_SHARE = 0.08
-
-# What the peak of a small blob must exceed, as nothing else is known of it.
-PEAK_NOISE_FACTOR = 8.0
-PEAK_SHARE = 0.2
-
-# "local" and "sauvola" compare with a box of this share of the shorter side of the window.
-LOCAL_BOX_SHARE = 1 / 8
-
-# How far Sauvola's level is from the local mean where all is even, as a share of what is left
-# up to the brightest pixel.  0.2 to 0.5 are in use (Sauvola and Pietikäinen, Pattern
-# Recognition 33, 2000); the lower one finds more of what is dim.
-SAUVOLA_K = 0.2
-
 # Floats are sorted into so many steps for the rules that look at a histogram.
 STEPS = 65535
+
+
+@dataclass(frozen=True)
+class ThresholdRules:
+    """The level above which something counts."""
+
+    background: BackgroundRules = BackgroundRules()
+    min_margin: int = constant(
+        64, "px around a window that are looked at at least, to know its background: four tiles"
+    )
+    noise_factor: float = constant(
+        5.0, "of the noise, the level at least: three pixels in ten million are above by chance"
+    )
+    faint: float = constant(
+        0.08,
+        "of the brightest feature, the level at least: reflections, lens flare and dimly lit "
+        "surroundings are fainter",
+    )
+    peak_noise_factor: float = constant(
+        8.0, "of the noise, for the peak of a small blob, of which nothing else is known"
+    )
+    peak: float = constant(0.2, "of the brightest feature, likewise")
+    local_box: float = constant(
+        1 / 8, "of the shorter side of a window: the box that `local` and `sauvola` compare with"
+    )
+    sauvola_k: float = constant(
+        0.2,
+        "how far Sauvola's level is from an even mean, of what is left up to the brightest pixel: "
+        "0.2 to 0.5 are in use (Sauvola and Pietikäinen 2000); the lower finds more of what is dim",
+    )
 
 
 @dataclass(frozen=True)
@@ -96,7 +113,12 @@ def above(signal: Grey, level: float) -> NDArray[np.uint8]:
     return np.asarray(signal > min(whole, _highest(signal))).view(np.uint8)
 
 
-def foreground(image: Image, options: ExtractOptions, window: Window) -> Foreground:
+def foreground(
+    image: Image,
+    options: ExtractOptions,
+    window: Window,
+    rules: ThresholdRules = ThresholdRules(),
+) -> Foreground:
     """Take the background out of a window and choose the level for its features.
 
     Parameters
@@ -106,31 +128,38 @@ def foreground(image: Image, options: ExtractOptions, window: Window) -> Foregro
         `polarity` and `threshold` matter here.
     window : (u0, v0, u1, v1)
         Non-empty box inside the image, u1 and v1 exclusive.
+    rules : ThresholdRules
     """
-    bright, inner, threshold = _bright(image, options, window)
-    noise = noise_of(bright)
+    bright, inner, threshold = _bright(image, options, window, rules)
+    noise = noise_of(bright, rules.background)
     if threshold == "otsu" or not isinstance(threshold, str):
         grey = bright[inner]
         level = _otsu(grey) if isinstance(threshold, str) else threshold
         return Foreground(grey, 0.0, level, noise, 0.0, judged=False, tops=grey.max(axis=1))
-    grey, zero = _without_background(bright, inner, noise, local=threshold in ("local", "sauvola"))
+    local = threshold in ("local", "sauvola")
+    grey, zero = _without_background(bright, inner, noise, rules, local=local)
     tops = grey.max(axis=1)
     if threshold in ("li", "triangle"):
-        level = max(NOISE_FACTOR * noise, _histogram_level(grey, threshold) - zero)
-        least_peak = max(PEAK_NOISE_FACTOR * noise, level)
+        level = max(rules.noise_factor * noise, _histogram_level(grey, threshold) - zero)
+        least_peak = max(rules.peak_noise_factor * noise, level)
         return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
     peak = _peak(grey, tops) - zero
-    level = max(NOISE_FACTOR * noise, FAINT_SHARE * peak)
-    least_peak = max(PEAK_NOISE_FACTOR * noise, PEAK_SHARE * peak)
+    level = max(rules.noise_factor * noise, rules.faint * peak)
+    least_peak = max(rules.peak_noise_factor * noise, rules.peak * peak)
     if threshold == "sauvola":
         # What Sauvola's level takes off beyond the detection level.
-        beyond = np.maximum(_sauvola_above_mean(bright)[inner] - np.float32(level), 0)
+        beyond = np.maximum(_sauvola_above_mean(bright, rules)[inner] - np.float32(level), 0)
         grey = grey.astype(np.float32) - beyond
         tops = grey.max(axis=1)
     return Foreground(grey, zero, level, noise, least_peak, judged=True, tops=tops)
 
 
-def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDArray[np.float32]:
+def feature_values(
+    image: Image,
+    options: ExtractOptions,
+    window: Window,
+    rules: ThresholdRules = ThresholdRules(),
+) -> NDArray[np.float32]:
     """Grey values of the features in a window without the background; zero elsewhere.
 
     Parameters are those of `foreground`.
@@ -139,11 +168,11 @@ def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDA
     -------
     (v1 - v0, u1 - u0) float32
     """
-    found = foreground(image, options, window)
+    found = foreground(image, options, window, rules)
     grey, zero = found.grey, found.zero
     if not found.judged:
-        bright, inner, _ = _bright(image, options, window)
-        grey, zero = _without_background(bright, inner, found.noise, local=False)
+        bright, inner, _ = _bright(image, options, window, rules)
+        grey, zero = _without_background(bright, inner, found.noise, rules, local=False)
     values = np.zeros(grey.shape, np.float32)
     # Rows without features are left alone: most of a frame has none.
     rows = np.flatnonzero(above(found.tops, found.zero + found.level))
@@ -153,7 +182,7 @@ def feature_values(image: Image, options: ExtractOptions, window: Window) -> NDA
 
 
 def _bright(
-    image: Image, options: ExtractOptions, window: Window
+    image: Image, options: ExtractOptions, window: Window, rules: ThresholdRules
 ) -> tuple[Grey, tuple[slice, slice], str | float]:
     """Surroundings of a window with features bright, the window in them, and the threshold.
 
@@ -162,7 +191,7 @@ def _bright(
     """
     u0, v0, u1, v1 = window
     height, width = image.shape
-    u_margin, v_margin = (max(side, LEAST_MARGIN_PX) for side in (u1 - u0, v1 - v0))
+    u_margin, v_margin = (max(side, rules.min_margin) for side in (u1 - u0, v1 - v0))
     left, top = max(u0 - u_margin, 0), max(v0 - v_margin, 0)
     near = image[top : min(v1 + v_margin, height), left : min(u1 + u_margin, width)]
     inner = np.s_[v0 - top : v1 - top, u0 - left : u1 - left]
@@ -185,13 +214,18 @@ def _highest(grey: Grey) -> int | float:
 
 
 def _without_background(
-    bright: Grey, inner: tuple[slice, slice], noise: float, *, local: bool
+    bright: Grey,
+    inner: tuple[slice, slice],
+    noise: float,
+    rules: ThresholdRules,
+    *,
+    local: bool,
 ) -> tuple[Grey, float]:
     """Grey values of the inner part with an even background, and the grey value of that."""
     if local:
-        side = _local_box(bright)
+        side = _local_box(bright, rules)
         return cv2.subtract(bright, cv2.boxFilter(bright, -1, (side, side)))[inner], 0.0
-    tiles = background_tiles(bright)
+    tiles = background_tiles(bright, rules.background)
     ascending = np.sort(tiles, axis=None)
     low, high = float(ascending[0]), float(ascending[-1])
     if high - low <= 2 * noise:
@@ -221,13 +255,13 @@ def _shared(rows: Grey) -> np.number[Any]:
     return cast("np.number[Any]", cv2.min(rows[:, :-1], rows[:, 1:]).max())
 
 
-def _local_box(bright: Grey) -> int:
+def _local_box(bright: Grey, rules: ThresholdRules) -> int:
     """Side in px of the box that a pixel is compared with."""
     shorter = int(min(bright.shape))
-    return max(round(shorter * LOCAL_BOX_SHARE), 3) // 2 * 2 + 1
+    return max(round(shorter * rules.local_box), 3) // 2 * 2 + 1
 
 
-def _sauvola_above_mean(bright: Grey) -> Grey:
+def _sauvola_above_mean(bright: Grey, rules: ThresholdRules) -> Grey:
     """By how much the level of Sauvola and Pietikäinen is above the local mean, per pixel.
 
     Their rule is for dark print: ``m (1 + k (s / r - 1))`` with the mean m and the standard
@@ -240,8 +274,8 @@ def _sauvola_above_mean(bright: Grey) -> Grey:
     if low == high:
         return np.zeros(bright.shape, np.float32)
     turned = np.float32(high) - bright.astype(np.float32)
-    side = _local_box(bright)
-    level = threshold_sauvola(turned, side, k=SAUVOLA_K, r=(high - low) / 2)
+    side = _local_box(bright, rules)
+    level = threshold_sauvola(turned, side, k=rules.sauvola_k, r=(high - low) / 2)
     return np.asarray(cv2.boxFilter(turned, -1, (side, side)) - level, dtype=np.float32)
 
 

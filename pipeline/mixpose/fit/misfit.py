@@ -10,14 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from mixpose.constants import constant
 from mixpose.density import peak
 from mixpose.objective.matched import FINE_STEPS
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_BELIEVED = 0.99  # probability of χ² up to which a misfit is taken for noise
 _ROUNDING = 1 / (8 * FINE_STEPS**2)  # of a height: what looking up linearly errs by
+
+
+@dataclass(frozen=True)
+class MisfitRules:
+    """When a body does not fit."""
+
+    believed: float = constant(
+        0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
+    )
 
 
 @dataclass(frozen=True)
@@ -61,7 +70,12 @@ class SensorDensity:
         return float(np.sqrt(self.cell_variance * peak(self.variance, self.geometry.dimension)))
 
 
-def misfit(densities: Sequence[SensorDensity], points_world: Floats, unknowns: int) -> float:
+def misfit(
+    densities: Sequence[SensorDensity],
+    points_world: Floats,
+    unknowns: int,
+    rules: MisfitRules = MisfitRules(),
+) -> float:
     """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
 
     Parameters
@@ -72,6 +86,7 @@ def misfit(densities: Sequence[SensorDensity], points_world: Floats, unknowns: i
         The body's features.
     unknowns : int
         Numbers of the pose that were fitted; each sensor's amplitude was, too.
+    rules : MisfitRules
     """
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
@@ -79,6 +94,6 @@ def misfit(densities: Sequence[SensorDensity], points_world: Floats, unknowns: i
         noise = np.hypot(sensor.noise(), _ROUNDING * height)
         statistic += float((rest * rest).sum()) / noise**2
         freedom += rest.size - 1
-    if freedom <= 0 or statistic < float(chdtri(freedom, 1 - _BELIEVED)):
+    if freedom <= 0 or statistic < float(chdtri(freedom, 1 - rules.believed)):
         return 1.0
     return statistic / freedom

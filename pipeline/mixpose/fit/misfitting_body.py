@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit.free_features import fit_freed
-from mixpose.fit.misfit import SensorDensity, misfit
+from mixpose.fit.misfit import MisfitRules, SensorDensity, misfit
 from mixpose.fit.prior import Prior, likelihood_near, most_probable
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
 from mixpose.rigid import transform
@@ -21,7 +21,11 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 def believed(
-    views: Sequence[View], body: Body, T_world_object: Floats, prior: Prior
+    views: Sequence[View],
+    body: Body,
+    T_world_object: Floats,
+    prior: Prior,
+    rules: MisfitRules = MisfitRules(),
 ) -> tuple[Floats, bool]:
     """The most probable pose, or the fit to freed features of a body that does not fit.
 
@@ -33,6 +37,7 @@ def believed(
     T_world_object : (4, 4) array
         A maximum of the likelihood.
     prior : Prior
+    rules : MisfitRules
 
     Returns
     -------
@@ -56,7 +61,7 @@ def believed(
         )
         for k, view in enumerate(views)
     ]
-    ratio = misfit(here, transform(T, points), int(prior.free.sum()))
+    ratio = misfit(here, transform(T, points), int(prior.free.sum()), rules)
     if ratio == 1:
         return T, False
     everywhere = matched_objective(views, body, [view.observation.sigma for view in views])

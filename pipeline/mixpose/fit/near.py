@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
+from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
@@ -44,6 +45,7 @@ class FitRules:
     """How a fit begins."""
 
     schedule: ScheduleRules = ScheduleRules()
+    misfit: MisfitRules = MisfitRules()
     near: float = constant(
         0.1,
         "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
@@ -63,8 +65,6 @@ class Fit:
     converged : bool
     iterations : int
         Evaluations at the finest blur.
-    proposer : str
-        Where the start came from.
     freed : bool
         Whether the body did not fit, and the pose was fitted to freed features.
     """
@@ -73,7 +73,6 @@ class Fit:
     value: float
     converged: bool
     iterations: int
-    proposer: str = ""
     freed: bool = False
 
 
@@ -119,7 +118,7 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     T, is_freed = ascent.state, False
     if matched and has_likelihood(views):
-        T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free))
+        T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free), rules.misfit)
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
 
 

@@ -15,7 +15,7 @@ from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior
 from mixpose.judgement.expected_covariance import expected_covariance
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
-from mixpose.judgement.noise import Noise, NoiseModel, enlargement
+from mixpose.judgement.noise import Noise, NoiseModel
 
 __all__ = [
     "AcceptanceRules",
@@ -31,7 +31,6 @@ __all__ = [
     "beliefs",
     "convinces",
     "decide",
-    "enlargement",
     "expected_covariance",
     "flat_prior",
     "insert",

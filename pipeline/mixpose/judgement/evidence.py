@@ -46,6 +46,11 @@ class DetectionModel:
     log_unseen: float = constant(
         -1.2, "for each feature that faces a sensor out of its view: ln 0.3, bodies are in view"
     )
+    by_count: bool = constant(
+        True,
+        "whether a pose may pay for its freedom by the features that fix it: cheaper than by "
+        "volume where priors are wide",
+    )
     room: float = constant(
         10.0, "radii of the body: how far a position may be where nothing is known before"
     )
@@ -118,6 +123,8 @@ def log_evidence(
     inner = information[np.ix_(free, free)] / variance + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
     by_volume = gained + missed + laplace + prior.log_density
+    if not detection.by_count:
+        return by_volume
     by_count = gained * _redundant(associations, free) + missed - _log_choices(associations, free)
     return max(by_volume, by_count)
 

@@ -22,9 +22,6 @@ from mixpose.judgement.association import Association
 
 Floats: TypeAlias = NDArray[np.float64]
 
-CONFIDENCE = 0.95
-"""Of the ellipsoid that the covariance stands for."""
-
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 
 
@@ -46,7 +43,25 @@ class NoiseModel:
         20.0, "degrees of freedom from which the noise of a recording is known to 16 %, √(1/2ν)"
     )
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
+    confidence: float = constant(
+        0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
+    )
     forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
+
+    def enlargement(self, directions: int, degrees: float) -> float:
+        """Factor that makes the Gaussian ellipsoid as large as that of the F distribution.
+
+        Parameters
+        ----------
+        directions : int
+            Of the pose that are free.
+        degrees : float
+            Of freedom, from which the variance was estimated.
+        """
+        if directions == 0 or self.confidence == 0:
+            return 1.0
+        tail = fdtri(directions, max(degrees, 1.0), self.confidence)
+        return float(directions * tail / chdtri(directions, 1 - self.confidence))
 
 
 @dataclass(frozen=True)
@@ -115,15 +130,7 @@ def covariance_of(
     values, vectors = np.linalg.eigh(inner * scale * scale[:, None])
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale * scale[:, None]
     variance = noise.variance if noise.degrees >= 1 else model.typical**2
-    variance = max(variance, model.smallest**2) * enlargement(int(free.sum()), noise.degrees)
+    variance = max(variance, model.smallest**2) * model.enlargement(int(free.sum()), noise.degrees)
     covariance = np.zeros((6, 6))
     covariance[np.ix_(free, free)] = variance / 2 * (inverse + inverse.T)
     return covariance
-
-
-def enlargement(directions: int, degrees: float) -> float:
-    """Factor that makes the Gaussian 95 % ellipsoid as large as that of the F distribution."""
-    if directions == 0:
-        return 1.0
-    tail = fdtri(directions, max(degrees, 1.0), CONFIDENCE)
-    return float(directions * tail / chdtri(directions, 1 - CONFIDENCE))

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density import close_pairs
+from mixpose.density.overlap import ALL_PAIRS
 from mixpose.objective.projection import Projected
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -121,15 +122,15 @@ def _are_apart(y: Floats, variances: Floats) -> bool:
 
 
 def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
-    """Pairs of features that may overlap at any of the poses."""
+    """Pairs of features that may overlap at any of the poses; all of few."""
+    n = y.shape[2]
+    if n <= ALL_PAIRS:
+        return close_pairs(y[0, 0], 1.0)
     each = [
         close_pairs(y[k, h], float(v))
         for k, v in enumerate(variances[:, 0])
         for h in range(y.shape[1])
     ]
-    if all(one is each[0] for one in each):
-        return each[0]
-    n = y.shape[2]
     codes = np.unique(np.concatenate([np.sort(one, axis=1) @ [n, 1] for one in each]))
     return np.stack(np.divmod(codes, n), axis=1)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.extraction.corners import SIGMA_PX, saddle_strength
+from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
 from mixpose.objective import MatchedObjective, View, matched_objective
@@ -74,7 +74,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     size = picture.shape[1], picture.shape[0]
     window = 0, 0, data.shape[1], data.shape[0]
     if options.method == "corners":
-        blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), SIGMA_PX)
+        blurred = cv2.GaussianBlur(data.astype(np.float32), (0, 0), CornerRules().blur)
         response = np.sqrt(np.maximum(saddle_strength(blurred), 0))
         picture = displayable(_resized(response, size))
         title = "strength of saddles"

@@ -6,34 +6,30 @@ Every field says what it is and where it comes from: a derivation, a test, or a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-
-def _because(default: Any, why: str) -> Any:
-    """A field with the reason for its default."""
-    return field(default=default, metadata={"why": why})
+from mixpose.constants import constant
 
 
 @dataclass(frozen=True)
 class PeakOptions:
     """Which maxima of grey values count as detections."""
 
-    max_peaks: int = _because(64, "peaks kept, highest first: more are noise on every recording")
-    height: float = _because(0.15, "of the highest peak: lower maxima of a blurred spot are noise")
-    grey_floor: float = _because(0.1, "of the largest value: below it a profile is background")
+    max_peaks: int = constant(64, "peaks kept, highest first: more are noise on every recording")
+    height: float = constant(0.15, "of the highest peak: lower maxima of a blurred spot are noise")
+    grey_floor: float = constant(0.1, "of the largest value: below it a profile is background")
 
 
 @dataclass(frozen=True)
 class EvidenceOptions:
     """What counts as met, and what a miss costs."""
 
-    gate: float = _because(3.0, "σ_ε within which a detection is met: 99 % of errors in a plane")
-    neighbours: int = _because(3, "detections about one by which crowding is judged")
-    sharpest: float = _because(0.1, "of σ_ε: errors are not believed to be smaller")
-    missed: float = _because(
+    gate: float = constant(3.0, "σ_ε within which a detection is met: 99 % of errors in a plane")
+    neighbours: int = constant(3, "detections about one by which crowding is judged")
+    sharpest: float = constant(0.1, "of σ_ε: errors are not believed to be smaller")
+    missed: float = constant(
         float(np.log(0.3)), "log-odds of a feature in view without a detection; half are common"
     )
 
@@ -42,19 +38,19 @@ class EvidenceOptions:
 class LabelOptions:
     """How finely detections are drawn to be counted."""
 
-    cells: float = _because(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
-    max_pages: int = _because(1_000_000, "of 16² cells per camera; larger planes get coarser")
-    min_cosine: float = _because(0.1, "to the middle of the rays: at 84° a ray misses the plane")
+    cells: float = constant(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
+    max_pages: int = constant(1_000_000, "of 16² cells per camera; larger planes get coarser")
+    min_cosine: float = constant(0.1, "to the middle of the rays: at 84° a ray misses the plane")
 
 
 @dataclass(frozen=True)
 class DescentOptions:
     """How guesses are refined."""
 
-    damping: float = _because(1e-3, "share of the curvature added: directions without any stay")
-    max_turn: float = _because(0.35, "rad in one step: farther the linear model holds no longer")
-    same: float = _because(0.01, "of the body's radius: poses nearer to each other are one")
-    alike: float = _because(
+    damping: float = constant(1e-3, "share of the curvature added: directions without any stay")
+    max_turn: float = constant(0.35, "rad in one step: farther the linear model holds no longer")
+    same: float = constant(0.01, "of the body's radius: poses nearer to each other are one")
+    alike: float = constant(
         0.03, "of the radius, root mean square over features: candidates nearer than this are one"
     )
 
@@ -63,98 +59,98 @@ class DescentOptions:
 class SearchBudget:
     """Limits and thresholds of one search."""
 
-    max_guesses: int | None = _because(
+    max_guesses: int | None = constant(
         None, "guesses of one search, counted and not timed, so that results repeat; None: thorough"
     )
-    gate: float = _because(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
-    max_points: int = _because(1000, "triangulated points kept, the most promising first")
-    max_prosac_points: int = _because(50, "of them all triples are tried: 19,600, which take 0.1 s")
-    random_triples: int = _because(20_000, "triples of points near each other tried after them")
-    max_triangles: int = _because(120_000, "of features kept for a body: all of 50 features")
-    triangles_alike: int = _because(16, "of features tried for three points, the nearest in shape")
-    min_height: float = _because(0.05, "of a triangle by its longest side: flatter fix no turn")
-    batch: int = _because(
+    gate: float = constant(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
+    max_points: int = constant(1000, "triangulated points kept, the most promising first")
+    max_prosac_points: int = constant(50, "of them all triples are tried: 19,600, which take 0.1 s")
+    random_triples: int = constant(20_000, "triples of points near each other tried after them")
+    max_triangles: int = constant(120_000, "of features kept for a body: all of 50 features")
+    triangles_alike: int = constant(16, "of features tried for three points, the nearest in shape")
+    min_height: float = constant(0.05, "of a triangle by its longest side: flatter fix no turn")
+    batch: int = constant(
         100, "triples of points first looked at together, then twice as many, up to 8 times"
     )
-    subsample: int = _because(8, "features far apart that stand for a body beside a point")
-    max_ray_points: int = _because(
+    subsample: int = constant(8, "features far apart that stand for a body beside a point")
+    max_ray_points: int = constant(
         16, "points with which two rays are combined, the most promising"
     )
-    max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
-    max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
-    max_problems: int = _because(
+    max_rays: int = constant(24, "rays that are combined with a point, the nearest to it")
+    max_pairs: int = constant(500, "pairs of places on rays for one point as one feature")
+    max_problems: int = constant(
         250_000, "triples of rays as triples of features, of one camera alone"
     )
-    max_shared_problems: int = _because(
+    max_shared_problems: int = constant(
         100_000, "the same for several cameras together, of which one hit of one is enough"
     )
-    exhaustive: int = _because(
+    exhaustive: int = constant(
         8, "features, and half as many again rays, of which all triples are tried first"
     )
-    crowds: tuple[int, ...] = _because(
+    crowds: tuple[int, ...] = constant(
         (8, 16, 32), "nearest detections among which triples are drawn: a body is seen in one place"
     )
-    chunk: int = _because(4096, "problems solved together: numbers stay in the cache")
-    min_pixels: float = _because(3.0, "apart in the image, for two features to be told apart")
-    min_sine: float = _because(0.02, "of the angle between rays: below it no depth is fixed")
-    max_together: int = _because(100_000, "features times poses tested together: cache size")
-    test_features: int = _because(16, "features by which many guesses are compared at first")
-    shortlist: int = _because(150, "guesses refined; fewer for bodies of more than 8 features")
-    min_shortlist: int = _because(40, "guesses refined at least, for bodies of many features")
-    behind: float = _because(3.0, "detections that a refined guess may explain less than the best")
-    distinct: float = _because(0.05, "of the body's radius: guesses nearer to each other are one")
-    convincing: float = _because(
+    chunk: int = constant(4096, "problems solved together: numbers stay in the cache")
+    min_pixels: float = constant(3.0, "apart in the image, for two features to be told apart")
+    min_sine: float = constant(0.02, "of the angle between rays: below it no depth is fixed")
+    max_together: int = constant(100_000, "features times poses tested together: cache size")
+    test_features: int = constant(16, "features by which many guesses are compared at first")
+    shortlist: int = constant(150, "guesses refined; fewer for bodies of more than 8 features")
+    min_shortlist: int = constant(40, "guesses refined at least, for bodies of many features")
+    behind: float = constant(3.0, "detections that a refined guess may explain less than the best")
+    distinct: float = constant(0.05, "of the body's radius: guesses nearer to each other are one")
+    convincing: float = constant(
         0.7, "share of the body that must be met for no other kind of guess to be made"
     )
-    sufficient: float = _because(
+    sufficient: float = constant(
         0.45, "the same at overwhelming evidence, and for no spread orientations to be tried"
     )
-    overwhelming: float = _because(
+    overwhelming: float = constant(
         24.0, "evidence in nats that leaves no doubt: a million guesses make 14"
     )
-    descent_features: int = _because(
+    descent_features: int = constant(
         32,
         "features by which guesses descend: the final plan takes all; 100/40 absent 2 times faster",
     )
-    survivors: tuple[int, ...] = _because(
+    survivors: tuple[int, ...] = constant(
         (150, 150, 150), "guesses left after each blur of a plan; fewer lose 1 % of 5/1/5"
     )
-    beyond_doubt: float = _because(
+    beyond_doubt: float = constant(
         32.0, "the same for a kind of guess to be cut short: a wrong pose reached 26 in 8/4/8"
     )
-    min_slip_features: int = _because(16, "of a body: with fewer, all poses a step off are met")
-    max_slip_features: int = _because(120, "of a body up to which shifts by a grid step are tried")
-    place_steps: int = _because(12, "Newton steps from a start to where the body's middle is")
-    turn_steps: int = _because(3, "Newton steps of the place for an assumed orientation")
-    max_places: int = _because(4, "places of the body's middle that are kept")
-    different: float = _because(0.2, "of the body's radius: middles nearer to each other are one")
-    heading_step: float = _because(float(np.radians(4.0)), "between headings, for one free axis")
-    orientation_step: float = _because(
+    min_slip_features: int = constant(16, "of a body: with fewer, all poses a step off are met")
+    max_slip_features: int = constant(120, "of a body up to which shifts by a grid step are tried")
+    place_steps: int = constant(12, "Newton steps from a start to where the body's middle is")
+    turn_steps: int = constant(3, "Newton steps of the place for an assumed orientation")
+    max_places: int = constant(4, "places of the body's middle that are kept")
+    different: float = constant(0.2, "of the body's radius: middles nearer to each other are one")
+    heading_step: float = constant(float(np.radians(4.0)), "between headings, for one free axis")
+    orientation_step: float = constant(
         float(np.radians(12.0)), "between spread orientations: 3 ranges 6/0/0 99 of 100"
     )
-    orientation_blur: float = _because(
+    orientation_blur: float = constant(
         0.2, "of the spread in a sensor: what a turn by such a step moves features by"
     )
-    orientation_stages: tuple[tuple[float, int, int], ...] = _because(
+    orientation_stages: tuple[tuple[float, int, int], ...] = constant(
         ((1.0, 0, 500), (1.0, 3, 300), (0.6, 4, 150), (0.3, 4, 60), (0.0, 6, 24)),
         "power of that blur, steps and survivors of each stage: 3 ranges 6/0/0 99 of 100",
     )
-    descent_plan: tuple[tuple[float, int], ...] = _because(
+    descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.5, 2), (0.75, 1), (0.4, 2)),
         "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
     )
-    wide_plan: tuple[tuple[float, int], ...] = _because(
+    wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)),
         "the same where not all sensors are cameras",
     )
-    final_plan: tuple[tuple[float, int], ...] = _because(
+    final_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"
     )
-    finalists: int = _because(
+    finalists: int = constant(
         16, "poses refined by the final plan, and rivals of a pose beyond doubt"
     )
-    improvement: float = _because(1.1, "factor in detections explained for another such look")
-    checked: int = _because(3, "guesses refined at once to see whether others are needed")
+    improvement: float = constant(1.1, "factor in detections explained for another such look")
+    checked: int = constant(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
     labels: LabelOptions = LabelOptions()
     peaks: PeakOptions = PeakOptions()

@@ -27,17 +27,15 @@ from mixpose.objective import View, pose_jacobian
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import facing
+from mixpose.tracking.range_rules import RangeRules
 
 Floats: TypeAlias = NDArray[np.float64]
 
-MAX_FEATURES = 8
-"""Features of a body up to which associations are summed: their subsets double with each."""
 
-
-def are_associated(views: Sequence[View], body: Body) -> bool:
+def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
     """Whether all sensors gave single ranges, of a body of few points."""
     return (
-        len(body.nodes.points) == len(body) <= MAX_FEATURES
+        len(body.nodes.points) == len(body) <= rules.max_features
         and all(view.sensor.dimension == 1 for view in views)
         and all(isinstance(view.observation.pattern, PointPattern) for view in views)
     )

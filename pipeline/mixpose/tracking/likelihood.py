@@ -239,5 +239,7 @@ def _prior_of(start: Start) -> Prediction | None:
 
 def likelihood_of(data: FrameData) -> Likelihood:
     """The likelihood for a frame."""
-    ranged = data.options.objective == "matched" and are_associated(data.views, data.body)
+    ranged = data.options.objective == "matched" and are_associated(
+        data.views, data.body, data.rules.ranges
+    )
     return AssociationLikelihood(data) if ranged else MatchedLikelihood(data)

@@ -11,12 +11,12 @@ from mixpose.constants import constant
 class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
-    drawn: int = constant(
-        512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
+    slipped: float = constant(
+        0.5, "of a feature, more that are missed and more beside it that belong to none: a step"
     )
-    kept: int = constant(5, "of these, starts that are fitted")
     narrowing: float = constant(
-        3.0, "how much narrower than the uncertainty the blur is at which they are scored"
+        3.0,
+        "by which a mirrored pose is surer than a start; one that was searched for, by its square",
     )
     outdone: float = constant(
         10.0, "log odds by which a candidate of the search may be behind to be fitted: e^-10"

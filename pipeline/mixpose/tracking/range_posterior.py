@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.constants import constant
 from mixpose.fit import blur_schedule
-from mixpose.judgement import DetectionModel, Judged, Noise, NoiseModel, Prior, enlargement
+from mixpose.judgement import DetectionModel, Judged, Noise, NoiseModel, Prior
 from mixpose.objective import Quadratic, View
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 from mixpose.tracking.association_likelihood import sum_associations
+from mixpose.tracking.range_rules import RangeRules
 from mixpose.tracking.track import Prediction
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -30,18 +30,6 @@ Floats: TypeAlias = NDArray[np.float64]
 _OPTIONS = NewtonOptions(iterations=30, tolerance=1e-7)
 _STEP = 0.01  # of σ_ε: by how much ranges differ for second derivatives, half of their digits
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
-
-
-@dataclass(frozen=True)
-class RangeRules:
-    """What is believed of single ranges."""
-
-    stated_degrees: float = constant(
-        20.0, "degrees of freedom that σ_ε counts as, where residuals say otherwise"
-    )
-    min_information: float = constant(
-        0.02, "of the information of known labels: what a pose has in any direction"
-    )
 
 
 def noise_ratio(noise: Noise, rules: RangeRules) -> float:
@@ -157,7 +145,7 @@ def judge_ranges(
     # a direction that the data leave open is as uncertain as before
     covariance[inner] = np.linalg.inv(information[inner] + np.diag(1 / known.spread[free] ** 2))
     volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-    covariance *= enlargement(int(free.sum()), rules.stated_degrees + before.degrees)
+    covariance *= model.enlargement(int(free.sum()), rules.stated_degrees + before.degrees)
     return replace(
         judged,
         covariance=covariance,

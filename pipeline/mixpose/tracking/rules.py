@@ -9,7 +9,7 @@ from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import SearchBudget
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.proposal_rules import ProposalRules
-from mixpose.tracking.range_posterior import RangeRules
+from mixpose.tracking.range_rules import RangeRules
 
 
 @dataclass(frozen=True)

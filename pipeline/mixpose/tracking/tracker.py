@@ -140,6 +140,7 @@ class Tracker:
             T_world_object=best.T_world_object,
             covariance=best.covariance,
             hypotheses=() if verdict.status == "ok" else tuple(hypotheses),
+            proposer=best.proposer,
         )
         found = [
             Found(one.T_world_object, weight, one.spread if self.options.fuse else None)

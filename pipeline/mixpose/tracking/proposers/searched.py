@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from mixpose.judgement import Judged
-from mixpose.search import search
+from mixpose.search import Candidate, search
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.doubt import is_doubtful
 
 
 def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
     """Candidates of the search where nothing convinces yet, as they are and fitted."""
-    if not is_doubtful(data, ranked):
-        return
-    close = data.start_uncertainty / data.rules.proposals.narrowing**2
-    candidates = search(
+    return starts_at(data, candidates_of(data)) if is_doubtful(data, ranked) else []
+
+
+def candidates_of(data: FrameData) -> list[Candidate]:
+    """What the search finds, the most evident first."""
+    return search(
         data.views,
         data.body,
         free=data.free,
         T_reference=data.T_reference,
         seed=data.options.seed,
+        budget=data.rules.search,
     )
+
+
+def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
+    """Candidates as they are and, unless far behind, fitted."""
+    close = data.start_uncertainty / data.rules.proposals.narrowing**2
     for candidate in candidates:
         yield Start(candidate.T_world_object)
         # far worse ones are rivals in name only

@@ -14,8 +14,6 @@ import numpy as np
 from mixpose.judgement import Judged
 from mixpose.tracking.likelihood import FrameData, Start
 
-_HALF = 0.5  # of a feature: less is no difference
-
 
 def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
     """The best pose shifted by each step of the body's grid, where it may have slipped."""
@@ -32,10 +30,11 @@ def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
 
 def _may_have_slipped(judged: Judged, data: FrameData) -> bool:
     """Whether a sensor misses more than in the frame before while more is seen beside the body."""
+    least = data.rules.proposals.slipped
     for one in judged.associations:
         before = data.track.tallies.get(one.name)
         if before is None:
             continue
-        if one.missed > before.missed + _HALF and one.surplus > before.surplus + _HALF:
+        if one.missed > before.missed + least and one.surplus > before.surplus + least:
             return True
     return False

@@ -1,0 +1,176 @@
+"""A case: recordings with their right answers, and what a tracker makes of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from benchmarks.search_cases import Row, absent, trial
+from numpy.typing import NDArray
+
+from mixpose.fit import EstimatorOptions
+from mixpose.judgement import Judged
+from mixpose.objective import View
+from mixpose.poses.evaluate import normalised_error_squared
+from mixpose.records import Estimate
+from mixpose.rigid import rotation_angle_deg, transform, twist_between
+from mixpose.search import Candidate
+from mixpose.tracking import Tracker
+from mixpose.tracking.likelihood import FrameData, Start
+from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.searched import candidates_of, searched, starts_at
+
+Floats: TypeAlias = NDArray[np.float64]
+Change: TypeAlias = Callable[[Tracker], Tracker]
+
+FRESH = 10_000  # first seed of frames without a body
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What sensors saw of a body, and its right poses (n, 4, 4); none where it is not there."""
+
+    number: int
+    time_s: float | None
+    views: list[View]
+    answers: Floats
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Frames that follow each other, and a tracker for them."""
+
+    tracker: Tracker
+    frames: list[Frame]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Recordings of one kind, and how far off a right pose may be."""
+
+    name: str
+    recordings: list[Recording]
+    largest_angle_deg: float
+    largest_shift: float
+    single_frames: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a tracker said of one frame.
+
+    Attributes
+    ----------
+    present, right : bool
+        Whether the body was there, and whether the pose is a right one.
+    status : str
+    angle_deg, shift : float
+        Error of the pose; the shift is that of the middle of the features.  NaN without a pose.
+    squared : float
+        Squared error per dimension, in standard deviations; NaN without a covariance.
+    ms : float
+        Of the processor.
+    """
+
+    present: bool
+    right: bool
+    status: str
+    angle_deg: float
+    shift: float
+    squared: float
+    ms: float
+
+
+class RememberedSearch:
+    """The proposer `searched`, which looks into what was searched already.
+
+    The search knows no rule but its budget: its candidates are the same whatever is switched off.
+    """
+
+    __name__ = searched.__name__
+
+    def __init__(self) -> None:
+        self.unspent_s = 0.0
+        self._found: dict[tuple[object, ...], tuple[float, list[Candidate], object]] = {}
+
+    def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+        """Starts, as `searched` gives them."""
+        return starts_at(data, self._candidates(data)) if is_doubtful(data, ranked) else []
+
+    def _candidates(self, data: FrameData) -> list[Candidate]:
+        T = None if data.T_reference is None else data.T_reference.tobytes()
+        key = (*((id(v.observation), id(v.sensor)) for v in data.views), T)
+        if key in self._found:
+            spent, candidates, _ = self._found[key]
+            self.unspent_s += spent
+            return candidates
+        began = time.process_time()
+        candidates = candidates_of(data)
+        # views are kept with it, as another may get the number of one that is gone
+        self._found[key] = (time.process_time() - began, candidates, list(data.views))
+        return candidates
+
+
+def outcomes(case: Case, change: Change, memory: RememberedSearch) -> list[Outcome]:
+    """Track all recordings of a case with something switched off."""
+    found = []
+    for recording in case.recordings:
+        tracker = change(recording.tracker)
+        proposers = tuple(memory if one is searched else one for one in tracker.proposers)
+        tracker = replace(tracker, proposers=proposers)
+        track = tracker.begin()
+        for frame in recording.frames:
+            began, before = time.process_time(), memory.unspent_s
+            track, estimate = tracker.advance(track, frame.number, frame.time_s, frame.views)
+            spent = time.process_time() - began + memory.unspent_s - before
+            found.append(_outcome(case, recording, frame, estimate, 1e3 * spent))
+    return found
+
+
+def _outcome(
+    case: Case, recording: Recording, frame: Frame, estimate: Estimate, ms: float
+) -> Outcome:
+    T, present = estimate.T_world_object, bool(len(frame.answers))
+    if T is None or not present:
+        return Outcome(present, False, estimate.status, np.nan, np.nan, np.nan, ms)
+    angles = rotation_angle_deg(np.broadcast_to(T, frame.answers.shape), frame.answers)
+    centre = recording.tracker.body.means.mean(axis=0)[None]
+    shifts = np.linalg.norm(transform(frame.answers, centre) - transform(T, centre), axis=-1)[:, 0]
+    # answers turned alike may lie beside each other, as those of a grid do
+    near = np.flatnonzero(angles <= angles.min() + 0.5)
+    k = int(near[np.argmin(shifts[near])])
+    squared = np.nan
+    if estimate.covariance is not None:
+        away = twist_between(frame.answers[k], T)
+        total, dimensions = normalised_error_squared(away, estimate.covariance)
+        squared = np.nan if total is None else total / dimensions
+    right = bool(angles[k] < case.largest_angle_deg and shifts[k] < case.largest_shift)
+    return Outcome(present, right, estimate.status, float(angles[k]), float(shifts[k]), squared, ms)
+
+
+def search_case(row: Row, trials: int) -> Case:
+    """A row of the search benchmark: first frames, a third of them without a body."""
+    present = [trial(row, seed) for seed in range(trials)]
+    empty = [absent(row, FRESH + seed) for seed in range(-(-trials // 2))]
+    recordings = []
+    for one, there in [(one, True) for one in present] + [(one, False) for one in empty]:
+        answers = one.T_world_object @ one.body.symmetries if there else np.zeros((0, 4, 4))
+        tracker = Tracker.create(one.body, EstimatorOptions())
+        recordings.append(Recording(tracker, [Frame(0, None, one.views, answers)]))
+    limits = present[0].largest_angle_deg, present[0].largest_shift * present[0].distance
+    return Case(row.name, recordings, *limits, single_frames=True)
+
+
+def all_on(tracker: Tracker) -> Tracker:
+    """Nothing is switched off."""
+    return tracker
+
+
+def counted(outcomes: Sequence[Outcome]) -> tuple[int, int, int]:
+    """Right poses, wrong ones called ok, and right ones called ok."""
+    right = sum(one.right for one in outcomes)
+    wrong = sum(one.status == "ok" and not one.right for one in outcomes)
+    return right, wrong, sum(one.status == "ok" and one.right for one in outcomes)

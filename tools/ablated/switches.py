@@ -1,0 +1,115 @@
+"""What can be switched off: a proposer, a refinement, or a rule at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from mixpose.judgement import DetectionModel
+from mixpose.tracking import Rules, Tracker
+from mixpose.tracking.proposers import Proposer, Refinement
+from mixpose.tracking.proposers.merged_pair import merged_pair
+from mixpose.tracking.proposers.mirrored import mirrored
+from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.without_outlier import without_outlier
+from mixpose.tracking.proposers.without_sensor import without_sensor
+
+FREE = 0.0
+NEVER = float("inf")
+
+
+@dataclass(frozen=True)
+class FreeMisses(DetectionModel):
+    """Features without a detection cost nothing."""
+
+    @property
+    def log_missed(self) -> float:
+        """Of a feature in view without a detection."""
+        return FREE
+
+
+@dataclass(frozen=True)
+class Switch:
+    """Something that is switched off.
+
+    Attributes
+    ----------
+    name : str
+        What is left without it.
+    change : callable
+        From a tracker with everything on to one without.
+    """
+
+    name: str
+    change: Callable[[Tracker], Tracker]
+
+
+def without_proposer(proposer: Proposer) -> Callable[[Tracker], Tracker]:
+    def change(tracker: Tracker) -> Tracker:
+        kept = tuple(one for one in tracker.proposers if one is not proposer)
+        return replace(tracker, proposers=kept)
+
+    return change
+
+
+def without_refinement(refinement: Refinement) -> Callable[[Tracker], Tracker]:
+    def change(tracker: Tracker) -> Tracker:
+        kept = tuple(one for one in tracker.refinements if one is not refinement)
+        return replace(tracker, refinements=kept)
+
+    return change
+
+
+def ruled(group: str, **fields: Any) -> Callable[[Tracker], Tracker]:
+    """Fields of a group of rules replaced, as ``ruled("judgement.noise", memory=0.0)``."""
+
+    def changed(rules: Any, names: list[str]) -> Any:
+        if not names:
+            return replace(rules, **fields)
+        return replace(rules, **{names[0]: changed(getattr(rules, names[0]), names[1:])})
+
+    def change(tracker: Tracker) -> Tracker:
+        rules: Rules = changed(tracker.rules, group.split("."))
+        return replace(tracker, rules=rules)
+
+    return change
+
+
+def free_misses(tracker: Tracker) -> Tracker:
+    judgement = replace(tracker.rules.judgement, detection=FreeMisses())
+    return replace(tracker, rules=replace(tracker.rules, judgement=judgement))
+
+
+def unfused(tracker: Tracker) -> Tracker:
+    return replace(tracker, options=replace(tracker.options, fuse=False))
+
+
+SWITCHES = (
+    Switch("no searched", without_proposer(searched)),
+    Switch("no mirrored", without_proposer(mirrored)),
+    Switch("no without_outlier", without_refinement(without_outlier)),
+    Switch("no merged_pair", without_refinement(merged_pair)),
+    Switch("no without_sensor", without_refinement(without_sensor)),
+    Switch("nothing merged", ruled("judgement.association", merged=False)),
+    Switch("misses free", free_misses),
+    Switch("unseen free", ruled("judgement.detection", log_unseen=FREE)),
+    Switch("clutter even", ruled("judgement.association", crowded=False)),
+    Switch("payment by volume", ruled("judgement.detection", by_count=False)),
+    Switch("prior flat", ruled("motion", surprise=1.0)),
+    Switch("no velocity", ruled("motion", coasting=-1)),
+    Switch("no fusion of ranges", unfused),
+    Switch("noise: no memory", ruled("judgement.noise", memory=0.0)),
+    Switch("noise: no outdone", ruled("judgement.noise", known=NEVER)),
+    Switch("noise: no typical", ruled("judgement.noise", typical_degrees=0.0)),
+    Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
+    Switch("blurs always", ruled("fit", near=NEVER)),
+    Switch("blurs never", ruled("fit", near=0.0)),
+    Switch("no slip check", ruled("proposals", recurrent=2.0)),
+    Switch("not looked elsewhere", ruled("acceptance", convincing=0.0)),
+    Switch("rivals not counted", ruled("acceptance", rival=2.0)),
+    Switch("any turn sure", ruled("acceptance", widest_turn_deg=NEVER)),
+    Switch("nothing doubtful told", ruled("acceptance", doubtful_coverage=2.0)),
+    Switch("candidates not fitted", ruled("proposals", outdone=-NEVER)),
+    Switch("candidates all fitted", ruled("proposals", outdone=NEVER)),
+)
