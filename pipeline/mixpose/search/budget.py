@@ -39,6 +39,15 @@ class EvidenceOptions:
 
 
 @dataclass(frozen=True)
+class LabelOptions:
+    """How finely detections are drawn to be counted."""
+
+    cells: float = _because(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
+    max_pages: int = _because(1_000_000, "of 16² cells per camera; larger planes get coarser")
+    min_cosine: float = _because(0.1, "to the middle of the rays: at 84° a ray misses the plane")
+
+
+@dataclass(frozen=True)
 class DescentOptions:
     """How guesses are refined."""
 
@@ -68,7 +77,7 @@ class SearchBudget:
         100, "triples of points first looked at together, then twice as many, up to 8 times"
     )
     subsample: int = _because(8, "features far apart that stand for a body beside a point")
-    max_anchors: int = _because(16, "points with which two rays are combined, the most promising")
+    max_ray_points: int = _because(16, "points with which two rays are combined, the most promising")
     max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
     max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
     max_problems: int = _because(
@@ -111,7 +120,10 @@ class SearchBudget:
     min_recurrence: float = _because(
         0.3, "share of a body met a step aside, from which slips are looked for: 1/N at random"
     )
-    beyond_doubt: float = _because(32.0, "the same for a kind of guess to be cut short")
+    beyond_doubt: float = _because(
+        32.0, "the same for a kind of guess to be cut short: a wrong pose reached 26 in 8/4/8"
+    )
+    min_slip_features: int = _because(16, "of a body: with fewer, all poses a step off are met")
     max_slip_features: int = _because(120, "of a body up to which shifts by a grid step are tried")
     place_steps: int = _because(12, "Newton steps from a start to where the body's middle is")
     turn_steps: int = _because(3, "Newton steps of the place for an assumed orientation")
@@ -145,6 +157,7 @@ class SearchBudget:
     improvement: float = _because(1.1, "factor in detections explained for another such look")
     checked: int = _because(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
+    labels: LabelOptions = LabelOptions()
     peaks: PeakOptions = PeakOptions()
     evidence: EvidenceOptions = EvidenceOptions()
 
@@ -152,5 +165,5 @@ class SearchBudget:
 THOROUGH = SearchBudget()
 """Everything is tried."""
 
-LIVE = SearchBudget(max_guesses=6000, shortlist=30, min_shortlist=15)
-"""Guesses of one frame of a live stream: with the body absent at most 50 ms a frame."""
+LIVE = SearchBudget(max_guesses=4000, chunk=1024, shortlist=16, min_shortlist=8, finalists=4)
+"""For each frame of a live stream: 4,000 guesses and the rest of the last batch."""

@@ -70,7 +70,7 @@ def from_point_and_rays(
         Points left out, as they were tried before.
     """
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-    for p in range(skipped, min(len(found), budget.max_anchors)):
+    for p in range(skipped, min(len(found), budget.max_ray_points)):
         near = _rays_near(found, p, rays, gates, budget.max_rays)
         body, world = [], []
         for i in range(len(features)):

@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.search.budget import LabelOptions
 from mixpose.search.detections import SensorDetections
 from mixpose.sensors import Rays
 
@@ -22,11 +23,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int32]
 
 _PAGE = 16  # cells along a page
-_STEPS = 4.0  # cells per radius of a disk
-_MAX_PAGES = 1_000_000  # in the table of one camera; larger planes get coarser cells
 _NEARNESS = 256  # a cell holds label * 256 + nearness
 _WORD = 63  # labels in one word of bits
-_STEEPEST = 0.1  # cosine to the middle of the rays below which a ray misses the plane
 
 
 @dataclass(frozen=True)
@@ -82,16 +80,20 @@ class LabelImage:
         return np.asarray((outward * towards).sum(axis=0) > 0)
 
 
-def label_images(detections: Sequence[SensorDetections], gate: float) -> list[LabelImage]:
+def label_images(
+    detections: Sequence[SensorDetections], gate: float, options: LabelOptions
+) -> list[LabelImage]:
     """Label images of all cameras, with disks of `gate` times σ_ε."""
     return [
-        _label_image(each, each.rays, gate * each.sigma)
+        _label_image(each, each.rays, gate * each.sigma, options)
         for each in detections
         if each.rays is not None and len(each.rays)
     ]
 
 
-def _label_image(seen: SensorDetections, rays: Rays, radius: float) -> LabelImage:
+def _label_image(
+    seen: SensorDetections, rays: Rays, radius: float, options: LabelOptions
+) -> LabelImage:
     axes = _axes(rays.directions)
     centre = rays.origins[0]
     points = rays.origins + rays.directions
@@ -103,13 +105,13 @@ def _label_image(seen: SensorDetections, rays: Rays, radius: float) -> LabelImag
     per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * depth * unit
     radii = radius / np.where(per_unit > 0, per_unit, 1.0)
     places = plane[:, :2] / unit / (plane[:, 2:] if rays.central else 1.0)
-    inside = ~np.array(rays.central) | (plane[:, 2] > _STEEPEST)
+    inside = ~np.array(rays.central) | (plane[:, 2] > options.min_cosine)
     places, radii = places[inside], radii[inside]
     if not len(places):
         places, radii = np.zeros((1, 2)), np.full(1, radius)
     lower, upper = places.min(axis=0), places.max(axis=0)
-    step = float(np.median(radii)) / _STEPS
-    step = max(step, float(np.sqrt(np.prod((upper - lower) / _PAGE) / _MAX_PAGES)))
+    step = float(np.median(radii)) / options.cells
+    step = max(step, float(np.sqrt(np.prod((upper - lower) / _PAGE) / options.max_pages)))
     margin = radii.max() + (_PAGE + 1) * step
     origin = -(lower - margin) / step
     columns, rows = (np.ceil((upper - lower + 2 * margin) / (_PAGE * step)) + 1).astype(int)

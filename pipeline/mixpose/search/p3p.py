@@ -1,6 +1,6 @@
-"""Poses of three points from three lines of sight that meet in one centre (P3P), in bulk.
+"""Poses of three points from three rays that meet in one centre (P3P), in bulk.
 
-The distances λ along the lines solve three quadratic equations
+The distances λ along the rays solve three quadratic equations
 ``λ_i² + λ_j² − 2 λ_i λ_j cos_ij = d_ij²``.  Two combinations without constant term are conics in
 the ratios of the λ; a member of their pencil that falls apart into two lines (a root of a cubic)
 is cut with another, which leaves two quadratic equations: at most four solutions

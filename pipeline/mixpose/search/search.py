@@ -115,7 +115,7 @@ class _Run:
         self._seed = seed
         self._images: list[LabelImage] = []
         if is_pointlike(body):
-            self._images = label_images(detections, budget.gate)
+            self._images = label_images(detections, budget.gate, budget.labels)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         self._by_evidence = bool(self._images) and all(one.rays is not None for one in detections)
         self._descent = Descent(detections, body, constraint.free, budget.descent)
@@ -136,7 +136,7 @@ class _Run:
         ):
             self._keep(self._blunt())
         slippery = self._body.recurrence >= budget.min_recurrence
-        slippery &= len(self._body) <= budget.max_slip_features
+        slippery &= budget.min_slip_features <= len(self._body) <= budget.max_slip_features
         if slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
