@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from detections import EIGHT, TRUTH, detect, random_start, view_of
+from detections import EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

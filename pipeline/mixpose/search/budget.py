@@ -73,9 +73,7 @@ class SearchBudget:
         100, "triples of points first looked at together, then twice as many, up to 8 times"
     )
     subsample: int = constant(8, "features far apart that stand for a body beside a point")
-    max_ray_points: int = constant(
-        16, "points with which two rays are combined, the most promising"
-    )
+    max_ray_points: int = constant(16, "points that two rays are combined with, best first")
     max_rays: int = constant(24, "rays that are combined with a point, the nearest to it")
     max_pairs: int = constant(500, "pairs of places on rays for one point as one feature")
     max_problems: int = constant(
