@@ -27,7 +27,7 @@ POINTS = np.array(
 def beam(turned: bool) -> ParallelBeam:
     T = np.eye(4)
     if turned:
-        T[:3, :3] = [[0, 0, -1.0], [0, 1, 0], [1, 0, 0]]
+        T[:3, :3] = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     return ParallelBeam(1.0, np.array([100.0, 100.0]), (201, 201), T)
 
 
