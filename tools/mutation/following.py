@@ -5,10 +5,11 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _PROPOSERS = "test_tracking_proposers.py"
+_STARTS = "test_tracking_starts.py"
 _RANGES = "test_tracking_ranges.py"
 _DELAYS = "test_tracking_delays.py"
 _OUTLIERS = "test_tracking_outliers.py"
-_WINDOWS = "test_runner_windows.py"
+_WINDOWS = "test_tracking_gating.py"
 _TRACK = "test_tracking_track.py"
 
 _PREDICTION = (
@@ -270,7 +271,7 @@ _PROPOSALS = (
         "return apart if len(left) >= 2 else []",
         "return []",
         "a camera that was bumped bends the pose",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-another-sensor-left-out",
@@ -278,7 +279,7 @@ _PROPOSALS = (
         "            apart.append(one.name)",
         "            apart.append(others[0].name)",
         "of three cameras a sound one is left out",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
@@ -286,7 +287,7 @@ _PROPOSALS = (
         "if not likelihood.knows_detections or len(data.views) < 3:",
         "if not likelihood.knows_detections or len(data.views) < 99:",
         "a camera that was bumped bends the pose",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-left-out-for-free",
@@ -294,7 +295,7 @@ _PROPOSALS = (
         "log_evidence=judged.log_evidence + missed,",
         "log_evidence=judged.log_evidence,",
         "leaving a sensor out makes a pose better",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-merged-pairs-never-mended",
@@ -326,7 +327,7 @@ _PROPOSALS = (
         "if one.missed > before.missed + least and one.surplus > before.surplus + least:",
         "if one.missed > before.missed + 1e9 and one.surplus > before.surplus + least:",
         "a chessboard is followed a square off",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-slips-along-the-world",
@@ -334,7 +335,7 @@ _PROPOSALS = (
         "yield Start(T @ shifted, close)",
         "yield Start(shifted @ T, close)",
         "a chessboard that is turned is followed a square off",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-one-branch-followed",
@@ -342,7 +343,7 @@ _PROPOSALS = (
         "for one in data.predictions]",
         "for one in data.predictions[:1]]",
         "of two possible poses one is forgotten",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-search-of-one-seed",
@@ -350,7 +351,7 @@ _PROPOSALS = (
         "seed=data.options.seed,",
         "seed=0,",
         "the seed of a session does nothing",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-search-of-any-budget",
@@ -358,7 +359,7 @@ _PROPOSALS = (
         "        budget=data.rules.search,\n",
         "",
         "limits of the search do nothing",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-never-in-doubt",
@@ -366,7 +367,7 @@ _PROPOSALS = (
         "return not ranked or not convinces(ranked[0], data.free, data.rules.acceptance)",
         "return not ranked",
         "where a prediction fails nothing else is tried",
-        (_PROPOSERS,),
+        (_STARTS,),
     ),
 )
 
@@ -385,7 +386,7 @@ _TRACKER = (
         "if judged.sensors[one.name].used",
         "if judged.sensors[one.name].used or True",
         "the next frame is looked at as a whole although all is well",
-        (_TRACK,),
+        (_STARTS,),
     ),
     Mutant(
         "tracking-start-widths-ignored",
