@@ -8,7 +8,7 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.budget import PeakOptions
+from mixpose.search.budget import LabelOptions, PeakOptions
 from mixpose.search.detections import peaks, sensor_detections
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.orientations import spread_rotations, spread_turns
@@ -29,7 +29,7 @@ def test_features_that_share_a_detection_count_once(
     paper_body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:
     views = seen_by(pinhole_cameras, paper_body)
-    images = label_images(sensor_detections(views, paper_body, PeakOptions()), 3.0)
+    images = label_images(sensor_detections(views, paper_body, PeakOptions()), 3.0, LabelOptions())
     collapsed = TRUTH.copy()
     # far behind its place the whole body falls within one disk
     collapsed[:3, 3] = [50.0, 4e6, 40.0]

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from mixpose.body import Body, PointFeature, SegmentFeature
     from mixpose.density import Observation
     from mixpose.errors import MixposeError, RecordingError, SessionError
-    from mixpose.tracking import estimate_pose
     from mixpose.objective import View
     from mixpose.records import Estimate
     from mixpose.runner import run
     from mixpose.selection import Selection
     from mixpose.session import Session, load_session
+    from mixpose.tracking import estimate_pose
 
 _HOMES = {
     "Body": "mixpose.body",

@@ -23,8 +23,8 @@ from scipy.stats import chi2
 
 from benchmarks.search_cases import Row, Trial, absent, errors_squared, is_right, rows_named, trial
 from mixpose.fit import EstimatorOptions
-from mixpose.tracking import Tracker
 from mixpose.search import search
+from mixpose.tracking import Tracker
 
 TIMED = ("2 pinhole 6/0/0", "2 pinhole 6/1/3", "2 pinhole 8/2/4")
 FRESH = 10_000  # first seed of the frames without a body

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mixpose.errors import MixposeError
-from mixpose.fit import free_mask
 from mixpose.extraction import METHODS, ExtractOptions
+from mixpose.fit import free_mask
 from mixpose.objective import View
 from mixpose.records import FrameSet, Image, PointPattern, RawFrame
 from mixpose.rigid import Floats

@@ -161,7 +161,9 @@ def draw(
             q = None if near[k] is None else parts[k][0]
             first = 1 + sum(len(pages) - 1 for pages in drawn)
             step, sigma = float(steps[k]), float(narrowed[k])
-            drawn.append(_draw_grid(pattern, k, step, sigma, grid, q, around * steps_per_sigma, table, first))
+            drawn.append(
+                _draw_grid(pattern, k, step, sigma, grid, q, around * steps_per_sigma, table, first)
+            )
     values, corners = _packed(drawn)
     two = np.array([float(_dimension(pattern) == 2) for pattern in patterns])
     return Atlas(

@@ -68,10 +68,10 @@ def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None) -> Fact
     scale = np.float32(pattern.step**m / mass(pattern))
     if v is None:
         one = np.ones((1, 1), dtype=np.float32)
-        values: Singles = pattern.values[:, columns] * scale
+        values: Singles = (pattern.values[:, columns] * scale).astype(np.float32)
         return Factors(one, np.zeros_like(one), values @ right, values @ right_slope)
     rows, left, left_slope = _along(pattern, 1, sigma, v)
-    values = np.asarray(pattern.values[rows, columns] * scale, dtype=np.float32)
+    values = (pattern.values[rows, columns] * scale).astype(np.float32)
     return Factors(left, left_slope, values @ right, values @ right_slope)
 
 

@@ -176,5 +176,3 @@ def matched_atlas(
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
     patterns = [observation.pattern for observation in observations]
     return draw(patterns, blurs, steps_per_sigma, near or [None] * len(patterns), around)
-
-

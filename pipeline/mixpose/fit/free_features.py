@@ -128,7 +128,10 @@ class Matching:
 
 
 def fit_freed(
-    densities: Sequence[SensorDensity], points: Floats, starts: Sequence[Floats], free: NDArray[np.bool_]
+    densities: Sequence[SensorDensity],
+    points: Floats,
+    starts: Sequence[Floats],
+    free: NDArray[np.bool_],
 ) -> Floats | None:
     """Fit the pose to freed features by least squares.
 
@@ -146,7 +149,9 @@ def fit_freed(
     (4, 4) array or None
         None where it is not known which place is whose.
     """
-    redundant = sum(sensor.geometry.dimension for sensor in densities) * len(points) - int(free.sum())
+    redundant = sum(sensor.geometry.dimension for sensor in densities) * len(points) - int(
+        free.sum()
+    )
     found = [own_peaks(sensor, len(points)) for sensor in densities]
     places = [one for one in found if one is not None]
     if redundant <= 0 or len(places) < len(densities):

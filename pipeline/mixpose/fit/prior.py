@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
 from mixpose.density.atlas import REACH
+from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
@@ -127,9 +127,7 @@ def likelihood_near(
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
 
-def cell_variances(
-    energies: Floats, shares: Floats, cells: NDArray[np.intp]
-) -> Floats:
+def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) -> Floats:
     """Variance of a cell's noise times the size of a cell (L,), from the energy left unexplained.
 
     Parameters
@@ -181,9 +179,7 @@ def most_probable(
     return _highest(likelihood, prior, [T], _NATS)
 
 
-def _highest(
-    likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float
-) -> Floats:
+def _highest(likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float) -> Floats:
     """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
     information = prior.information()
 

@@ -50,7 +50,7 @@ class AcceptanceRules:
     disagreeing: float = constant(
         25.0,
         "residual variance over that of the other sensors from which one that meets the body is "
-        "left out: five times their deviation; web cams a frame late have three times and still help",
+        "left out: five times their deviation; web cams a frame late have three and still help",
     )
     same_rotation_deg: float = constant(1.0, "poses nearer than this are one, unless both fit")
     same_distance: float = constant(0.02, "the same, of the body's radius")
@@ -105,9 +105,7 @@ def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -
     return share > rules.convincing and is_sure(judged, free, rules)
 
 
-def decide(
-    ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules
-) -> Verdict:
+def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
     best = next((one for one in ranked if is_possible(one, free, rules)), None)
     if best is None:

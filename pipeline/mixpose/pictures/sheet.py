@@ -114,7 +114,10 @@ def blur_levels(
         return {}
     if estimate.T_world_object is None:
         steps = range(_LEVELS_WITHOUT_POSE - 1, -1, -1)
-        return {view.name: [view.observation.sigma * ScheduleRules().ratio**k for k in steps] for view in views}
+        return {
+            view.name: [view.observation.sigma * ScheduleRules().ratio ** k for k in steps]
+            for view in views
+        }
     around = np.where(tracker.free, tracker.start_uncertainty, 0.0)
     levels = blur_schedule(views, tracker.body, estimate.T_world_object, around)
     return {view.name: [level[k] for level in levels] for k, view in enumerate(views)}

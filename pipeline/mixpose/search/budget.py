@@ -77,7 +77,9 @@ class SearchBudget:
         100, "triples of points first looked at together, then twice as many, up to 8 times"
     )
     subsample: int = _because(8, "features far apart that stand for a body beside a point")
-    max_ray_points: int = _because(16, "points with which two rays are combined, the most promising")
+    max_ray_points: int = _because(
+        16, "points with which two rays are combined, the most promising"
+    )
     max_rays: int = _because(24, "rays that are combined with a point, the nearest to it")
     max_pairs: int = _because(500, "pairs of places on rays for one point as one feature")
     max_problems: int = _because(
@@ -116,9 +118,6 @@ class SearchBudget:
     )
     survivors: tuple[int, ...] = _because(
         (150, 150, 150), "guesses left after each blur of a plan; fewer lose 1 % of 5/1/5"
-    )
-    min_recurrence: float = _because(
-        0.3, "share of a body met a step aside, from which slips are looked for: 1/N at random"
     )
     beyond_doubt: float = _because(
         32.0, "the same for a kind of guess to be cut short: a wrong pose reached 26 in 8/4/8"

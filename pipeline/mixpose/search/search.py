@@ -135,7 +135,7 @@ class _Run:
             self._coverage() < budget.sufficient
         ):
             self._keep(self._blunt())
-        slippery = self._body.recurrence >= budget.min_recurrence
+        slippery = len(self._body.grid_steps) > 0
         slippery &= budget.min_slip_features <= len(self._body) <= budget.max_slip_features
         if slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])

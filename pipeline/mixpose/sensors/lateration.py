@@ -62,7 +62,7 @@ class RangeSensor:
 
     def rays(self, y: Floats) -> None:
         """None: a range leaves a sphere, not a line."""
-        return None
+        return
 
     def moved(self, motion: Floats) -> Self:
         """The sensor that measures of points x what this one measures of ``motion @ x``."""

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions
 from mixpose.extraction.options import ExtractOptions
+from mixpose.fit import EstimatorOptions
 from mixpose.rigid import Floats
 from mixpose.sensors import Sensor
 

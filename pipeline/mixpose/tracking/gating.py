@@ -87,7 +87,8 @@ class Expectation:
             scales = np.sqrt(np.einsum("lnij,lnij->ln", by_shift, by_shift).max(axis=1))
             margins = self._rules.reach * np.sqrt(J**2 @ variances)
             margins += np.maximum(scales * self._feature_reach, self._rules.min_margin_px)[
-                :, None, None]
+                :, None, None
+            ]
             lower = np.where(seen, y - margins, np.inf).min(axis=1).tolist()
             upper = np.where(seen, y + margins, -np.inf).max(axis=1).tolist()
             for name, low, high in zip(self.names, lower, upper, strict=True):

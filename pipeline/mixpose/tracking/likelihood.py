@@ -200,7 +200,13 @@ class AssociationLikelihood:
             T = nearest_alike(T, data.body, data.T_reference)
         posterior = self._posterior(start)
         found = fit_ranges(
-            data.views, data.body, T, data.free, posterior.noise, posterior.prior, posterior.detection
+            data.views,
+            data.body,
+            T,
+            data.free,
+            posterior.noise,
+            posterior.prior,
+            posterior.detection,
         )
         return Fit(found.state, found.value, found.converged, found.iterations)
 

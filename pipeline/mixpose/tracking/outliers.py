@@ -21,9 +21,7 @@ def has_outlier(judged: Judged, rules: ProposalRules) -> bool:
     )
 
 
-def least_squares_step(
-    associations: Sequence[Association], free: NDArray[np.bool_]
-) -> Floats:
+def least_squares_step(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:
     """The step (6,) to where the features were met, merged ones in their middle."""
     rows = [(np.sqrt(one.shares) / one.sigma)[:, None] for one in associations]
     J = np.concatenate(
@@ -66,9 +64,7 @@ def step_without_loosest(
     return step
 
 
-def _rows(
-    associations: Sequence[Association], free: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
+def _rows(associations: Sequence[Association], free: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Jacobians (n, 2, k) and offsets (n, 2) of the met features in σ, missing coordinates 0."""
     met = [one.shares > 0 for one in associations]
     count = sum(int(np.count_nonzero(seen)) for seen in met)

@@ -16,6 +16,7 @@ from mixpose.tracking.motion import MotionRules, RandomWalk
 
 Floats: TypeAlias = NDArray[np.float64]
 
+
 @dataclass(frozen=True)
 class Branch:
     """One place where the body may be.
@@ -121,9 +122,7 @@ def predict(
     The longer nothing was seen, the wider; velocities are believed for a few frames only.
     """
     elapsed = elapsed_since(track, frame, time_s)
-    widening = min(
-        rules.widening**track.misses, rules.widest * (1 + track.misses / 10)
-    )
+    widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
     for branch in track.branches:
         T = branch.T_world_object

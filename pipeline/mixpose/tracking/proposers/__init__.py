@@ -26,7 +26,9 @@ class Proposer(Protocol):
 
     __name__: str
 
-    def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]: ...
+    def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+        """Where fits may begin; nothing where the proposer does not apply."""
+        ...
 
 
 class Refinement(Protocol):
@@ -34,9 +36,9 @@ class Refinement(Protocol):
 
     __name__: str
 
-    def __call__(
-        self, data: FrameData, likelihood: Likelihood, judged: Judged
-    ) -> Iterable[Start]: ...
+    def __call__(self, data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
+        """Where fits may begin; nothing where the pose leaves nothing to mend."""
+        ...
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, multistart, searched, mirrored)

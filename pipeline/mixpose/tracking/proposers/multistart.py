@@ -47,7 +47,9 @@ def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list
     rules = data.rules.proposals
     sigmas = blur_schedule(data.views, data.body, T_guess, uncertainty / rules.narrowing)[0]
     objective = matched_objective(data.views, data.body, sigmas)
-    twists = np.concatenate([np.zeros((1, 6)), _twists(uncertainty, rules.drawn, data.options.seed)])
+    twists = np.concatenate(
+        [np.zeros((1, 6)), _twists(uncertainty, rules.drawn, data.options.seed)]
+    )
     poses = perturb(T_guess, twists)
     scores = objective.value(poses)
     kept: list[int] = []

@@ -17,9 +17,7 @@ from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 from mixpose.tracking.outliers import has_outlier, step_without_loosest
 
 
-def without_outlier(
-    data: FrameData, likelihood: Likelihood, judged: Judged
-) -> Iterable[Start]:
+def without_outlier(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
     """The pose climbed to at a narrower blur from where most features agree."""
     rules = data.rules.proposals
     if not likelihood.knows_detections or not has_outlier(judged, rules):

@@ -17,9 +17,7 @@ from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 OUT_OF_STEP = "out of step or bumped"
 
 
-def without_sensor(
-    data: FrameData, likelihood: Likelihood, judged: Judged
-) -> Iterable[Start]:
+def without_sensor(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
     """The pose fitted without the sensors that disagree with two others or more."""
     if not likelihood.knows_detections or len(data.views) < 3:
         return []
