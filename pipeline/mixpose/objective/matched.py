@@ -29,7 +29,7 @@ from mixpose.objective.projection import BodyProjection, Projected, project_body
 Floats: TypeAlias = NDArray[np.float64]
 
 STEPS_PER_SIGMA = 3.0
-"""Cells per standard deviation of C: places are off by up to 1.8e-3 standard deviations."""
+"""Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
 
 LAST_STEPS = 5.0
 """The same at σ_ε, where estimates end: 1e-4 standard deviations, a fiftieth of what the best
