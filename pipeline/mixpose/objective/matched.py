@@ -32,8 +32,8 @@ STEPS_PER_SIGMA = 3.0
 """Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
 
 LAST_STEPS = 5.0
-"""The same at σ_ε, where estimates end: 1e-4 standard deviations, a fiftieth of what the best
-centres of blobs err by."""
+"""The same at σ_ε, where estimates end: places are 4e-4 standard deviations off at most, a part of
+what the best centres of blobs err by."""
 
 FINE_STEPS = 8.0
 """The same where grey values are judged, which have no detection noise."""
