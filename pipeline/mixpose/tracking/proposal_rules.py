@@ -20,8 +20,8 @@ class ProposalRules:
     kept: int = constant(5, "of these, starts that are fitted")
     narrowing: float = constant(
         3.0,
-        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur at "
-        "which drawn ones are scored; one that was searched for, by its square",
+        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
+        "at which drawn ones are scored; one that was searched for, by its square",
     )
     outdone: float = constant(
         10.0, "log odds by which a candidate of the search may be behind to be fitted: e^-10"
