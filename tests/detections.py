@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import View, project_body
-from mixpose.objective.matched import STEPS_PER_SIGMA
+from mixpose.objective.matched import LAST_STEPS
 from mixpose.records import PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import Sensor
@@ -88,6 +88,6 @@ def _moved_by_look_up(
         at.J[k, 0, at.seen[k, 0], : view.sensor.dimension].reshape(-1, 6) / view.observation.sigma
         for k, view in enumerate(views)
     ]
-    error = np.sqrt(3) / 36 / STEPS_PER_SIGMA**3 * np.sqrt(2)  # in σ_ε
+    error = np.sqrt(3) / 36 / LAST_STEPS**3 * np.sqrt(2)  # in σ_ε
     inverse = np.linalg.pinv(np.concatenate(rows)[:, free])
     return np.asarray(np.abs(of_pose[:, free] @ inverse).sum(axis=1) * error)

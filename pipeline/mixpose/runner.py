@@ -92,9 +92,13 @@ def run(
         At once, if a recording cannot be opened or its table of times lacks rows; else in place
         of the first frame that cannot be read.
     """
-    tracker, track = begin(session, T_start)
     if opened is None:
         opened = open_sources(session, sources or {})
+    if session.estimator.search is None:
+        live = all(source.kind == "live" for source in opened.values())
+        options = replace(session.estimator, search="live" if live else "thorough")
+        session = replace(session, estimator=options)
+    tracker, track = begin(session, T_start)
     frames = pair(opened, selection.start, selection.stop, selection.step)
     return _estimates(session, tracker, track, frames, watch)
 

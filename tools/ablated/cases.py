@@ -16,7 +16,7 @@ from mixpose.judgement import Judged
 from mixpose.objective import View
 from mixpose.poses.evaluate import normalised_error_squared
 from mixpose.records import Estimate
-from mixpose.rigid import rotation_angle_deg, transform, twist_between
+from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import FrameData, Start
@@ -26,6 +26,7 @@ from mixpose.tracking.proposers.searched import candidates_of, searched, starts_
 Floats: TypeAlias = NDArray[np.float64]
 Change: TypeAlias = Callable[[Tracker], Tracker]
 
+CROWDED = Row("1 pinhole", 8, 1, 60, 0.95)
 FRESH = 10_000  # first seed of frames without a body
 
 
@@ -162,6 +163,22 @@ def search_case(row: Row, trials: int) -> Case:
         recordings.append(Recording(tracker, [Frame(0, None, one.views, answers)]))
     limits = present[0].largest_angle_deg, present[0].largest_shift * present[0].distance
     return Case(row.name, recordings, *limits, single_frames=True)
+
+
+def loose_start_case(trials: int) -> Case:
+    """One camera, 60 false features, and a start that is up to 15 mm and 7.5° off."""
+    recordings = []
+    for seed in range(trials):
+        one = trial(CROWDED, seed)
+        rng = np.random.default_rng([seed, 2])
+        off = rng.uniform(-1, 1, 6) * np.repeat([15.0, np.radians(7.5)], 3)
+        start = perturb(one.T_world_object, off)
+        tracker = Tracker.create(
+            one.body, EstimatorOptions(), start, rotation_deg=7.5, distance=15.0
+        )
+        recordings.append(Recording(tracker, [Frame(0, None, one.views, one.T_world_object[None])]))
+    limits = one.largest_angle_deg, one.largest_shift * one.distance
+    return Case("a loose start, 60 false", recordings, *limits, single_frames=True)
 
 
 def all_on(tracker: Tracker) -> Tracker:

@@ -11,7 +11,9 @@ from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
+from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_outlier import without_outlier
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
@@ -86,6 +88,8 @@ def unfused(tracker: Tracker) -> Tracker:
 
 
 SWITCHES = (
+    Switch("no stepped_aside", without_proposer(stepped_aside)),
+    Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
     Switch("no mirrored", without_proposer(mirrored)),
     Switch("no without_outlier", without_refinement(without_outlier)),
@@ -105,7 +109,6 @@ SWITCHES = (
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),
-    Switch("no slip check", ruled("proposals", recurrent=2.0)),
     Switch("not looked elsewhere", ruled("acceptance", convincing=0.0)),
     Switch("rivals not counted", ruled("acceptance", rival=2.0)),
     Switch("any turn sure", ruled("acceptance", widest_turn_deg=NEVER)),

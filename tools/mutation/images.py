@@ -52,7 +52,7 @@ _LEVELS = (
     Mutant(
         "extraction-no-surroundings",
         "extraction/threshold.py",
-        "max(side, LEAST_MARGIN_PX) for side in",
+        "max(side, rules.min_margin) for side in",
         "0 * side for side in",
         "a feature that fills its window is taken for background",
         (_BLOBS,),
@@ -119,8 +119,8 @@ _SHAPES = (
     Mutant(
         "extraction-tips-only",
         "extraction/spots.py",
-        "CENTROID_SHARE = 0.1",
-        "CENTROID_SHARE = 0.8",
+        "centroid: float = constant(\n        0.1,",
+        "centroid: float = constant(\n        0.8,",
         "centres are drawn to the middles of pixels",
         (_BLOBS,),
     ),
@@ -135,8 +135,8 @@ _SHAPES = (
     Mutant(
         "extraction-touching-spots-are-one",
         "extraction/spots.py",
-        "LONG = 1.35",
-        "LONG = 9.0",
+        "long: float = constant(1.35,",
+        "long: float = constant(9.0,",
         "two spots that touch are one in their middle",
         (_BLOBS,),
     ),
@@ -186,7 +186,7 @@ _SADDLES = (
     Mutant(
         "extraction-corners-of-any-symmetry",
         "extraction/corners.py",
-        "crossed &= (crossings == 4) & (symmetry >= LEAST_SYMMETRY)",
+        "crossed &= (crossings == 4) & (symmetry >= rules.symmetry)",
         "crossed &= crossings == 4",
         "crossings of unlike things count as corners",
         (_CORNERS,),
@@ -202,8 +202,8 @@ _SADDLES = (
     Mutant(
         "extraction-corners-in-rows-of-the-band",
         "extraction/corners.py",
-        "np.stack([u + MARGIN_PX, v + top], axis=-1)",
-        "np.stack([u + MARGIN_PX, v], axis=-1)",
+        "np.stack([u + margin, v + top], axis=-1)",
+        "np.stack([u + margin, v], axis=-1)",
         "corners are found in the rows of a band",
         (_CORNERS,),
     ),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.near import Fit, FitRules, fit_near
-from mixpose.fit.options import EstimatorOptions, free_mask
+from mixpose.fit.options import EstimatorOptions, SearchName, free_mask
 
 __all__ = [
     "EstimatorOptions",
     "Fit",
     "FitRules",
     "ScheduleRules",
+    "SearchName",
     "blur_schedule",
     "fit_near",
     "free_mask",

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES
+
+SearchName: TypeAlias = Literal["thorough", "live"]
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,9 @@ class EstimatorOptions:
     seed : int
     fuse : bool
         Whether frames of single ranges take the pose before them as a prior.
+    search : {"thorough", "live"} or None
+        How long a frame is searched where no prediction convinces; None: live for cameras and
+        streams.
     """
 
     objective: ObjectiveName = "matched"
@@ -33,6 +39,7 @@ class EstimatorOptions:
     samples: int = 1000
     seed: int = 0
     fuse: bool = True
+    search: SearchName | None = None
 
 
 def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -32,7 +33,8 @@ def _matched(
     return matched_objective(views, body, sigmas, near, steps_per_sigma=steps)
 
 
-def _paper(
+def _sampled(
+    kind: type[PaperObjective] | type[IndependentObjective],
     views: Sequence[View],
     body: Body,
     samples: Floats,
@@ -41,25 +43,13 @@ def _paper(
     fine: bool,
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
-    return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
-
-
-def _independent(
-    views: Sequence[View],
-    body: Body,
-    samples: Floats,
-    sigmas: Sequence[float],
-    near: Floats,
-    fine: bool,
-) -> Objective:
-    terms = sampled_terms(views, samples, sigmas, near)
-    return IndependentObjective(terms, samples, body.world_offsets(samples.shape[1]))
+    return kind(terms, samples, body.world_offsets(samples.shape[1]))
 
 
 OBJECTIVES: dict[ObjectiveName, Builder] = {
     "matched": _matched,
-    "paper": _paper,
-    "independent": _independent,
+    "paper": partial(_sampled, PaperObjective),
+    "independent": partial(_sampled, IndependentObjective),
 }
 
 

@@ -29,11 +29,11 @@ from mixpose.objective.projection import BodyProjection, Projected, project_body
 Floats: TypeAlias = NDArray[np.float64]
 
 STEPS_PER_SIGMA = 3.0
-"""Cells per standard deviation of C: places are off by up to 1.8e-3 standard deviations."""
+"""Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
 
 LAST_STEPS = 5.0
-"""The same at σ_ε, where estimates end: 1e-4 standard deviations, a fiftieth of what the best
-centres of blobs err by."""
+"""The same at σ_ε, where estimates end: places are 4e-4 standard deviations off at most, a part of
+what the best centres of blobs err by."""
 
 FINE_STEPS = 8.0
 """The same where grey values are judged, which have no detection noise."""

@@ -102,4 +102,6 @@ def _estimator(table: EstimatorTable, start: Start | None) -> EstimatorOptions:
             "[start]; add one with the pose they are held at, or leave free out to estimate all",
             "free",
         )
-    return EstimatorOptions(table.objective, table.free, table.samples, table.seed, table.fuse)
+    return EstimatorOptions(
+        table.objective, table.free, table.samples, table.seed, table.fuse, table.search
+    )

@@ -12,6 +12,7 @@ from typing import Annotated, Any, get_args
 from pydantic import Field, PlainValidator
 
 from mixpose.body import Spread
+from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.session.messages import one_of
@@ -165,6 +166,13 @@ class EstimatorTable(Table):
     """Whether frames of single ranges without labels take the pose before them as a prior.
 
     Example: `fuse = false`
+    """
+    search: Annotated[SearchName | None, Field(description=one_of(get_args(SearchName)))] = None
+    """How a frame is searched in which no prediction convinces: to the end, or with a budget of
+    guesses per frame (counted, so that results repeat), going on in the next frame from where it
+    stopped.  Left out, recordings are searched thoroughly, cameras and streams live.
+
+    Example: `search = "live"`
     """
 
 

@@ -20,6 +20,7 @@ from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, neare
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
 from mixpose.records import SensorReport
+from mixpose.search import SearchReport, SearchState
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
@@ -66,9 +67,17 @@ class Likelihood(Protocol):
         ...
 
 
+@dataclass
+class SearchLog:
+    """What the search of a frame cost, and where it goes on in the next."""
+
+    report: SearchReport = SearchReport()
+    state: SearchState = SearchState()
+
+
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it."""
+    """A frame, and what is known before it; `log` is written by the proposer that searches."""
 
     views: Sequence[View]
     body: Body
@@ -79,6 +88,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    log: SearchLog = field(default_factory=SearchLog)
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:

@@ -14,9 +14,14 @@ class ProposalRules:
     slipped: float = constant(
         0.5, "of a feature, more that are missed and more beside it that belong to none: a step"
     )
+    drawn: int = constant(
+        512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
+    )
+    kept: int = constant(5, "of these, starts that are fitted")
     narrowing: float = constant(
         3.0,
-        "by which a mirrored pose is surer than a start; one that was searched for, by its square",
+        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
+        "at which drawn ones are scored; one that was searched for, by its square",
     )
     outdone: float = constant(
         10.0, "log odds by which a candidate of the search may be behind to be fitted: e^-10"

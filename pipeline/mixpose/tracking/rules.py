@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
-from mixpose.search import SearchBudget
+from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.proposal_rules import ProposalRules
 from mixpose.tracking.range_rules import RangeRules
@@ -22,4 +22,5 @@ class Rules:
     motion: MotionRules = MotionRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
-    search: SearchBudget = SearchBudget()
+    search: SearchBudget = THOROUGH
+    live: SearchBudget = LIVE

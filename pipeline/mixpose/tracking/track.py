@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_alike
 from mixpose.rigid import perturb, twist_between
+from mixpose.search import SearchState
 from mixpose.tracking.motion import MotionRules, RandomWalk
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -85,6 +86,8 @@ class Track:
         None before two uncertain poses.
     tallies : mapping of str to SensorTally
         By sensor, of the last frame with a pose.
+    search : SearchState
+        Where a search with a budget goes on while nothing convinces.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -94,10 +97,11 @@ class Track:
     noise: Noise = field(default_factory=Noise)
     walk: RandomWalk | None = None
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
+    search: SearchState = SearchState()
 
-    def missed(self) -> Track:
+    def missed(self, search: SearchState) -> Track:
         """The track after a frame without a pose."""
-        return replace(self, misses=self.misses + 1)
+        return replace(self, misses=self.misses + 1, search=search)
 
 
 @dataclass(frozen=True)

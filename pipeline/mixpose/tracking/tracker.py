@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import Judged, decide, insert
+from mixpose.judgement import Judged, Verdict, decide, insert
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, SensorReport
 from mixpose.tracking.delays import in_step
@@ -117,53 +117,23 @@ class Tracker:
         """
         usable = [view for view in views if not view.observation.is_empty]
         usable = in_step(usable, track, frame, time_s, self.rules.motion)
-        ranked = self.ranked(track, frame, time_s, usable) if usable else []
+        data = self.data(track, frame, time_s, usable)
+        ranked = self.ranked(data) if usable else []
         verdict = decide(ranked, self.free, self.rules.acceptance)
-        reports = {view.name: SensorReport(False) for view in views}
         told = verdict.best or (ranked[0] if ranked else None)
-        estimate = Estimate(
-            frame=frame,
-            time_s=time_s,
-            object=self.body.name,
-            status=verdict.status,
-            T_world_object=None,
-            covariance=None,
-            score=told.score if told else 0.0,
-            sensors=reports | (told.sensors if told else {}),
-        )
-        best = verdict.best
-        if best is None:
-            return track.missed(), estimate
-        hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
-        estimate = replace(
-            estimate,
-            T_world_object=best.T_world_object,
-            covariance=best.covariance,
-            hypotheses=() if verdict.status == "ok" else tuple(hypotheses),
-            proposer=best.proposer,
-        )
-        found = [
-            Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
-            for one, weight in verdict.kept
-        ]
-        noise = best.noise if verdict.status == "ok" else track.noise
-        motion = self.rules.motion
-        after = follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
-        return after, estimate
+        estimate = self._estimate(frame, time_s, views, verdict, told)
+        if verdict.best is None:
+            return track.missed(data.log.state), estimate
+        return self._followed(track, frame, time_s, verdict, verdict.best), estimate
 
-    def ranked(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> list[Judged]:
-        """Distinct poses that may explain a frame, most evident first.
+    def ranked(self, data: FrameData) -> list[Judged]:
+        """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
         Parameters
         ----------
-        track, frame, time_s
-            As `advance` has them.
-        views : sequence of View
-            At least one, none of which saw nothing.
+        data : FrameData
+            With at least one view, none of which saw nothing.
         """
-        data = self._data(track, frame, time_s, views)
         likelihood = likelihood_of(data)
         ranked: list[Judged] = []
 
@@ -180,9 +150,47 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def _data(
+    def _estimate(
+        self,
+        frame: int,
+        time_s: float | None,
+        views: Sequence[View],
+        verdict: Verdict,
+        told: Judged | None,
+    ) -> Estimate:
+        """The estimate of a frame, with reports of the best pose, believed or not."""
+        best = verdict.best
+        hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
+        reports = {view.name: SensorReport(False) for view in views}
+        return Estimate(
+            frame=frame,
+            time_s=time_s,
+            object=self.body.name,
+            status=verdict.status,
+            T_world_object=best.T_world_object if best else None,
+            covariance=best.covariance if best else None,
+            score=told.score if told else 0.0,
+            sensors=reports | (told.sensors if told else {}),
+            hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
+            proposer=best.proposer if best else "",
+        )
+
+    def _followed(
+        self, track: Track, frame: int, time_s: float | None, verdict: Verdict, best: Judged
+    ) -> Track:
+        """The track after a frame with poses."""
+        found = [
+            Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
+            for one, weight in verdict.kept
+        ]
+        noise = best.noise if verdict.status == "ok" else track.noise
+        motion = self.rules.motion
+        return follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
+
+    def data(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
+        """A frame, and what is known before it; arguments as of `advance`."""
         predictions = predict(track, self.body, frame, time_s, self.rules.motion)
         return FrameData(
             views=views,

@@ -13,6 +13,7 @@ from mixpose.judgement import Judged
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
+from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
@@ -40,5 +41,5 @@ class Refinement(Protocol):
         ...
 
 
-PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, searched, mirrored)
+PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, multistart, searched, mirrored)
 REFINEMENTS: tuple[Refinement, ...] = (without_sensor, without_outlier, merged_pair)

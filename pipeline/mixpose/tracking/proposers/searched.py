@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from mixpose.judgement import Judged
-from mixpose.search import Candidate, search
+from mixpose.search import Candidate, search_frame
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.doubt import is_doubtful
 
@@ -16,15 +16,19 @@ def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
 
 
 def candidates_of(data: FrameData) -> list[Candidate]:
-    """What the search finds, the most evident first."""
-    return search(
+    """What the search finds, the most evident first; with a budget, as far as that reaches."""
+    live = data.options.search == "live"
+    result = search_frame(
         data.views,
         data.body,
         free=data.free,
         T_reference=data.T_reference,
         seed=data.options.seed,
-        budget=data.rules.search,
+        budget=data.rules.live if live else data.rules.search,
+        state=data.track.search if live else None,
     )
+    data.log.report, data.log.state = result.report, result.state
+    return result.candidates
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
