@@ -138,7 +138,7 @@ def test_directions_that_ranges_leave_open_are_as_uncertain_as_anywhere() -> Non
         noise = JudgementRules(noise=NoiseModel(confidence=confidence))
         rules = Rules(judgement=noise)
         tracker = Tracker.create(TROLLEY, options, np.eye(4), rules=rules)
-        data = tracker._data(tracker.begin(), 0, None, views)
+        data = tracker.data(tracker.begin(), 0, None, views)
         judged = likelihood_of(data).judge(Fit(np.eye(4), 0.0, True, 0), Start(np.eye(4)))
         covariances.append(np.diag(judged.covariance)[list(FREE)])
     # one anchor: within ten radii, and turned anyhow

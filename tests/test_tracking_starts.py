@@ -16,12 +16,14 @@ from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import AcceptanceRules, Association, Judged, Noise, NoiseModel
 from mixpose.objective import View
-from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg
-from mixpose.search import SearchBudget
+from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg, twist_between
+from mixpose.search import SearchBudget, SearchReport, SearchState
+from mixpose.search.result import SearchResult
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.multistart import starts_around
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
@@ -58,7 +60,7 @@ def judged_at(T: Floats, *associations: Association) -> Judged:
 
 
 def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> FrameData:
-    return tracker._data(track or tracker.begin(), 1, None, views)
+    return tracker.data(track or tracker.begin(), 1, None, views)
 
 
 def test_every_place_where_the_body_may_be_is_a_start() -> None:
@@ -86,22 +88,71 @@ def test_a_grid_that_may_have_slipped_is_tried_a_step_aside_along_its_own_axes()
         assert not list(stepped_aside(data, [judged_at(slipped, one)]))
 
 
-def test_the_search_is_told_what_the_session_says(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("live", [False, True])
+def test_the_search_is_told_what_the_session_says(
+    live: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked: dict[str, Any] = {}
+    stopped, before = SearchState(2, 5), SearchState(1, 3)
 
-    def recorded(views: Sequence[View], body: Body, **options: Any) -> list[Any]:
-        asked.update(options)
-        return []
+    def recorded(views: Sequence[View], body: Body, **told: Any) -> SearchResult:
+        asked.update(told)
+        return SearchResult([], SearchReport(), stopped)
 
-    monkeypatch.setattr(sys.modules[searched.__module__], "search", recorded)
-    budget = SearchBudget(max_guesses=1234)
-    options = EstimatorOptions(free=("x", "y", "rz"), seed=7)
-    tracker = Tracker.create(EIGHT, options, TRUTH, rules=Rules(search=budget))
-    assert not list(searched(data_of(tracker, []), []))
+    monkeypatch.setattr(sys.modules[searched.__module__], "search_frame", recorded)
+    budgets = SearchBudget(max_guesses=1234), SearchBudget(max_guesses=12)
+    options = EstimatorOptions(free=("x", "y", "rz"), seed=7, search="live" if live else "thorough")
+    rules = Rules(search=budgets[0], live=budgets[1])
+    tracker = Tracker.create(EIGHT, options, TRUTH, rules=rules)
+    data = data_of(tracker, [], replace(tracker.begin(), search=before))
+    assert not list(searched(data, []))
     assert asked["seed"] == 7
-    assert asked["budget"] is budget
+    assert asked["budget"] is budgets[live]
+    assert asked["state"] == (before if live else None)
     assert asked["free"].tolist() == [True, True, False, False, False, True]
     np.testing.assert_allclose(asked["T_reference"], TRUTH)
+    assert data.log.state == stopped
+
+
+def test_a_live_search_goes_on_in_the_next_frame_where_it_stopped(
+    pinhole_cameras: list[PinholeCamera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped = SearchState(2, 5)
+    monkeypatch.setattr(
+        sys.modules[searched.__module__],
+        "search_frame",
+        lambda *_, **__: SearchResult([], SearchReport(), stopped),
+    )
+    tracker = Tracker.create(EIGHT, EstimatorOptions(search="live"))
+    views = detect(pinhole_cameras, EIGHT, TRUTH)
+    track, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    assert estimate.status == "lost"
+    assert track.search == stopped
+
+
+def test_several_starts_are_apart_and_where_most_is_seen(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = detect(pinhole_cameras, EIGHT, TRUTH)
+    start = perturb(TRUTH, np.repeat([6.0, 0.05], 3))
+    u = np.repeat([9.0, 0.08], 3)
+    found = {}
+    for seed in (0, 1):
+        tracker = Tracker.create(EIGHT, EstimatorOptions(seed=seed), start)
+        found[seed] = starts_around(data_of(tracker, views), start, u)
+        assert len(found[seed]) == 5
+        twists = [twist_between(start, T) / u for T in found[seed]]
+        for k, one in enumerate(twists):
+            # none within a third of the uncertainty of another, nor beyond what is drawn from;
+            # twists of turns do not quite add up
+            assert all(np.linalg.norm(one - other) > 0.3 for other in twists[:k])
+            assert np.abs(one).max() < np.sqrt(3) * 1.05
+        # a uniform number of standard deviation 1 is beyond 1/√3 in two of three draws
+        assert max(np.abs(one).max() for one in twists) > 1.0
+        off = [np.linalg.norm(twist_between(TRUTH, T) / u) for T in found[seed]]
+        # 512 poses: the start itself is 1.6 off, and some are nearer
+        assert off[0] < 1.6
+    assert not np.allclose(found[0][0], found[1][0])
 
 
 def test_a_pose_that_does_not_convince_is_in_doubt() -> None:

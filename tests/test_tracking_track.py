@@ -12,6 +12,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.judgement import AcceptanceRules, DetectionModel, Noise, flat_prior, judge
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform, twist_between
+from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Prediction, Track, Tracker, predict
 from mixpose.tracking.motion import MotionRules, RandomWalk
@@ -62,7 +63,7 @@ def test_a_velocity_is_believed_for_five_frames_without_a_pose(misses: int, fram
 def test_a_prediction_widens_with_every_frame_without_a_pose(misses: int, wider: float) -> None:
     track = Track((branch(),), frame=0)
     for _ in range(misses):
-        track = track.missed()
+        track = track.missed(SearchState())
     # by half each, then to four times and a tenth of that more for each
     (prediction,) = predict(track, EIGHT, 1, None)
     assert prediction.uncertainty == pytest.approx(wider * NARROW)

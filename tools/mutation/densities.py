@@ -15,9 +15,9 @@ _ATLAS = (
     Mutant(
         "density-drawn-too-narrowly",
         "density/atlas.py",
+        "REACH = 3.5",
         "REACH = 2.5",
-        "REACH = 1.5",
-        "features that are met beyond 1.5 standard deviations pull at nothing",
+        "features four widths apart draw each other",
     ),
     Mutant(
         "density-normalised-by-two-pi",
