@@ -130,22 +130,30 @@ def test_ranges_err_by_more_than_said_where_residuals_say_so() -> None:
     assert noise_ratio(Noise(1.0, 20.0), RangeRules()) == 1.0
 
 
-def test_directions_that_ranges_leave_open_are_as_uncertain_as_anywhere() -> None:
-    options = EstimatorOptions(free=("x", "y", "rz"))
-    views = views_at(np.eye(4), np.random.default_rng(7))[:1]
-    covariances = []
+def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:
+    # one tag at the origin of the body; the other faces away from all anchors
+    tags = PointFeature(np.zeros(3)), PointFeature(np.array([0.2, 0.0, 0.0]))
+    body = Body("tags", tags, np.array([[0, 0, 1.0], [0, 0, -1.0]]))
+    rng = np.random.default_rng(7)
+    views = []
+    for k, anchor in enumerate(ANCHORS):
+        found = anchor.project(np.zeros((1, 3)))[0] + rng.normal(0, SIGMA)
+        views.append(
+            View(f"anchor{k}", anchor, Observation(PointPattern(found, np.ones(1)), SIGMA))
+        )
+    variances = []
     for confidence in (0.0, 0.95):
-        noise = JudgementRules(noise=NoiseModel(confidence=confidence))
-        rules = Rules(judgement=noise)
-        tracker = Tracker.create(TROLLEY, options, np.eye(4), rules=rules)
+        rules = Rules(judgement=JudgementRules(noise=NoiseModel(confidence=confidence)))
+        options = EstimatorOptions(free=("x", "y", "rz"))
+        tracker = Tracker.create(body, options, np.eye(4), rules=rules)
         data = tracker.data(tracker.begin(), 0, None, views)
         judged = likelihood_of(data).judge(Fit(np.eye(4), 0.0, True, 0), Start(np.eye(4)))
-        covariances.append(np.diag(judged.covariance)[list(FREE)])
-    # one anchor: within ten radii, and turned anyhow
-    room = np.array([10 * TROLLEY.radius, 10 * TROLLEY.radius, np.pi])
-    assert (np.sqrt(covariances[0]) <= room * (1 + 1e-9)).all()
+        variances.append(np.diag(judged.covariance)[list(FREE)])
+    assert np.sqrt(variances[0][2]) == pytest.approx(np.pi, rel=1e-6)
+    # eight anchors all around: σ / √4 along each axis where all are detections of the tag
+    assert (np.sqrt(variances[0][:2]) < 2 * SIGMA / 2).all()
     # σ_ε counts as known from 20 residuals: tables have 3.098 for F of 3 and 20, 7.815 for χ² of 3
-    assert covariances[1] / covariances[0] == pytest.approx([3 * 3.098 / 7.815] * 3, rel=1e-3)
+    assert variances[1] / variances[0] == pytest.approx([3 * 3.098 / 7.815] * 3, rel=1e-3)
 
 
 def test_the_gradient_of_the_likelihood_is_its_slope() -> None:
