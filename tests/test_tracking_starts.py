@@ -155,6 +155,18 @@ def test_several_starts_are_apart_and_where_most_is_seen(
     assert not np.allclose(found[0][0], found[1][0])
 
 
+def test_several_starts_along_one_direction_are_a_third_of_the_uncertainty_apart(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions(free=("x",)), TRUTH)
+    data = data_of(tracker, detect(pinhole_cameras, EIGHT, TRUTH))
+    # the best five of 512 along one line would all be next to the truth
+    places = [T[0, 3] for T in starts_around(data, TRUTH, np.array([9.0, 0, 0, 0, 0, 0]))]
+    assert len(places) == 5
+    assert np.diff(np.sort(places)).min() > 3.0
+    assert abs(places[0] - TRUTH[0, 3]) < 0.1
+
+
 def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
     data = data_of(Tracker.create(EIGHT, EstimatorOptions(), TRUTH), [])
     assert is_doubtful(data, [])
