@@ -60,6 +60,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "objective": ("test_objective_kernel.py", "test_objective*.py"),
     "search": (
         "test_search_evidence.py",
+        "test_search_guesses.py",
         "test_search_detections.py",
         "test_search_[!p]*.py",
         "test_search_*.py",

@@ -1,0 +1,53 @@
+"""Parts of the search: slips along a grid, directions that are held, faces turned away."""
+
+from __future__ import annotations
+
+import numpy as np
+from detections import EIGHT, TRUTH, view_of
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.rigid import perturb, transform, twist_between
+from mixpose.search.budget import LabelOptions, PeakOptions
+from mixpose.search.constraint import Constraint
+from mixpose.search.detections import sensor_detections
+from mixpose.search.guesses import from_slips
+from mixpose.search.inlier_counts import count_inliers, label_images
+from mixpose.sensors import PinholeCamera
+
+Floats = NDArray[np.float64]
+
+
+def test_a_slipped_pose_is_put_back_by_the_way_from_a_feature_to_another() -> None:
+    row = Body("row", tuple(PointFeature(np.array([x, 0.0, 0.0])) for x in (0.0, 20.0, 40.0)))
+    poses = from_slips(row, TRUTH)
+    moved = transform(poses, np.zeros((1, 3)))[:, 0] - TRUTH[:3, 3]
+    # one step either way twice, two steps once, along the axes of the body
+    np.testing.assert_allclose(
+        np.sort(moved @ TRUTH[:3, 0]), [-40, -20, -20, 20, 20, 40], atol=1e-9
+    )
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(moved @ TRUTH[:3, 0]))
+
+
+def test_directions_that_are_held_stay_where_the_reference_has_them() -> None:
+    free = np.array([True, False, False, False, False, True])
+    pose = perturb(TRUTH, np.array([5.0, 7.0, -3.0, 0.0, 0.0, 0.2]))
+    (allowed,) = Constraint(free, TRUTH).apply(pose[None])
+    expected = np.array([5.0, 0, 0, 0, 0, 0.2])
+    np.testing.assert_allclose(twist_between(TRUTH, allowed), expected, atol=1e-9)
+
+
+def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    camera = pinhole_cameras[0]
+    y = camera.project(transform(TRUTH, EIGHT.means))[0]
+    detections = sensor_detections([view_of("0", camera, y)], EIGHT, PeakOptions())
+    images = label_images(detections, 3.0, LabelOptions())
+    towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
+    normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    normals[5:] *= -1
+    counts, _ = count_inliers(images, EIGHT.means, normals, TRUTH[None], 1000)
+    assert counts.tolist() == [[5.0]]
+    counts, _ = count_inliers(images, EIGHT.means, None, TRUTH[None], 1000)
+    assert counts.tolist() == [[8.0]]
