@@ -7,7 +7,8 @@ from detections import EIGHT, TRUTH, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.rigid import perturb, transform, twist_between
+from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
+from mixpose.search.alignment import align_triples
 from mixpose.search.budget import LabelOptions, PeakOptions
 from mixpose.search.constraint import Constraint
 from mixpose.search.detections import sensor_detections
@@ -51,3 +52,27 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
     assert counts.tolist() == [[5.0]]
     counts, _ = count_inliers(images, EIGHT.means, None, TRUTH[None], 1000)
     assert counts.tolist() == [[8.0]]
+
+
+def test_triangles_are_brought_onto_their_images_by_the_motion_between_them() -> None:
+    corners = np.random.default_rng(1).uniform(-50, 50, (20, 3, 3))
+    images = transform(TRUTH, corners.reshape(-1, 3)).reshape(corners.shape)
+    found = align_triples(corners.transpose(1, 2, 0), images.transpose(1, 2, 0))
+    np.testing.assert_allclose(found, np.broadcast_to(TRUTH, found.shape), atol=1e-6)
+    # of an image whose first side is a little off, the least squares of all three corners are taken
+    bent = images.copy()
+    bent[:, 1] += 0.5
+    for T, here, there in zip(
+        align_triples(corners.transpose(1, 2, 0), bent.transpose(1, 2, 0)), corners, bent
+    ):
+        across = np.cross(there[1] - there[0], there[2] - there[0])
+        across /= np.linalg.norm(across)
+        off = np.linalg.norm(transform(T, here) - there)
+        for angle in (0.002, -0.002):
+            centre = there.mean(axis=0)
+            turn = (
+                from_parts(np.eye(3), centre)
+                @ from_rotation_vector(angle * across, np.zeros(3))
+                @ from_parts(np.eye(3), -centre)
+            )
+            assert np.linalg.norm(transform(turn @ T, here) - there) > off
