@@ -192,3 +192,30 @@ def test_a_profile_that_lies_below_zero_is_empty() -> None:
     assert Observation(GridPattern(noise, np.zeros(1), 1.0), 2.0).is_empty
     noise[0, 20] = 100.0
     assert not Observation(GridPattern(noise, np.zeros(1), 1.0), 2.0).is_empty
+
+
+def test_a_profile_whose_noise_cancels_keeps_the_size_of_its_noise() -> None:
+    values = np.zeros((1, 100), dtype=np.float32)
+    values[0, 40], values[0, 60:80] = 1.0, -0.0499
+    observed = Observation(GridPattern(values, np.array([0.0]), 0.1), 0.2)
+    density = observed.density(0.2, (np.array([3.0]), np.array([5.0])))
+    # the integral of absolute values is 2 · 0.1, of which the peak holds half
+    assert density.values.sum() * density.window.step == pytest.approx(0.5, rel=1e-2)
+
+
+def test_a_measurement_that_is_a_density_already_is_not_blurred_again() -> None:
+    v, u = np.mgrid[:61, :61] - 30.0
+    values = np.exp(-(u**2 + v**2) / (2 * 3.0**2)).astype(np.float32)
+    observed = Observation(GridPattern(values, np.array([-30.0, -30.0]), 1.0), 3.0, intrinsic=3.0)
+    for sigma in (3.0, 5.0):
+        assert observed.blur(sigma) == pytest.approx(np.sqrt(sigma**2 - 3.0**2))
+        assert observed.blur(sigma, matched=True) == pytest.approx(np.sqrt(2 * sigma**2 - 3.0**2))
+        # ⟨g, g⟩ of a Gaussian of standard deviation σ is 1/4πσ²
+        assert observed.energy(sigma) == pytest.approx(1 / (4 * np.pi * sigma**2), rel=1e-3)
+
+
+def test_the_energy_of_detections_falls_with_every_blur() -> None:
+    observed = Observation(PointPattern(np.array([[10.0, 10.0], [500.0, 20.0]]), np.ones(2)), 1.5)
+    for sigma in (1.5, 3.0, 6.0):
+        # two halves that do not overlap
+        assert observed.energy(sigma) == pytest.approx(2 * 0.25 / (4 * np.pi * sigma**2))

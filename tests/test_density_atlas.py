@@ -266,6 +266,22 @@ def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> Non
     assert points_only(several, STEPS_PER_SIGMA).values.nbytes < 1e6
 
 
+@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+def test_a_detection_is_drawn_well_beyond_where_features_are_met(steps: float) -> None:
+    # features are met within 1.55 standard deviations, and pull from farther away
+    points = far_apart(11, side=5)
+    atlas = points_only(points, steps)
+    for turn in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+        y = points + 2.4 * SIGMA * np.array([np.cos(turn), np.sin(turn)])
+        value, gradient = looked_up(atlas, y)
+        expected, slope = exact(points, y)
+        # 1/12 n² of second derivatives, which are at most 1/2 of the peak there along an axis
+        off = 2 / 12 / steps**2 * peak(len(points))
+        np.testing.assert_allclose(value, expected, atol=off)
+        np.testing.assert_allclose(gradient, slope, atol=2 * off / SIGMA)
+        assert expected.min() > 2 * off
+
+
 def test_where_nothing_is_drawn_the_density_is_zero() -> None:
     atlas = points_only(far_apart(10, side=3), STEPS_PER_SIGMA)
     outside = np.array([[-1e6, -1e6], [1e12, 3.0], [300.0, 300.0], [10 * SIGMA, 10 * SIGMA]])

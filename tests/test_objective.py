@@ -217,6 +217,41 @@ def test_the_matched_share_is_one_at_the_truth_and_what_clutter_leaves_of_it(
         assert share == pytest.approx(expected, rel=2e-3)
 
 
+def test_clutter_in_one_sensor_does_not_take_the_weight_from_its_features(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    clean = views_of(pinhole_cameras, paper_body, TRUTH, 2.0)
+    pattern = clean[1].observation.pattern
+    assert isinstance(pattern, PointPattern)
+    false = np.column_stack([np.arange(100) * 12.0, np.full(100, 1000.0)])
+    cluttered = PointPattern(np.concatenate([pattern.points, false]), np.ones(106))
+    views = [clean[0], View("1", pinhole_cameras[1], Observation(cluttered, 2.0))]
+    objective = matched_objective(views, paper_body, [2.0, 2.0], steps_per_sigma=FINE_STEPS)
+    # as many equal features as there are, per feature of the body: 6/6 and 106/6, of which the
+    # body explains all and 6/106
+    assert objective.weights[:, 0] == pytest.approx([1.0, 106 / 6], rel=1e-3)
+    assert objective.shares(TRUTH[None])[:, 0] == pytest.approx([1.0, 1.0], rel=4e-3)
+
+
+def test_a_pose_does_not_gain_by_features_that_leave_the_picture(
+    paper_body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    camera = pinhole_cameras[0]
+    y, _ = camera.project(transform(TRUTH, paper_body.means))
+    narrow = replace(camera, resolution=(int(np.sort(y[:, 0])[3]), 1024))
+    seen = narrow.project(transform(TRUTH, paper_body.means))[1]
+    count = int(seen.sum())
+    assert 0 < count < 6
+    observation = Observation(PointPattern(y[seen], np.ones(count)), 2.0)
+    objective = matched_objective(
+        [View("0", narrow, observation)], paper_body, [2.0], steps_per_sigma=FINE_STEPS
+    )
+    visible, whole = (objective.shares(TRUTH[None], whole=each)[0, 0] for each in (False, True))
+    # all that is in view is met: as many of six, where the others count as missed
+    assert visible == pytest.approx(count / 6, rel=4e-3)
+    assert whole == pytest.approx(count / 6 * count / 6, rel=4e-3)
+
+
 def test_far_away_on_one_bright_marker_the_paper_collapses_and_the_matched_does_not(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

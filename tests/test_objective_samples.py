@@ -109,6 +109,45 @@ def test_a_pose_that_is_nowhere_has_the_floor(rig: str, wrong: float) -> None:
     assert several[1] == 0.0
 
 
+def flat_density(lower: float, upper: float) -> Density:
+    """1 on a window that is larger than what the sensor measures."""
+    window = Window.around(np.full(2, lower), np.full(2, upper), 1.0)
+    return Density(np.ones((*window.shape, 3), dtype=np.float32), window, 2.0)
+
+
+def test_what_is_beside_the_picture_is_not_seen() -> None:
+    beam = ParallelBeam(1.0, np.array([50.0, 50.0]), (101, 101), np.eye(4))
+    term = SampledTerm(beam, flat_density(-30.0, 130.0))
+    # the picture begins half a pixel before 0 and ends half a pixel after 100
+    for place, expected in ((-60.0, 0.0), (-50.0, 1.0), (50.0, 1.0), (60.0, 0.0)):
+        for axis in (0, 1):
+            T = np.eye(4)
+            T[axis, 3] = place
+            objective = PaperObjective([term], np.zeros((1, 1, 3)))
+            assert float(objective.value(T)) == expected
+
+
+def test_a_body_behind_a_camera_is_not_seen_although_its_mirror_image_is() -> None:
+    K = np.array([[500.0, 0, 50], [0, 500.0, 50], [0, 0, 1]])
+    camera = PinholeCamera(K, resolution=(101, 101))
+    # what looks alike turned by half a turn about the axis has the same image from behind
+    samples = np.array([[[20.0, 10.0, 0.0], [-20.0, -10.0, 0.0]]])
+    objective = PaperObjective([SampledTerm(camera, flat_density(0.0, 100.0))], samples)
+    before, behind = np.eye(4), np.eye(4)
+    before[2, 3], behind[2, 3] = 500.0, -500.0
+    assert objective.value(np.stack([before, behind])) == pytest.approx([1.0, 0.0])
+
+
+@pytest.mark.parametrize("count", [16385, 16387, 40001])
+def test_samples_that_do_not_fill_blocks_count_once(count: int) -> None:
+    beam = ParallelBeam(1.0, np.array([50.0, 50.0]), (101, 101), np.eye(4))
+    samples = np.full((1, count, 3), 1e3)
+    samples[0, -1] = 0.0  # only the last is seen
+    objective = PaperObjective([SampledTerm(beam, flat_density(0.0, 100.0))], samples)
+    poses = np.stack([np.eye(4)] * 3)
+    assert objective.value(poses) == pytest.approx([1 / count] * 3, rel=1e-6)
+
+
 def test_no_poses_have_no_values() -> None:
     samples = np.zeros((1, 4, 3))
     objective = PaperObjective(densities(RIGS["parallel"], samples), samples)

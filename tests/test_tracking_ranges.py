@@ -11,7 +11,8 @@ from scipy.special import chdtri
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import EstimatorOptions
+from mixpose.fit import EstimatorOptions, Fit
+from mixpose.judgement import JudgementRules, Noise, NoiseModel
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
@@ -22,12 +23,15 @@ from mixpose.rigid import (
     twist_between,
 )
 from mixpose.sensors import RangeSensor
-from mixpose.tracking import Tracker
+from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.association_likelihood import (
     _summed,
     are_associated,
     sum_associations,
 )
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.range_posterior import noise_ratio
+from mixpose.tracking.range_rules import RangeRules
 
 Floats = NDArray[np.float64]
 
@@ -100,6 +104,48 @@ def test_the_sum_over_associations_is_that_of_all_of_them() -> None:
     more[:, 1, 2] *= 1 + 1e-6
     slope = np.log(_summed(more)[0] / total) / 1e-6
     assert shares[:, 1, 2] == pytest.approx(slope, rel=1e-4)
+
+
+def test_the_odds_of_one_tag_in_false_ranges_are_those_of_the_formula() -> None:
+    tag = Body("tag", (PointFeature(np.array([0.2, 0.0, 0.0])), PointFeature(np.zeros(3))))
+    normals = np.array([[0, 0, 1.0], [0, 0, -1.0]])
+    tag = Body("tag", tag.features, normals)  # the second faces away from the anchor
+    anchor = RangeSensor(np.array([0.0, 0.0, 3.0]))
+    true = float(np.hypot(0.2, 3.0))
+    found = np.array([true + SIGMA, true - 2 * SIGMA, 5.0])
+    view = View("a", anchor, Observation(PointPattern(found[:, None], np.ones(3)), SIGMA))
+    clutter, room = 3 - 0.75, max(20 * tag.radius, 20 * SIGMA)
+    # L = Σ_λ Π_met P_D N Π_missed (1 − P_D) Π_rest c/W of Poisson clutter, over c = 3 alone
+    bells = np.exp(-0.5 * np.array([1.0, 4.0, ((5 - true) / SIGMA) ** 2]))
+    bells /= np.sqrt(2 * np.pi) * SIGMA
+    expected = 3 * np.log(clutter / 3) + 3 - clutter
+    expected += np.log(0.25 + 0.75 * bells.sum() * room / clutter)
+    odds = sum_associations([view], tag, np.eye(4)[None]).log_odds[0]
+    assert odds == pytest.approx(expected)
+
+
+def test_ranges_err_by_more_than_said_where_residuals_say_so() -> None:
+    # twenty degrees of freedom at 1 and twenty at 4
+    assert noise_ratio(Noise(80.0, 20.0), RangeRules()) == pytest.approx(np.sqrt(2.5))
+    assert noise_ratio(Noise(1.0, 20.0), RangeRules()) == 1.0
+
+
+def test_directions_that_ranges_leave_open_are_as_uncertain_as_anywhere() -> None:
+    options = EstimatorOptions(free=("x", "y", "rz"))
+    views = views_at(np.eye(4), np.random.default_rng(7))[:1]
+    covariances = []
+    for confidence in (0.0, 0.95):
+        noise = JudgementRules(noise=NoiseModel(confidence=confidence))
+        rules = Rules(judgement=noise)
+        tracker = Tracker.create(TROLLEY, options, np.eye(4), rules=rules)
+        data = tracker.data(tracker.begin(), 0, None, views)
+        judged = likelihood_of(data).judge(Fit(np.eye(4), 0.0, True, 0), Start(np.eye(4)))
+        covariances.append(np.diag(judged.covariance)[list(FREE)])
+    # one anchor: within ten radii, and turned anyhow
+    room = np.array([10 * TROLLEY.radius, 10 * TROLLEY.radius, np.pi])
+    assert (np.sqrt(covariances[0]) <= room * (1 + 1e-9)).all()
+    # σ_ε counts as known from 20 residuals: tables have 3.098 for F of 3 and 20, 7.815 for χ² of 3
+    assert covariances[1] / covariances[0] == pytest.approx([3 * 3.098 / 7.815] * 3, rel=1e-3)
 
 
 def test_the_gradient_of_the_likelihood_is_its_slope() -> None:

@@ -51,12 +51,36 @@ TESTS: dict[str, tuple[str, ...]] = {
     "simulation": ("test_simulation_*.py",),
     "checking": ("test_check_*.py",),
     "runner": ("test_runner_*.py",),
-    "density": ("test_density*.py",),
-    "objective": ("test_objective*.py",),
-    "search": ("test_search_*.py",),
-    "fit": ("test_fit*.py",),
-    "judgement": ("test_judgement.py", "test_tracking*.py"),
-    "tracking": ("test_tracking*.py", "test_runner_*.py"),
+    "density": (
+        "test_density_met.py",
+        "test_density_atlas.py",
+        "test_density*.py",
+        "test_tracking_outliers.py",
+    ),
+    "objective": ("test_objective_kernel.py", "test_objective*.py"),
+    "search": (
+        "test_search_evidence.py",
+        "test_search_detections.py",
+        "test_search_[!p]*.py",
+        "test_search_*.py",
+    ),
+    "fit": ("test_fit_*.py", "test_fit*.py"),
+    "judgement": (
+        "test_judgement*.py",
+        "test_tracking_outliers.py",
+        "test_tracking_starts.py",
+        "test_tracking.py",
+    ),
+    "tracking": (
+        "test_tracking_track.py",
+        "test_tracking_gating.py",
+        "test_tracking_starts.py",
+        "test_tracking_delays.py",
+        "test_tracking_outliers.py",
+        "test_tracking_ranges.py",
+        "test_tracking*.py",
+        "test_runner_*.py",
+    ),
 }
 
 # A mutant may make the code go on for ever: then it counts as noticed.

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from mutation import edge, files, geometry, images, recordings
+from mutation import (
+    densities,
+    edge,
+    estimating,
+    files,
+    following,
+    geometry,
+    images,
+    recordings,
+)
 from mutation.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
     *geometry.MUTANTS,
     *images.MUTANTS,
     *recordings.MUTANTS,
+    *densities.MUTANTS,
+    *estimating.MUTANTS,
+    *following.MUTANTS,
     *files.MUTANTS,
     *edge.MUTANTS,
 )

@@ -1,0 +1,87 @@
+"""Where features are looked for while a body is tracked, and when that was not enough."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detections import view_of
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.rigid import from_parts
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Expectation, Prediction, are_as_good, have_fewer, is_convincing
+from mixpose.tracking.track import SensorTally
+
+Floats = NDArray[np.float64]
+
+FREE = np.ones(6, dtype=np.bool_)
+CAMERA = PinholeCamera(
+    np.array([[900.0, 0, 640], [0, 900, 512], [0, 0, 1]]), np.zeros(0), (1280, 1024)
+)
+SURE = np.full(6, 1e-9)
+
+
+def body_of(*points: tuple[float, float, float], normals: Floats | None = None) -> Body:
+    return Body("some", tuple(PointFeature(np.array(point)) for point in points), normals)
+
+
+def window(body: Body, *places: tuple[float, float, float]) -> tuple[int, int, int, int]:
+    predictions = [Prediction(from_parts(np.eye(3), place), SURE, 1.0) for place in places]
+    return Expectation(body, {"0": CAMERA}, FREE).windows(predictions)["0"]
+
+
+def test_around_features_close_together_there_is_room_for_a_spot_and_its_ground() -> None:
+    # 4 mm at 500 mm: 3.6 px to either side of the middle
+    found = window(body_of((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0)), (0.0, 0.0, 500.0))
+    np.testing.assert_allclose(found, (596, 472, 685, 553), atol=1)  # whole pixels
+
+
+def test_around_features_far_apart_there_is_room_for_their_images() -> None:
+    # 100 mm at 500 mm: images of up to 50 mm to either side, 90 px, in any direction √2 · 90 px
+    found = window(body_of((-50.0, 0.0, 0.0), (50.0, 0.0, 0.0)), (0.0, 0.0, 500.0))
+    expected = (640 - 90 - 127, 512 - 127, 640 + 90 + 127 + 1, 512 + 127 + 1)
+    np.testing.assert_allclose(found, expected, atol=2)
+
+
+def test_a_window_holds_all_places_where_the_body_may_be() -> None:
+    body = body_of((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0))
+    left, right = (-100.0, 0.0, 500.0), (100.0, 50.0, 500.0)
+    one, other = window(body, left), window(body, right)
+    both = (*np.minimum(one, other)[:2].tolist(), *np.maximum(one, other)[2:].tolist())
+    assert window(body, left, right) == both
+    assert window(body, right, left) == both
+
+
+def test_features_that_a_camera_does_not_see_have_no_part_in_its_window() -> None:
+    # the third is beyond the left border, the fourth turns its back
+    points = ((-2.0, 0.0, 0.0), (2.0, 0.0, 0.0), (-500.0, 0.0, 0.0), (-200.0, 0.0, 0.0))
+    normals = np.array([[0, 0, -1.0], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
+    found = window(body_of(*points, normals=normals), (0.0, 0.0, 500.0))
+    np.testing.assert_allclose(found, (596, 472, 685, 553), atol=1)  # whole pixels
+
+
+@pytest.mark.parametrize(("count", "fewer"), [(7, True), (8, False), (9, False)])
+def test_fewer_detections_than_were_met_are_noticed(count: int, fewer: bool) -> None:
+    before = {"0": SensorTally(8, 8, 0.0, 0.0)}
+    views = [view_of("0", CAMERA, np.zeros((count, 2)))]
+    assert have_fewer(views, before) is fewer
+    assert have_fewer(views, {}) is False
+
+
+def test_a_sensor_that_misses_one_more_is_not_as_good() -> None:
+    before = {"0": SensorTally(7, 8, 1.0, 0.0)}
+    assert are_as_good({"0": SensorTally(7, 8, 1.0, 0.0)}, before)
+    assert not are_as_good({"0": SensorTally(6, 8, 2.0, 0.0)}, before)
+    assert are_as_good({"1": SensorTally(0, 8, 8.0, 0.0)}, before)
+
+
+def test_a_covered_camera_does_not_count_where_two_others_agree() -> None:
+    tallies = {
+        "0": SensorTally(8, 8, 0.0, 0.0),
+        "1": SensorTally(7, 8, 1.0, 0.0),
+        "2": SensorTally(1, 8, 7.0, 0.0),
+    }
+    assert is_convincing(tallies, ["0", "1", "2"], 0.75)
+    # of 16 features 9 are met
+    assert not is_convincing(tallies, ["0", "2"], 0.75)

@@ -1,0 +1,173 @@
+"""What is known between frames: predictions and how wide they are, velocities, surprises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.fit import EstimatorOptions
+from mixpose.judgement import AcceptanceRules, DetectionModel, Noise, flat_prior, judge
+from mixpose.objective import matched_objective
+from mixpose.rigid import perturb, transform, twist_between
+from mixpose.search import SearchState
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Prediction, Track, Tracker, predict
+from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.track import Branch, Found, follow, prior_of
+
+Floats = NDArray[np.float64]
+
+RULES = MotionRules()
+MODEL = DetectionModel()
+NARROW = np.repeat([0.5, np.radians(1.0)], 3)
+VELOCITY = np.array([10.0, -20.0, 5.0, 0.1, -0.2, 0.3])
+
+
+def branch(T: Floats = TRUTH, velocity: Floats | None = None) -> Branch:
+    return Branch(T, 1.0, velocity, NARROW)
+
+
+def moved(frame: float) -> Floats:
+    return perturb(np.eye(4), frame * np.array([5.0, 0, 0, 0, 0, 0]))
+
+
+def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
+    found = [Found(T, 1.0 / len(places)) for T in places]
+    return follow(track, EIGHT, found, frame, time_s, Noise(), {}, RULES)
+
+
+def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
+    predictions = [Prediction(TRUTH, NARROW, 1.0)]
+    prior = prior_of(T, predictions, body, ALL_FREE, misses, RULES, MODEL)
+    return prior.log_density, prior.spread
+
+
+def test_a_body_that_moves_is_predicted_where_its_velocity_takes_it() -> None:
+    track = Track((branch(velocity=VELOCITY),), frame=7, time_s=2.0)
+    (prediction,) = predict(track, EIGHT, 8, 2.1)
+    assert twist_between(TRUTH, prediction.T_world_object) == pytest.approx(0.1 * VELOCITY)
+
+
+@pytest.mark.parametrize(("misses", "frames"), [(5, 6), (6, 0)])
+def test_a_velocity_is_believed_for_five_frames_without_a_pose(misses: int, frames: int) -> None:
+    track = Track((branch(velocity=VELOCITY / 100),), frame=7, misses=misses)
+    (prediction,) = predict(track, EIGHT, 13, None)
+    expected = frames * VELOCITY / 100
+    assert twist_between(TRUTH, prediction.T_world_object) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize(("misses", "wider"), [(0, 1.0), (2, 2.25), (20, 12.0)])
+def test_a_prediction_widens_with_every_frame_without_a_pose(misses: int, wider: float) -> None:
+    track = Track((branch(),), frame=0)
+    for _ in range(misses):
+        track = track.missed(SearchState())
+    # by half each, then to four times and a tenth of that more for each
+    (prediction,) = predict(track, EIGHT, 1, None)
+    assert prediction.uncertainty == pytest.approx(wider * NARROW)
+
+
+def test_a_pose_far_from_every_prediction_is_a_surprise_that_grows_with_the_wait() -> None:
+    elsewhere = perturb(TRUTH, np.repeat([80.0, 0.7], 3))
+    flat = flat_prior(EIGHT, ALL_FREE, MODEL)
+    for misses, surprise in ((0, 0.02), (4, 0.1)):
+        log_density, spread = prior_near(elsewhere, misses)
+        assert log_density == pytest.approx(np.log(surprise) + flat.log_density)
+        np.testing.assert_allclose(spread, flat.spread)
+
+
+def test_at_a_prediction_directions_that_are_open_are_as_uncertain_as_predicted() -> None:
+    log_density, spread = prior_near(TRUTH)
+    # a normal distribution, and next to nothing of anywhere
+    peak = np.log(0.98) - np.log(NARROW * np.sqrt(2 * np.pi)).sum()
+    assert log_density == pytest.approx(peak, abs=1e-3)
+    np.testing.assert_allclose(spread, NARROW)
+
+
+def test_one_detection_where_a_feature_is_predicted_is_no_pose(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    y = pinhole_cameras[0].project(transform(TRUTH, EIGHT.means))[0]
+    views = [view_of("0", pinhole_cameras[0], y[:1])]
+    predictions = [Prediction(TRUTH, NARROW, 1.0)]
+    prior = prior_of(TRUTH, predictions, EIGHT, ALL_FREE, 0, RULES, MODEL)
+    judged = judge(matched_objective(views, EIGHT, [1.5]), TRUTH, ALL_FREE, prior=prior)
+    # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
+    assert judged.log_evidence < 7 * np.log(0.25) + 10
+    assert judged.log_evidence < AcceptanceRules().possible
+
+
+def test_a_symmetric_body_is_where_it_was_predicted_whichever_way_it_is_turned() -> None:
+    corners = ((50.0, 50.0, 0.0), (-50.0, 50.0, 0.0), (-50.0, -50.0, 0.0), (50.0, -50.0, 0.0))
+    square = Body("square", tuple(PointFeature(np.array(corner)) for corner in corners))
+    assert len(square.symmetries) > 3
+    expected, _ = prior_near(TRUTH, body=square)
+    for symmetry in square.symmetries:
+        assert prior_near(TRUTH @ symmetry, body=square)[0] == pytest.approx(expected)
+
+
+def test_a_velocity_is_per_second_and_steadied_over_two_steps() -> None:
+    track = followed(Track(), [moved(0)], 0, 0.0)
+    assert track.branches[0].velocity is None
+    track = followed(track, [moved(1)], 1, 0.1)
+    assert track.branches[0].velocity == pytest.approx([50.0, 0, 0, 0, 0, 0])
+    track = followed(track, [moved(3)], 2, 0.2)
+    assert track.branches[0].velocity == pytest.approx([100.0, 0, 0, 0, 0, 0])
+    assert track.branches[0].steady == pytest.approx([75.0, 0, 0, 0, 0, 0])
+    # it moved by 5 more than expected: as much may happen again, in any direction
+    assert track.branches[0].uncertainty[:3] == pytest.approx([5.0] * 3)
+    least = RULES.steady_distance * EIGHT.radius
+    steady = followed(track, [moved(5)], 3, 0.3)
+    assert steady.branches[0].uncertainty[:3] == pytest.approx([least] * 3)
+
+
+def test_of_two_places_where_a_body_may_be_each_goes_on_by_itself() -> None:
+    there = perturb(np.eye(4), np.array([0.0, 300.0, 0.0, 0.0, 0.0, 0.0]))
+    track = followed(Track(), [moved(0), there], 0, 0.0)
+    track = followed(track, [there, moved(1)], 1, 0.1)
+    assert track.branches[0].velocity == pytest.approx(np.zeros(6), abs=1e-9)
+    assert track.branches[1].velocity == pytest.approx([50.0, 0, 0, 0, 0, 0])
+
+
+def test_a_walk_grows_with_time_and_turns_although_only_shifts_were_seen() -> None:
+    walk = RandomWalk(np.zeros(6), 0.0, RULES)
+    walk = walk.joined(np.array([4.0, 0, 0, 0, 0, 0]), radius=100.0, elapsed=0.5)
+    # 4 in half a second: 32 per second, 1.5 times as much as errors of prediction add up; turns
+    # move the rim by a quarter of that
+    assert walk.variance(1.0)[:3] == pytest.approx([48.0] * 3)
+    assert walk.variance(1.0)[3:] == pytest.approx([0.25 * 48.0 / 100**2] * 3)
+    assert walk.variance(0.25) == pytest.approx(walk.variance(1.0) / 4)
+
+
+def test_the_noise_of_an_ambiguous_frame_is_not_remembered(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    places = ((0.0, 0.0, 0.0), (50.0, 0.0, 0.0), (90.0, 0.0, 0.0))
+    wand = Body("wand", tuple(PointFeature(np.array(place)) for place in places))
+    tracker = Tracker.create(wand, EstimatorOptions(), TRUTH)
+    views = detect(pinhole_cameras, wand, TRUTH, noise=0.2)
+    track, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
+    assert estimate.status == "ambiguous"
+    assert track.noise == Noise()
+
+
+def test_a_sure_frame_has_no_rivals_and_its_noise_is_remembered(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.2)
+    track, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
+    assert estimate.status == "ok"
+    assert estimate.hypotheses == ()
+    # 2 · 8 · 2 coordinates, six of which the pose has used up
+    assert track.noise.degrees == pytest.approx(26)
+
+
+def test_a_start_may_be_as_far_off_as_is_said() -> None:
+    said = Tracker.create(EIGHT, EstimatorOptions(), TRUTH, distance=7.0, rotation_deg=20.0)
+    assert said.start_uncertainty == pytest.approx(np.repeat([7.0, np.radians(20.0)], 3))
+    unsaid = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    expected = np.repeat([0.1 * EIGHT.radius, np.radians(5.0)], 3)
+    assert unsaid.start_uncertainty == pytest.approx(expected)

@@ -1,0 +1,396 @@
+"""Mutants of `fit` and `judgement`."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_PRIOR = "test_fit_prior.py"
+
+_NEAR = (
+    Mutant(
+        "fit-blurs-from-fine-to-coarse",
+        "fit/blur_schedule.py",
+        "for k in range(count, -1, -1)]",
+        "for k in range(count + 1)]",
+        "fits end at the coarsest blur",
+    ),
+    Mutant(
+        "fit-blurs-whatever-the-uncertainty",
+        "fit/blur_schedule.py",
+        "at.J[:, 0] ** 2 @ uncertainty**2",
+        "at.J[:, 0] ** 2 @ (0 * uncertainty)",
+        "a start that is far off is looked for at the finest blur alone",
+    ),
+    Mutant(
+        "fit-blurs-wider-than-the-picture",
+        "fit/blur_schedule.py",
+        "widest: float = constant(\n        0.1,",
+        "widest: float = constant(\n        10.0,",
+        "descents begin where everything is one blob",
+    ),
+    Mutant(
+        "fit-always-at-the-finest-blur",
+        "fit/near.py",
+        "if here.value >= rules.near * len(views):",
+        "if here.value >= 0.0:",
+        "a start some widths off is never corrected",
+    ),
+    Mutant(
+        "fit-prior-around-the-answer",
+        "fit/near.py",
+        "Prior(T_start, uncertainty, free)",
+        "Prior(T, uncertainty, free)",
+        "what is known of the start does not count",
+    ),
+)
+
+_PROBABLE = (
+    Mutant(
+        "fit-start-ignored",
+        "fit/prior.py",
+        "return np.where(self.free, 1 / np.where(self.free, self.uncertainty, 1.0) ** 2, 0.0)",
+        "return np.zeros(6)",
+        "what is known of the start does not count",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-start-repels",
+        "fit/prior.py",
+        "one.gradient - information * away",
+        "one.gradient + information * away",
+        "the gradient of the prior has the wrong sign",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-first-maximum-is-the-best",
+        "fit/prior.py",
+        "return bool(self.shares.min() > 0.5)",
+        "return True",
+        "under heavy noise the next peak is taken for the highest",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-starts-too-close",
+        "fit/prior.py",
+        "steps = np.sqrt(count) * np.diag(",
+        "steps = np.diag(",
+        "other maxima are sought within less than the prior allows",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-likelihood-twice-as-sure",
+        "fit/prior.py",
+        "weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]",
+        "weights = (objective.energies[:, 0] / (misfit * noise))[:, None]",
+        "the data outweigh the prior by twice what their noise allows",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-misfit-not-in-the-noise",
+        "fit/prior.py",
+        "weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]",
+        "weights = (0.5 * objective.energies[:, 0] / noise)[:, None]",
+        "a body that does not fit is believed as one that does",
+        (_PRIOR,),
+    ),
+    Mutant(
+        "fit-noise-of-all-the-energy",
+        "fit/prior.py",
+        "np.maximum(1 - shares, 1e-9) * energies / cells",
+        "energies / cells",
+        "what the body explains counts as noise",
+        (_PRIOR,),
+    ),
+)
+
+_MISFIT = (
+    Mutant(
+        "fit-every-body-fits",
+        "fit/misfit.py",
+        "return statistic / freedom",
+        "return 1.0",
+        "a deformed body pulls the pose where its features happen to fit",
+    ),
+    Mutant(
+        "fit-amplitudes-are-free",
+        "fit/misfit.py",
+        "freedom += rest.size - 1",
+        "freedom += rest.size",
+        "a misfit is divided by coordinates that the fit has used up",
+    ),
+    Mutant(
+        "fit-misfit-in-units-of-the-sensor",
+        "fit/misfit.py",
+        "here[:, 1:] *= np.sqrt(self.variance)",
+        "here[:, 1:] *= self.variance",
+        "whether a body fits depends on the unit of its sensor",
+    ),
+    Mutant(
+        "fit-neighbours-are-misfit",
+        "fit/misfit.py",
+        "return here - height * mixture, height",
+        "return here - height * np.eye(len(y), here.shape[1])[:, :1], height",
+        "features that overlap seem not to fit",
+    ),
+    Mutant(
+        "fit-own-peaks-left",
+        "fit/free_features.py",
+        "y = y + np.sqrt(sensor.variance) / height * rest[:, 1:]",
+        "y = y - np.sqrt(sensor.variance) / height * rest[:, 1:]",
+        "freed features leave their peaks",
+    ),
+    Mutant(
+        "fit-features-go-to-the-farthest-place",
+        "fit/free_features.py",
+        "labels.append(tuple(linear_sum_assignment(costs)[1].tolist()))",
+        "labels.append(tuple(linear_sum_assignment(-costs)[1].tolist()))",
+        "places of features are mixed up",
+    ),
+    Mutant(
+        "fit-any-assignment-is-believed",
+        "fit/free_features.py",
+        "return best.T if ((others / best.squares) ** (-0.5 * redundant)).sum() < 1 else None",
+        "return best.T",
+        "a pose is told although two places might be each other's",
+    ),
+    Mutant(
+        "fit-lower-peaks-do-not-count",
+        "fit/free_features.py",
+        "return y if others < 0.5 * height < sensor.density(y)[:, 0].min() else None",
+        "return y",
+        "features without a peak of their own are freed",
+    ),
+)
+
+_NOISE = (
+    Mutant(
+        "judgement-few-residuals-are-as-good-as-many",
+        "judgement/noise.py",
+        "return float(directions * tail / chdtri(directions, 1 - self.confidence))",
+        "return 1.0",
+        "covariances of few features are too small",
+    ),
+    Mutant(
+        "judgement-noise-of-earlier-frames-forgotten",
+        "judgement/noise.py",
+        "memory: float = constant(0.95,",
+        "memory: float = constant(0.0,",
+        "covariances change from frame to frame with the residuals of single frames",
+    ),
+    Mutant(
+        "judgement-noise-of-another-kind-joined",
+        "judgement/noise.py",
+        "return frame.variance > limit * self.variance",
+        "return False",
+        "a frame of large residuals is as sure as those before it",
+    ),
+    Mutant(
+        "judgement-noise-with-the-coordinates-used-up",
+        "judgement/noise.py",
+        "degrees = max(measurements - int(free.sum()), 0.0)",
+        "degrees = max(measurements, 0.0)",
+        "noise seems smaller than it is",
+    ),
+    Mutant(
+        "judgement-information-in-sigmas",
+        "judgement/noise.py",
+        "one.shares / one.sigma**2",
+        "one.shares / one.sigma",
+        "covariances depend on the unit of a sensor",
+    ),
+    Mutant(
+        "judgement-unknown-noise-is-sigma",
+        "judgement/noise.py",
+        "noise.variance if noise.degrees >= 1 else model.typical**2",
+        "noise.variance if noise.degrees >= 1 else 0.0",
+        "three features in one camera have an exact pose",
+    ),
+)
+
+_EVIDENCE = (
+    Mutant(
+        "judgement-misses-are-free",
+        "judgement/evidence.py",
+        "return math.log(1 - self.probability)",
+        "return 0.0",
+        "a pose that misses half of the body is as good as one that meets it",
+    ),
+    Mutant(
+        "judgement-out-of-view-is-free",
+        "judgement/evidence.py",
+        "missed += one.unseen * detection.log_unseen",
+        "missed += one.unseen * 0.0",
+        "a pose gains by moving features out of the picture",
+    ),
+    Mutant(
+        "judgement-clutter-of-any-density",
+        "judgement/evidence.py",
+        "density = one.sigma**m * one.crowd *",
+        "density = one.sigma**m * 1e-6 *",
+        "poses in clutter are as sure as poses without",
+    ),
+    Mutant(
+        "judgement-choices-cost-nothing",
+        "judgement/evidence.py",
+        "return ways + assigned + math.log(2)",
+        "return math.log(2)",
+        "among many detections some pose is sure to be found by chance",
+    ),
+    Mutant(
+        "judgement-offsets-cost-nothing",
+        "judgement/evidence.py",
+        "gain - one.squared / (2 * variance)",
+        "gain - 0 * one.squared",
+        "a pose that meets features loosely is as good as one that meets them",
+    ),
+    Mutant(
+        "judgement-volume-of-the-other-sign",
+        "judgement/evidence.py",
+        "len(inner) * math.log(2 * math.pi) - _log_det(inner))",
+        "len(inner) * math.log(2 * math.pi) + _log_det(inner))",
+        "poses that are known well count as known badly",
+    ),
+    Mutant(
+        "judgement-prediction-does-not-count",
+        "judgement/evidence.py",
+        "by_volume = gained + missed + laplace + prior.log_density",
+        "by_volume = gained + missed + laplace",
+        "a pose far from its prediction is as good as one near it",
+    ),
+    Mutant(
+        "judgement-features-that-fix-the-pose-count",
+        "judgement/evidence.py",
+        "by_count = gained * _redundant(associations, free) + missed",
+        "by_count = gained + missed",
+        "three features in one camera, which fit whatever they are, are evidence",
+    ),
+)
+
+_ACCEPTANCE = (
+    Mutant(
+        "judgement-rivals-never-count",
+        "judgement/acceptance.py",
+        "rival: float = constant(0.01,",
+        "rival: float = constant(2.0,",
+        "of two poses that fit alike one is called sure",
+    ),
+    Mutant(
+        "judgement-rivals-count-when-it-is-too-late",
+        "judgement/acceptance.py",
+        "rival: float = constant(0.01,",
+        "rival: float = constant(0.3,",
+        "a frame with a rival of one in ten is called sure",
+    ),
+    Mutant(
+        "judgement-sure-by-chance",
+        "judgement/acceptance.py",
+        "sure: float = constant(\n        7.0,",
+        "sure: float = constant(\n        1.0,",
+        "one pose in four of mere clutter is called sure",
+    ),
+    Mutant(
+        "judgement-open-turns-are-sure",
+        "judgement/acceptance.py",
+        "return bool(turns.max() < _OPEN_TURN**2)",
+        "return True",
+        "the turn about a line of features is called sure",
+    ),
+    Mutant(
+        "judgement-wide-turns-are-sure",
+        "judgement/acceptance.py",
+        "return bool(1.96 * judged.spread[3:].max() < np.radians(rules.widest_turn_deg))",
+        "return True",
+        "ranges that leave the turn open are called sure",
+        ("test_tracking_ranges.py",),
+    ),
+    Mutant(
+        "judgement-doubtful-without-coverage",
+        "judgement/acceptance.py",
+        "doubtful = judged.coverage >= rules.doubtful_coverage",
+        "doubtful = True",
+        "poses that meet two features in clutter are told",
+    ),
+    Mutant(
+        "judgement-too-few-coordinates-fix-a-pose",
+        "judgement/acceptance.py",
+        "enough = judged.measurements >= int(free.sum())",
+        "enough = True",
+        "a pose is told that the data do not fix",
+    ),
+    Mutant(
+        "judgement-symmetric-poses-are-rivals",
+        "judgement/acceptance.py",
+        "T_b = nearest_alike(b.T_world_object, body, T_a)",
+        "T_b = b.T_world_object",
+        "a symmetric body is its own rival",
+    ),
+    Mutant(
+        "judgement-anything-convinces",
+        "judgement/acceptance.py",
+        "return share > rules.convincing and is_sure(judged, free, rules)",
+        "return is_sure(judged, free, rules)",
+        "a body that slipped by a step of its grid is not looked for elsewhere",
+    ),
+    Mutant(
+        "judgement-a-covered-sensor-makes-doubt",
+        "judgement/acceptance.py",
+        "if len(agreeing) > 1 else judged.coverage",
+        "if len(agreeing) > 99 else judged.coverage",
+        "a covered camera makes every frame slow",
+    ),
+    Mutant(
+        "judgement-worse-twin-kept",
+        "judgement/acceptance.py",
+        "if new.log_evidence > old.log_evidence:",
+        "if new.log_evidence < old.log_evidence:",
+        "of two fits that are one pose the worse is told",
+    ),
+)
+
+_JUDGE = (
+    Mutant(
+        "judgement-symmetry-ignored",
+        "judgement/judge.py",
+        "if len(body.symmetries) == 1:",
+        "if len(body.symmetries) >= 1:",
+        "a symmetric body jumps between poses that look the same",
+    ),
+    Mutant(
+        "judgement-most-turned-twin",
+        "judgement/judge.py",
+        "alike[int(np.argmax(traces))]",
+        "alike[int(np.argmin(traces))]",
+        "of poses that look the same the farthest is told",
+    ),
+    Mutant(
+        "judgement-all-poses-believed-alike",
+        "judgement/judge.py",
+        "weights = np.exp(logs - logs.max())",
+        "weights = np.ones(len(logs))",
+        "evidence does not tell poses apart",
+    ),
+    Mutant(
+        "judgement-merged-features-move-as-one",
+        "judgement/association.py",
+        "np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)",
+        "np.where(paired[:, None, None], J, J)",
+        "the middle of two features moves as if it were one of them",
+        ("test_tracking_outliers.py",),
+    ),
+    Mutant(
+        "judgement-out-of-view-is-covered",
+        "judgement/association.py",
+        "max(self.expected + self.unseen, 1e-12)",
+        "max(self.expected, 1e-12)",
+        "a body half out of the picture convinces",
+    ),
+    Mutant(
+        "judgement-ranges-have-two-coordinates",
+        "judgement/association.py",
+        "return self.met * int(self.J.shape[1])",
+        "return self.met * 2",
+        "ranges seem to fix poses that they leave open",
+    ),
+)
+
+MUTANTS = (*_NEAR, *_PROBABLE, *_MISFIT, *_NOISE, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
