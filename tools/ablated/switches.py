@@ -105,7 +105,7 @@ SWITCHES = (
     Switch("no fusion of ranges", unfused),
     Switch("noise: no memory", ruled("judgement.noise", memory=0.0)),
     Switch("noise: no outdone", ruled("judgement.noise", known=NEVER)),
-    Switch("noise: no typical", ruled("judgement.noise", typical_degrees=0.0)),
+    Switch("noise: no typical", ruled("judgement.noise", typical_degrees=1e-3)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),
@@ -113,6 +113,4 @@ SWITCHES = (
     Switch("rivals not counted", ruled("acceptance", rival=2.0)),
     Switch("any turn sure", ruled("acceptance", widest_turn_deg=NEVER)),
     Switch("nothing doubtful told", ruled("acceptance", doubtful_coverage=2.0)),
-    Switch("candidates not fitted", ruled("proposals", outdone=-NEVER)),
-    Switch("candidates all fitted", ruled("proposals", outdone=NEVER)),
 )

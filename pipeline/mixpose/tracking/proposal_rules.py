@@ -23,9 +23,6 @@ class ProposalRules:
         "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
         "at which drawn ones are scored; one that was searched for, by its square",
     )
-    outdone: float = constant(
-        10.0, "log odds by which a candidate of the search may be behind to be fitted: e^-10"
-    )
     flat: float = constant(
         0.15, "thickness of a body against its smaller width below which it may be tilted"
     )

@@ -32,10 +32,8 @@ def candidates_of(data: FrameData) -> list[Candidate]:
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
-    """Candidates as they are and, unless far behind, fitted."""
+    """Candidates as they are, and fitted."""
     close = data.start_uncertainty / data.rules.proposals.narrowing**2
     for candidate in candidates:
         yield Start(candidate.T_world_object)
-        # far worse ones are rivals in name only
-        if candidate.evidence > candidates[0].evidence - data.rules.proposals.outdone:
-            yield Start(candidate.T_world_object, close)
+        yield Start(candidate.T_world_object, close)
