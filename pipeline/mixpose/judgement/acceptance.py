@@ -57,6 +57,9 @@ class AcceptanceRules:
     same_peak: float = constant(
         9.0, "squared distance in standard deviations below which uncertain poses are one"
     )
+    same_peak_deg: float = constant(
+        5.0, "turn above which they are two all the same: another tilt of a small flat body"
+    )
 
 
 @dataclass(frozen=True)
@@ -157,7 +160,13 @@ def _alike(
         away = twist_between(T_a, T_b)[free]
         widest = (a.covariance + b.covariance)[np.ix_(free, free)]
         return bool(away @ np.linalg.solve(widest, away) < rules.same_peak)
+    turned = float(rotation_angle_deg(T_a, T_b))
     centre = np.append(body.means.mean(axis=0), 1.0)
     apart = float(np.linalg.norm((T_a - T_b) @ centre))
-    near = apart < rules.same_distance * body.radius
-    return near and float(rotation_angle_deg(T_a, T_b)) < rules.same_rotation_deg
+    if apart < rules.same_distance * body.radius and turned < rules.same_rotation_deg:
+        return True
+    # one peak, of which one of the two is not the top: as in depth, seen by one camera
+    better = a if a.log_evidence >= b.log_evidence else b
+    away = twist_between(T_a, T_b)[free]
+    inside = away @ np.linalg.solve(better.covariance[np.ix_(free, free)], away) < rules.same_peak
+    return bool(inside and turned < rules.same_peak_deg)

@@ -103,7 +103,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
 def densities_picture(
     view: View, body: Body, T: Floats | None, sigmas: Sequence[float], room: Size, columns: int
 ) -> Picture:
-    """The densities of one camera that the estimator looks up, blur by blur, in panels."""
+    """C of one camera, g blurred once more, as the estimator looks it up, blur by blur."""
     if len(sigmas) > _MOST_LEVELS:
         keep = np.round(np.linspace(0, len(sigmas) - 1, _MOST_LEVELS)).astype(int)
         sigmas = [sigmas[k] for k in keep]
@@ -117,7 +117,7 @@ def densities_picture(
         share = np.clip(values / max(float(values.max()), 1e-30), 0, 1)
         grey = np.round(255 * np.sqrt(share)).astype(np.uint8)
         panel = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
-        panels.append(_titled(panel, f"g, σ = {sigma:.3g} px"))
+        panels.append(_titled(panel, f"C = g ∗ ε, σ = {sigma:.3g} px"))
     rows = -(-len(panels) // columns)
     return in_grid(panels, -(-len(panels) // rows))  # five are three and two, not four and one
 
