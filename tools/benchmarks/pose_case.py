@@ -5,7 +5,7 @@ method is given the same detections and starts, and the paper's own settings: fe
 deviation 5 in the image and in the body, R = 1000 samples, the same mirrored pairs for all
 features, which serve it best.
 
-The fit alone is timed on observations that it has seen before, so that their sums are at hand; what
+The fit alone is timed with the drawing of its densities, on observations seen before; what
 a tracker does with a frame, from its prediction to the judgement of the pose, on ones that are new
 in every call.
 """
