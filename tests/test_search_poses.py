@@ -1,18 +1,20 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.errors import SessionError
 from mixpose.objective import View
-from mixpose.records import GridPattern, PointPattern
+from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search import Candidate, SearchBudget, SearchState, search, search_frame
+from mixpose.search import Candidate, SearchBudget, SearchState, search_frame
 from mixpose.search.alignment import align_triples
 from mixpose.sensors import ParallelBeam
 
@@ -21,6 +23,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 from benchmarks.search_cases import Row, Trial, absent, errors, is_right, trial
 
 ALL = np.ones(6, dtype=np.bool_)
+
+
+def search(
+    views: Sequence[View], body: Body, *, free: NDArray[np.bool_], T_reference: Floats | None
+) -> list[Candidate]:
+    return search_frame(views, body, free=free, T_reference=T_reference).candidates
 
 
 def found(frame: Trial) -> list[Candidate]:

@@ -35,7 +35,6 @@ from mixpose.tracking import (
     are_as_good,
     have_fewer,
     is_convincing,
-    predict,
 )
 
 if TYPE_CHECKING:
@@ -224,7 +223,7 @@ def _advance(
         return _Step(after, estimate, views, met)
 
     if tracked:
-        predictions = predict(track, tracker.body, frame_set.number, frame_set.time_s)
+        predictions = tracker.predictions(track, frame_set.number, frame_set.time_s)
         images = {
             name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)
         }

@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from benchmarks.search_cases import Row, Trial, absent, errors_squared, is_right, rows_named, trial
 from mixpose.fit import EstimatorOptions
-from mixpose.search import search
+from mixpose.search import search_frame
 from mixpose.tracking import Tracker
 
 TIMED = ("2 pinhole 6/0/0", "2 pinhole 6/1/3", "2 pinhole 8/2/4")
@@ -62,7 +62,7 @@ class Outcome:
 
 def outcome(frame: Trial) -> Outcome:
     began = time.perf_counter()
-    search(frame.views, frame.body, free=np.ones(6, dtype=np.bool_), T_reference=None)
+    search_frame(frame.views, frame.body, free=np.ones(6, dtype=np.bool_), T_reference=None)
     searched = time.perf_counter()
     tracker = Tracker.create(frame.body, EstimatorOptions())
     _, estimate = tracker.advance(tracker.begin(), 0, None, frame.views)

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.errors import SessionError
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
-from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.options import ExtractOptions, check_level
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.sampling import sample
 from mixpose.extraction.threshold import Window
@@ -79,16 +78,11 @@ def extract_corners(
     SessionError
         If the threshold is neither "auto" nor a number.
     """
-    threshold = options.threshold
-    if isinstance(threshold, str) and threshold != "auto":
-        raise SessionError(
-            f"extract.threshold: {threshold!r} does not go with method 'corners';"
-            ' allowed are "auto" and a grey level, the least step from bright to dark'
-        )
+    check_level(options.threshold, "corners", "the least step from bright to dark")
     u0, v0, u1, v1 = window
     crop = image[v0:v1, u0:u1].astype(np.float32)
     large = min(crop.shape) > 2 * rules.margin
-    corners = _find(crop, threshold, rules) if large else np.empty((0, 2))
+    corners = _find(crop, options.threshold, rules) if large else np.empty((0, 2))
     return PointPattern(corners + np.array([u0, v0]), np.ones(len(corners)))
 
 

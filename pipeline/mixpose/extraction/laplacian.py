@@ -22,9 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.errors import SessionError
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
-from mixpose.extraction.options import ExtractOptions
+from mixpose.extraction.options import ExtractOptions, check_level
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
@@ -79,12 +78,7 @@ def extract_log(
     SessionError
         If the threshold is neither "auto" nor a number.
     """
-    threshold = options.threshold
-    if isinstance(threshold, str) and threshold != "auto":
-        raise SessionError(
-            f"extract.threshold: {threshold!r} does not go with method 'log';"
-            ' allowed are "auto" and a grey level, the least height of a spot'
-        )
+    check_level(options.threshold, "log", "the least height of a spot")
     u0, v0, u1, v1 = window
     spots = _find(image[v0:v1, u0:u1], options, rules)
     return PointPattern(spots + np.array([u0, v0]), np.ones(len(spots)))

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from mixpose.errors import SessionError
+
 
 @dataclass(frozen=True)
 class ExtractOptions:
@@ -37,3 +39,18 @@ class ExtractOptions:
     max_area: float | None = None
     sigma: float = 1.5
     spot_sigma: float = 0.0
+
+
+def check_level(threshold: str | float, method: str, meaning: str) -> None:
+    """Refuse rules for a threshold where only "auto" and a grey level have a meaning.
+
+    Raises
+    ------
+    SessionError
+        Names the method, and the meaning that a grey level has there.
+    """
+    if isinstance(threshold, str) and threshold != "auto":
+        raise SessionError(
+            f"extract.threshold: {threshold!r} does not go with method {method!r};"
+            f' allowed are "auto" and a grey level, {meaning}'
+        )

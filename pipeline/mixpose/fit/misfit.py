@@ -12,12 +12,12 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.objective.matched import FINE_STEPS
+from mixpose.objective.matched import FINE_STEPS, look_up_error
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_ROUNDING = 1 / (8 * FINE_STEPS**2)  # of a height: what looking up linearly errs by
+_ROUNDING = look_up_error(FINE_STEPS)
 
 
 @dataclass(frozen=True)

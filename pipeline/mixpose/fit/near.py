@@ -22,22 +22,17 @@ from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
 from mixpose.objective import MatchedObjective, Objective, View, build_objective, matched_objective
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA
+from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
 
 Floats: TypeAlias = NDArray[np.float64]
 
 
-def _value_error(steps_per_sigma: float) -> float:
-    """Relative error of looked-up values: 1/8n² along each of two axes, and squared."""
-    return 4.0 / (8 * steps_per_sigma**2)
-
-
-COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=_value_error(STEPS_PER_SIGMA))
+COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
 # after a step that gains 1e-6, 0.002 σ long, a twentieth of it is left to go: residuals draw it
-SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=_value_error(LAST_STEPS))
-FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=_value_error(FINE_STEPS))
+SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=value_error(LAST_STEPS))
+FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
 
 
 @dataclass(frozen=True)

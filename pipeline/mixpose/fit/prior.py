@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density.atlas import REACH
 from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS, value_error
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 
@@ -35,7 +35,7 @@ CLOSE: Scale = (ZOOM_STEPS, ZOOM)
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
-_VALUE_ERROR = 4.0 / (8 * FINE_STEPS**2)  # of values looked up linearly
+_VALUE_ERROR = value_error(FINE_STEPS)
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,16 @@ features overlap, gradients are looked up beside their zeros and err by the squa
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
 
+def look_up_error(steps_per_sigma: float) -> float:
+    """Of a height, what looking it up linearly errs by along one axis: 1/8n²."""
+    return 1 / (8 * steps_per_sigma**2)
+
+
+def value_error(steps_per_sigma: float) -> float:
+    """Relative error of looked-up values: along each of two axes, and squared."""
+    return 4 * look_up_error(steps_per_sigma)
+
+
 @dataclass(frozen=True, eq=False)
 class MatchedObjective:
     """Σ_l ω_l ⟨g_l, h_l⟩² / (⟨g_l, g_l⟩ ⟨h_l, h_l⟩) over the pose.
@@ -98,9 +108,7 @@ class MatchedObjective:
 
     def match(self, poses: Floats) -> tuple[Projected, Floats, Matched, Overlaps]:
         """The predicted features at poses (H, 4, 4), C at them, and the inner products."""
-        at = self.projection.project(poses)
-        sampled = self.atlas.look_up(at.y)
-        over = overlaps(at.y, at.weights, self.variances, self.tops)
+        at, sampled, over = self._predicted(poses)
         return at, sampled, inner_products(sampled[..., 0] * at.weights, over), over
 
     def slopes(self, poses: Floats) -> Slopes:
@@ -110,10 +118,13 @@ class MatchedObjective:
         parts = [self._slopes(some) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _slopes(self, poses: Floats) -> Slopes:
+    def _predicted(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
-        over = overlaps(at.y, at.weights, self.variances, self.tops)
+        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
+
+    def _slopes(self, poses: Floats) -> Slopes:
+        at, sampled, over = self._predicted(poses)
         scales = self.weights / self.energies
         return slopes(at, sampled, over, self.variances, self.tops, scales)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
 from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
-from mixpose.search.search import search, search_frame
+from mixpose.search.search import search_frame
 
 __all__ = [
     "LIVE",
@@ -19,6 +19,5 @@ __all__ = [
     "SearchReport",
     "SearchResult",
     "SearchState",
-    "search",
     "search_frame",
 ]

@@ -25,28 +25,6 @@ from mixpose.search.spread import sparse
 Floats: TypeAlias = NDArray[np.float64]
 
 
-def search(
-    views: Sequence[View],
-    body: Body,
-    *,
-    free: NDArray[np.bool_],
-    T_reference: Floats | None,
-    count: int = 8,
-    seed: int = 0,
-    budget: SearchBudget = THOROUGH,
-) -> list[Candidate]:
-    """Find poses that explain the views, without a start; arguments as of `search_frame`.
-
-    Returns
-    -------
-    list of Candidate
-        Best first, no two alike modulo the body's symmetries; empty where nothing was seen.
-    """
-    return search_frame(
-        views, body, free=free, T_reference=T_reference, count=count, seed=seed, budget=budget
-    ).candidates
-
-
 def search_frame(
     views: Sequence[View],
     body: Body,

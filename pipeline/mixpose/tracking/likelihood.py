@@ -20,7 +20,7 @@ from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, neare
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
 from mixpose.records import SensorReport
-from mixpose.search import SearchReport, SearchState
+from mixpose.search import SearchState
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
@@ -69,9 +69,8 @@ class Likelihood(Protocol):
 
 @dataclass
 class SearchLog:
-    """What the search of a frame cost, and where it goes on in the next."""
+    """Where the search of a frame goes on in the next."""
 
-    report: SearchReport = SearchReport()
     state: SearchState = SearchState()
 
 

@@ -23,7 +23,7 @@ from mixpose.tracking.delays import in_step
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Branch, Found, SensorTally, Track, follow, predict
+from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -187,11 +187,15 @@ class Tracker:
         motion = self.rules.motion
         return follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
 
+    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
+        """Where the track expects the body; arguments as of `advance`."""
+        return predict(track, self.body, frame, time_s, self.rules.motion)
+
     def data(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
         """A frame, and what is known before it; arguments as of `advance`."""
-        predictions = predict(track, self.body, frame, time_s, self.rules.motion)
+        predictions = self.predictions(track, frame, time_s)
         return FrameData(
             views=views,
             body=self.body,

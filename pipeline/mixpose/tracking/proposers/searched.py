@@ -27,7 +27,7 @@ def candidates_of(data: FrameData) -> list[Candidate]:
         budget=data.rules.live if live else data.rules.search,
         state=data.track.search if live else None,
     )
-    data.log.report, data.log.state = result.report, result.state
+    data.log.state = result.state
     return result.candidates
 
 
