@@ -151,8 +151,8 @@ _SHAPES = (
     Mutant(
         "extraction-scraps-within-disks",
         "extraction/blobs.py",
-        "(within & (areas < np.array(disk_areas)[:, None]))",
-        "(within & (areas < 0))",
+        "within & (areas < np.array(disk_areas)[:, None])",
+        "within & (areas < 0)",
         "the islands in a ring count as features beside it",
         (_BLOBS,),
     ),
