@@ -26,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "constants": set(),
     "threads": set(),
     "encoding": set(),
+    "executing": GROUND,
     "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,

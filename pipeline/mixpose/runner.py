@@ -299,11 +299,22 @@ def observation_of(
         # noise may take a profile below zero; cutting that off would leave a floor of noise
         pattern = frame.data
     else:
+        _refuse_code(session, options.method)
         pattern = extract(frame.data, options, window=window, base=session.folder)
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))
     return Observation(pattern, width, intrinsic=options.spot_sigma)
+
+
+def _refuse_code(session: Session, method: str) -> None:
+    """A session file comes from anywhere: what it names is run only where that was allowed."""
+    if ":" in method and not session.allow_code:
+        raise SessionError(
+            f'{session.path}: extract.method: "{method}" runs code of a module that the session '
+            "names; if you trust it, add --allow-code (in Python: load_session(..., "
+            "allow_code=True))"
+        )
 
 
 def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:

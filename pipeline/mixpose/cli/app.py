@@ -18,6 +18,13 @@ app = typer.Typer(
 )
 
 SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
+AllowCode = Annotated[
+    bool,
+    typer.Option(
+        "--allow-code",
+        help='Run functions that the session names: method = "module:function".',
+    ),
+]
 
 
 class Format(StrEnum):
@@ -62,18 +69,27 @@ def _common(
 def run(
     context: typer.Context,
     sessions: Annotated[
-        list[Path], typer.Argument(metavar="SESSION.toml", help="One session file or several.")
+        list[str],
+        typer.Argument(
+            metavar="SESSION.toml...",
+            help="One session file or several, patterns such as 'day*/session.toml', or text files "
+            "(.txt) with one to a line.",
+        ),
     ],
     output: Annotated[
         Path | None,
         typer.Option(
             "-o",
             "--output",
-            help="Write poses here, not to stdout; with several sessions, the folder for a file "
-            "each, named after the session or, where that is session.toml, after its folder.",
+            help="Write poses here, not to stdout, in the format that the suffix tells. With "
+            "several sessions, a folder in which each gets its own for poses, log and status; what "
+            "is done there already is not done again.",
         ),
     ] = None,
-    format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
+    format: Annotated[
+        Format | None,
+        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; or jsonl."),
+    ] = None,
     source: Annotated[
         list[str] | None,
         typer.Option(
@@ -92,24 +108,44 @@ def run(
         Path | None,
         typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
+            "local for one on this machine.",
+        ),
+    ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
-    from mixpose.cli.request import RunRequest  # noqa: PLC0415
+    from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
     sources, debug = tuple(source or ()), bool(context.obj)
-    request = RunRequest(output, format.value, sources, selection, resume, overlay, debug)
-    if len(sessions) > 1:
-        from mixpose.cli.several import run_sessions  # noqa: PLC0415
+    named = None if format is None else format.value
+    request = RunRequest(
+        output,
+        format_of(output, named),
+        sources,
+        selection,
+        resume,
+        overlay,
+        debug,
+        allow_code,
+        scheduler,
+    )
+    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
 
-        raise typer.Exit(run_sessions(sessions, request, workers))
+    if are_many(sessions, request):
+        raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415
     from mixpose.cli.run import run_session  # noqa: PLC0415
 
     if workers > 1:
         warn(f"--workers {workers}: one session is one process, frames follow each other")
-    run_session(sessions[0], request)
+    run_session(Path(sessions[0]), request)
 
 
 @app.command()
@@ -118,11 +154,12 @@ def check(
     quick: Annotated[
         bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
     ] = False,
+    allow_code: AllowCode = False,
 ) -> None:
     """Read every frame before any run: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session, quick=quick)
+    check_session(session, quick=quick, allow_code=allow_code)
 
 
 @app.command()
@@ -142,11 +179,19 @@ def inspect(
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
     ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
     from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
 
-    inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
+    inspect_frame(
+        session,
+        frame,
+        output,
+        poses=poses,
+        sources=tuple(source or ()),
+        allow_code=allow_code,
+    )
 
 
 @app.command()
@@ -255,6 +300,7 @@ def convert(
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
     ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Write poses in the format of another program."""
     from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
@@ -270,6 +316,7 @@ def convert(
         relative_to=relative_to,
         session=session,
         sources=tuple(source or ()),
+        allow_code=allow_code,
     )
     convert_poses(poses, request)
 

@@ -62,7 +62,7 @@ class _Report:
         self.lines, self.warnings = [], []
 
 
-def check_session(path: Path, *, quick: bool = False) -> None:
+def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
     Parameters
@@ -70,6 +70,8 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     path : Path
     quick : bool
         Look at a few frames only instead of all.
+    allow_code : bool
+        Whether functions that the session names may be run.
 
     Raises
     ------
@@ -79,7 +81,7 @@ def check_session(path: Path, *, quick: bool = False) -> None:
         If a recording cannot be opened or its table of times lacks rows, or, after all has been
         printed, if a frame is damaged.
     """
-    session = load_session(path)
+    session = load_session(path, allow_code=allow_code)
     sources = open_sources(session, {})
     for source in sources.values():
         source.check_times(ALL_NUMBERS)

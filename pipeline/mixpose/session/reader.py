@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.validation import validate
 
 
-def load_session(path: str | Path) -> Session:
+def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read a session file and the calibration and marker files that it names.
 
     Recordings are not opened.
@@ -29,6 +30,9 @@ def load_session(path: str | Path) -> Session:
     ----------
     path : str or Path
         A TOML file; paths in it are relative to it.
+    allow_code : bool
+        Whether functions that the file names (``method = "module:function"``) may be run when
+        features are extracted; reading a session runs none.
 
     Returns
     -------
@@ -46,7 +50,8 @@ def load_session(path: str | Path) -> Session:
     try:
         content = read_bytes(path)
         data = _parse(as_text(content))
-        return _build(path, hashlib.sha256(content).hexdigest(), data)
+        session = _build(path, hashlib.sha256(content).hexdigest(), data)
+        return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
         raise SessionError(one_line(path, problem.key, problem.text, data)) from problem
     except RecursionError as error:

@@ -90,6 +90,8 @@ class Session:
     estimator : EstimatorOptions
     sensors : tuple of SensorSetup
         In the order of the file, at least one.
+    allow_code : bool
+        Whether functions that the file names may be run.
     """
 
     path: Path
@@ -99,6 +101,7 @@ class Session:
     start: Start | None
     estimator: EstimatorOptions
     sensors: tuple[SensorSetup, ...]
+    allow_code: bool = False
 
     @property
     def folder(self) -> Path:
