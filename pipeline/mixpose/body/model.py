@@ -68,15 +68,23 @@ class Body:
         Outward normals: a feature is seen only by sensors it faces.
     gravity : Gravity or None
         Spread that stays with the world while the body turns.
+    names : tuple of str
+        What people call the features, those of them that have a name; they come first.
     """
 
     name: str
     features: tuple[Feature, ...]
     normals: Floats | None = None
     gravity: Gravity | None = None
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.features)
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """What each feature (N) is called in messages: its name, else its number from 1."""
+        return self.names + tuple(str(i + 1) for i in range(len(self.names), len(self)))
 
     @cached_property
     def means(self) -> Floats:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from mixpose.limits import MOST_YAML_BYTES, MOST_YAML_NODES
 from mixpose.rigid import Floats
 from mixpose.session.arrays import resolution
 from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
@@ -45,7 +46,13 @@ def parse_yaml(text: str) -> Any:
     """Parse the first document of a YAML text."""
     import yaml  # noqa: PLC0415  # only sessions with such a calibration need it
 
+    if len(text) > MOST_YAML_BYTES:
+        raise BadKeyError(
+            f"found {len(text)} characters of YAML; allowed: at most {MOST_YAML_BYTES}"
+        )
     try:
+        for node in yaml.compose_all(text, yaml.SafeLoader):
+            _check_size(node)
         return next((part for part in yaml.safe_load_all(text) if part is not None), None)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -53,6 +60,28 @@ def parse_yaml(text: str) -> Any:
         raise BadKeyError(f"not YAML{line}: {error.problem or error.context}") from error
     except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise BadKeyError(f"not YAML: {error}") from error
+
+
+def _check_size(root: Any) -> None:
+    """Refuse a document that its aliases make large: a few bytes may stand for gigabytes."""
+    sizes: dict[int, float] = {}
+
+    def size_of(node: Any) -> float:
+        known = sizes.get(id(node))
+        if known is not None:
+            return known
+        sizes[id(node)] = float("inf")  # met again inside of itself: without end
+        value = node.value
+        parts = [] if isinstance(value, str) else value
+        flat = [each for part in parts for each in (part if isinstance(part, tuple) else (part,))]
+        sizes[id(node)] = 1 + sum(map(size_of, flat))
+        return sizes[id(node)]
+
+    if root is not None and size_of(root) > MOST_YAML_NODES:
+        raise BadKeyError(
+            f"its aliases (*name) stand for more than {MOST_YAML_NODES} values; write out what is "
+            "meant"
+        )
 
 
 def kalibr_cameras(content: dict[str, Any]) -> list[str]:

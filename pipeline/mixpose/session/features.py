@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
+from mixpose.body.features import SEGMENT_NODES
+from mixpose.limits import MOST_FEATURES
 from mixpose.rigid import Floats
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.markers import Markers, read_markers
@@ -38,6 +40,13 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     points = np.zeros((0, 3)) if markers is None else markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
+    nodes = len(points) + SEGMENT_NODES * len(segments)
+    if nodes > MOST_FEATURES:
+        raise BadKeyError(
+            f"found {len(points)} points and {len(segments)} segments; allowed: {MOST_FEATURES} "
+            f"together, a segment counting as {SEGMENT_NODES}",
+            "file" if table.file is not None else "points",
+        )
     if count < FEWEST_FEATURES:
         key = "file" if table.file is not None else "points"
         if table.segments is not None:
@@ -65,7 +74,8 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
     normals = _normals(table.normals, count)
-    return Body(table.name, tuple(features), normals, _gravity(table))
+    names = () if markers is None else markers.names
+    return Body(table.name, tuple(features), normals, _gravity(table), names)
 
 
 def _gravity(table: ObjectTable) -> Gravity | None:

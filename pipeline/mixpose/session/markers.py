@@ -29,10 +29,13 @@ class Markers:
     sigma : list or None
         Per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them;
         None where the table has no such columns.
+    names : tuple of str
+        By which people know them; empty where some have none, or two the same.
     """
 
     points: Floats
     sigma: list[Any] | None
+    names: tuple[str, ...] = ()
 
 
 def read_markers(path: Path) -> Markers:
@@ -63,7 +66,9 @@ def read_markers(path: Path) -> Markers:
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
     if not len(values):
         raise BadKeyError(f"{path.name}: found no markers below the header")
-    return Markers(values[:, :3], _sigma_of(values[:, 3:]))
+    names = tuple(" ".join(row[0].split()) for _, row in rows[1:])
+    known = all(names) and len(set(names)) == len(names)
+    return Markers(values[:, :3], _sigma_of(values[:, 3:]), names if known else ())
 
 
 def _check_header(header: list[str]) -> None:

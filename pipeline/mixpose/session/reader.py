@@ -10,6 +10,7 @@ from typing import Any
 
 from mixpose.errors import SessionError
 from mixpose.fit import EstimatorOptions
+from mixpose.limits import MOST_SAMPLES
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.features import build_body
 from mixpose.session.messages import BadKeyError, one_line, one_of, under
@@ -75,6 +76,13 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
         start = _start(table.start)
     with under("estimator"):
         estimator = _estimator(table.estimator, start)
+    drawn = 0 if body.is_exact else len(body) * estimator.samples
+    if drawn > MOST_SAMPLES:
+        raise BadKeyError(
+            f"found {estimator.samples} for {len(body)} features; allowed: {MOST_SAMPLES} together",
+            "estimator",
+            "samples",
+        )
     return Session(
         path=path,
         sha256=sha256,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mixpose.limits import MOST_BYTES
 from mixpose.session.messages import BadKeyError
 
 
@@ -13,9 +14,14 @@ def read_bytes(path: Path) -> bytes:
     Raises
     ------
     BadKeyError
-        If there is no such file or it cannot be read.
+        If there is no such file, it is larger than any session needs, or it cannot be read.
     """
     try:
+        if path.exists() and not path.is_file():
+            raise BadKeyError(f"{path} is no file; allowed: a file, no folder, pipe or device")
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise BadKeyError(f"{path} has {size} bytes; allowed: at most {MOST_BYTES}")
         return path.read_bytes()
     except FileNotFoundError as error:
         raise BadKeyError(f"no such file: {path}") from error
