@@ -9,7 +9,13 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -40,8 +46,14 @@ def run_session(path: Path, request: RunRequest) -> None:
     header = header_of(session, replaced)
     selection, T_start, resumed = request.selection, None, False
     opened = open_sources(session, replaced)
-    if request.output is not None and not _is_device(request.output):
-        refuse_to_overwrite(request.output, _inputs(session))
+    outputs = (
+        []
+        if request.output is None
+        else written_paths(request.output, request.format, header.labels)
+    )
+    for written in outputs:
+        if not _is_device(written):
+            refuse_to_overwrite(written, _inputs(session))
     if request.resume:
         _refuse_live(opened)
         selection, T_start, resumed = _resumed(request, header)
@@ -52,7 +64,7 @@ def run_session(path: Path, request: RunRequest) -> None:
         watch = _overlay(stack, session, request)
         estimates = run(session, opened=opened, selection=selection, T_start=T_start, watch=watch)
         stack.enter_context(closing(estimates))
-        output = Output(request.output, request.format, header, append=resumed)
+        output = _output(request, header, append=resumed)
         stack.enter_context(output)
         for estimate in _with_progress(estimates, session, quiet=request.output is None):
             output.write(estimate)
@@ -62,8 +74,14 @@ def run_session(path: Path, request: RunRequest) -> None:
     if resumed and not summary.statuses:
         say(f"nothing left to do: {request.output} has all frames asked for already")
         return
-    written = [str(path) for path in (request.output, request.overlay) if path is not None]
-    summary.say(f" -> {', '.join(written)}" if written else "")
+    names = [str(each) for each in (*outputs, request.overlay) if each is not None]
+    summary.say(f" -> {', '.join(names)}" if names else "")
+
+
+def _output(request: RunRequest, header: Header, *, append: bool) -> Output | OutputPerBody:
+    if is_apart(request.format, header.labels):
+        return OutputPerBody(request.output, request.format, header, header.labels)
+    return Output(request.output, request.format, header, append=append)
 
 
 @contextmanager
@@ -112,9 +130,10 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
         session_sha256=session.sha256,
         mixpose=__version__,
         seed=session.estimator.seed,
-        symmetries={session.body.name: session.body.symmetries},
+        symmetries={one.body.name: one.body.symmetries for one in session.objects},
         sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
+        objects={one.body.name: one.count for one in session.objects},
     )
 
 
@@ -144,7 +163,9 @@ def _refuse_live(opened: Mapping[str, Source]) -> None:
             )
 
 
-def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | None, bool]:
+def _resumed(
+    request: RunRequest, header: Header
+) -> tuple[Selection, dict[str, Floats] | None, bool]:
     """What is left to do after the frames that stand in the output already."""
     if request.output is None or request.format != "jsonl":
         raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
@@ -159,13 +180,12 @@ def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | N
         begin = wanted.start + steps * wanted.step
     elif wanted.step > 1:
         begin = last + wanted.step
-    trusted = [
-        pose.T_world_object
+    trusted = {
+        pose.label: pose.T_world_object
         for pose in read_poses(request.output).poses
         if pose.T_world_object is not None
-    ]
-    T_start = trusted[-1] if trusted else None
-    return Selection(begin, wanted.stop, wanted.step), T_start, True
+    }
+    return Selection(begin, wanted.stop, wanted.step), trusted, True
 
 
 def _with_progress(
