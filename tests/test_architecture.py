@@ -45,6 +45,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
+    "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {
