@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -52,6 +52,25 @@ LEAST_DELAY_S = 1e-6
 """Sensors that differ by less count as in step."""
 
 
+@dataclass(frozen=True)
+class Memory:
+    """All that a run knows between two frames.
+
+    Attributes
+    ----------
+    tracks : tuple of Track
+        One per body.
+    tracked : bool
+        Whether the frame before convinced.
+    """
+
+    tracks: tuple[Track, ...]
+    tracked: bool = False
+
+
+Remember: TypeAlias = Callable[[Memory], None]
+
+
 def run(
     session: Session,
     *,
@@ -60,6 +79,8 @@ def run(
     selection: Selection = ALL_FRAMES,
     T_start: Floats | Starts | None = None,
     watch: Watch | None = None,
+    memory: Memory | None = None,
+    remember: Remember | None = None,
 ) -> Generator[Estimate, None, None]:
     """Estimate the poses of every frame of a recording, one per body.
 
@@ -80,6 +101,10 @@ def run(
         Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
         raw frames and the features found in them, while tracking around the bodies only; its time
         is not in the latency.
+    memory : Memory or None
+        What a run knew after the frame before the first of `selection`; None: nothing.
+    remember : callable or None
+        Called with what is known after a frame, before its first estimate is yielded.
 
     Returns
     -------
@@ -106,7 +131,8 @@ def run(
         starts = {session.labels[0]: T_start}
     scene = scene_of(session, starts)
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    return _estimates(session, scene, frames, watch)
+    begun = Memory(scene.begin()) if memory is None else memory
+    return _estimates(session, scene, begun, frames, watch, remember)
 
 
 def scene_of(session: Session, starts: Starts | None = None) -> Scene:
@@ -181,14 +207,16 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 def _estimates(
     session: Session,
     scene: Scene,
+    memory: Memory,
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
+    remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
     cameras = _windowed(session)
     expectations = [
         Expectation(one.tracker.body, cameras, one.tracker.free) for one in scene.members
     ]
-    tracks, tracked = scene.begin(), False
+    tracks, tracked = memory.tracks, memory.tracked
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -196,11 +224,13 @@ def _estimates(
                 step = _advance(session, scene, expectations, tracks, frame_set, tracked)
             tracks, tracked = tuple(one.track for one in step.outcomes), step.convinces
             latency_ms = 1e3 * (time.perf_counter() - began)
-            for outcome in step.outcomes:
+            for k, outcome in enumerate(step.outcomes):
                 estimate = _with_silent_sensors(outcome.estimate, session.sensors)
                 estimate = replace(estimate, latency_ms=latency_ms)
                 if watch is not None:
                     watch(frame_set, step.views, estimate)
+                if remember is not None and k == 0:
+                    remember(Memory(tracks, tracked))
                 yield estimate
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,11 +29,12 @@ from mixpose.poses.estimates import (
     relative_to,
 )
 from mixpose.poses.formats import ONE_TRAJECTORY
-from mixpose.poses.header import UNITS_PER_METRE
+from mixpose.poses.header import UNITS_PER_METRE, Header
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
+from mixpose.whole_files import appearing_whole
 
 _BY_SUFFIX = {
     ".jsonl": "jsonl",
@@ -103,13 +105,28 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
     header = header_of(poses, _unit(poses, request), __version__)
     header = replace(header, objects=objects_of(lines))
     labels = tuple(dict.fromkeys(line.label for line in lines))
-    with (
-        OutputPerBody(request.output, name, header, labels, options)
-        if is_apart(name, labels)
-        else Output(request.output, name, header, options=options)
-    ) as output:
+    with ExitStack() as stack:
+        output = _output(stack, name, header, labels, options, request.output)
+        stack.enter_context(output)
         for line in lines:
             output.write(relative_to(T_sensor_world, estimate_of(line)))
+
+
+def _output(
+    stack: ExitStack,
+    name: str,
+    header: Header,
+    labels: Sequence[str],
+    options: Mapping[str, int | str],
+    path: Path | None,
+) -> Output | OutputPerBody:
+    """Where poses go; files are whole when they appear."""
+
+    def whole(own: Path | None) -> Output:
+        part = None if own is None else stack.enter_context(appearing_whole(own))
+        return Output(part, name, header, options=options, called=own)
+
+    return OutputPerBody(path, name, labels, whole) if is_apart(name, labels) else whole(path)
 
 
 def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:

@@ -76,7 +76,7 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
         body=objects[0].body,
         start=objects[0].start,
         estimator=estimator,
-        sensors=build_sensors(table.sensor, table.extract, path.parent),
+        sensors=build_sensors(table.sensor, table.extract, path.parent, table.unit),
         count=objects[0].count,
         others=objects[1:],
     )
@@ -95,7 +95,7 @@ def _objects(table: SessionTable, folder: Path) -> tuple[ObjectSetup, ...]:
         with under("object", k):
             if table.start is not None and each.start is not None:
                 raise BadKeyError("stands beside [start]; allowed: one of the two", "start")
-            body = build_body(each, folder)
+            body = build_body(each, folder, table.unit)
             with under("start"):
                 start = _start(each.start)
             new = ObjectSetup(body, start, each.count)
