@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BeforeValidator, Field, PlainValidator
 
-from mixpose.body import Spread
+from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
@@ -19,7 +19,7 @@ from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import FREE_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+from mixpose.session.values import FREE_ALLOWED, RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
 
 MOST_ALIKE = 1000
 """Identical bodies that a session may have."""
@@ -128,6 +128,17 @@ class ObjectTable(Table):
     by sensors that it faces.
 
     Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`
+    """
+    shape: Annotated[Shape, Field(description=one_of(get_args(Shape)))] = "point"
+    """What the markers are: points, or spheres or flat disks of a `radius`, the centres of whose
+    images are not where their own centres are seen. Disks lie across their `normals`.
+
+    Example: `shape = "sphere"`
+    """
+    radius: Annotated[Any, Field(description=RADIUS_ALLOWED)] = None
+    """Radius of the spheres or disks, in `unit`; what shines or is dark counts, to its edge.
+
+    Example: `radius = 7.0`
     """
     spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
     """Density of the displacements that `sigma` states.
