@@ -44,7 +44,7 @@ def evidence(
     detection: DetectionModel = BY_VOLUME,
 ) -> float:
     prior = Prior(log_density, np.ones(6))
-    return log_evidence([one], information, Noise(), FREE, prior, detection, MODEL)
+    return log_evidence([one], information, Noise(), FREE, prior, 1.0, detection, MODEL)
 
 
 def test_the_odds_by_volume_are_those_of_the_formula() -> None:

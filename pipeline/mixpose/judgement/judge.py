@@ -109,7 +109,10 @@ def judge(
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
     information = information_of(found)
     noise, remembered = noises(before, noise_of(found, free), rules.noise)
-    evidence = log_evidence(found, information, noise, free, prior, rules.detection, rules.noise)
+    size = 2 * objective.projection.body.radius
+    evidence = log_evidence(
+        found, information, noise, free, prior, size, rules.detection, rules.noise
+    )
     count = len(found)
     return Judged(
         T_world_object=T_world_object,
