@@ -96,19 +96,17 @@ def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules)
     return _is_fixed(judged, free) and judged.log_evidence > rules.possible
 
 
-def stands_out(
-    judged: Judged, ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules
-) -> bool:
-    """Whether a pose that meets most of the body is far likelier than all others of its frame.
+def stands_out(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+    """Whether the first pose meets most of the body and is far likelier than all others.
 
     Poses that meet detections by chance come in numbers, and about equally good.
     """
-    if not _is_fixed(judged, free) or judged.coverage < rules.doubtful_coverage:
+    if not ranked or not _is_fixed(ranked[0], free):
         return False
-    others = [one.log_evidence for one in ranked if one is not judged]
-    rest = float(np.logaddexp.reduce(others)) if others else -np.inf
-    least = max(rules.doubtful, rest + rules.standing_out)
-    return judged.log_evidence > least
+    if ranked[0].coverage < rules.doubtful_coverage:
+        return False
+    rest = np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in ranked[1:])])
+    return ranked[0].log_evidence > max(rules.doubtful, float(rest) + rules.standing_out)
 
 
 def _is_fixed(judged: Judged, free: NDArray[np.bool_]) -> bool:
@@ -148,14 +146,8 @@ def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -
 
 def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
-    best = next(
-        (
-            one
-            for one in ranked
-            if is_possible(one, free, rules) or stands_out(one, ranked, free, rules)
-        ),
-        None,
-    )
+    told = (one for one in ranked if is_possible(one, free, rules))
+    best = ranked[0] if stands_out(ranked, free, rules) else next(told, None)
     if best is None:
         return Verdict("lost", None, [])
     weights = beliefs(ranked)
