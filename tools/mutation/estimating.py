@@ -267,8 +267,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-a-point-in-space-counts-for-each-camera",
         "judgement/evidence.py",
-        "together = np.nonzero(cameras > 1)",
-        "together = np.nonzero(cameras > 9)",
+        "together = np.nonzero(np.sum(near, axis=0) > 1)",
+        "together = np.nonzero(np.sum(near, axis=0) > 9)",
         "screws that all cameras see pass for the body",
     ),
     Mutant(

@@ -206,20 +206,22 @@ def odds_of(
     detection : DetectionModel
     """
     shape = sightings[0].weights.shape
-    gained, missed, coordinates, cameras = np.zeros((4, *shape))
+    gained, missed, coordinates = np.zeros((3, *shape))
+    near: list[NDArray[np.bool_]] = []
     for one in sightings:
         m = one.offsets.shape[2]
         squares = (one.offsets**2).sum(axis=2)
         density = one.crowd * (2 * np.pi * variance) ** (m / 2)
         gain = np.log(detection.probability / np.maximum(density, 1e-300))
-        gain = np.maximum(gain[:, None] - squares / (2 * variance[:, None]), 0.0)
-        gained += one.shares * gain
+        gain = one.shares * np.maximum(gain[:, None] - squares / (2 * variance[:, None]), 0.0)
+        gained += gain
         missed += (one.weights - one.shares) * detection.log_missed
         coordinates += m * one.shares
-        cameras += (one.shares > 0) & (m == 2)
-    together = np.nonzero(cameras > 1)
+        # a detection that chance puts as near is not the feature's
+        near.append((gain > 0) & (m == 2))
+    together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
-        space, share = _in_space(sightings, together, variance, size)
+        space, share = _in_space(sightings, near, together, variance, size)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -230,6 +232,7 @@ def odds_of(
 
 def _in_space(
     sightings: Sequence[Sighting],
+    near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
     variance: Floats,
     size: float,
@@ -241,18 +244,18 @@ def _in_space(
     A = np.tile(np.eye(3) / size**2, (len(chosen[0]), 1, 1))
     b, share = np.zeros((len(A), 3)), np.zeros(len(A))
     log_rarity = np.full(len(A), -np.inf)
-    for one in sightings:
+    for one, is_near in zip(sightings, near, strict=True):
         if one.offsets.shape[2] != 2:
             continue
-        J, r, met = one.by_world[chosen], one.offsets[chosen], one.shares[chosen]
-        weighted = J * ((met > 0) / variance[chosen[0]])[:, None, None]
+        J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
+        weighted = J * (met / variance[chosen[0]])[:, None, None]
         A += weighted.swapaxes(1, 2) @ J
         b += (weighted.swapaxes(1, 2) @ r[..., None])[..., 0]
-        share = np.maximum(share, met)
+        share = np.maximum(share, met * one.shares[chosen])
         # detections per area, of which each has a depth
         across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(1, 2)), 1e-300))
         rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + math.log(size)
-        log_rarity = np.maximum(log_rarity, np.where(met > 0, rarity, -np.inf))
+        log_rarity = np.maximum(log_rarity, np.where(met, rarity, -np.inf))
     away = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1)
     tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
