@@ -27,8 +27,8 @@ MOST_UNSORTED_ROWS = 1_000_000
 MOST_BYTES = 4_000_000
 """Of a session file, a calibration or a table of markers."""
 
-MOST_YAML_BYTES = 500_000
-"""Of a calibration in YAML, whose reader is slow: this much takes 4 s."""
+MOST_YAML_CHARACTERS = 500_000
+"""Of a calibration in YAML, whose reader is slow: this much takes seconds."""
 
 MOST_YAML_NODES = 100_000
 """Of a YAML file once its aliases are written out."""

@@ -17,18 +17,20 @@ def read_bytes(path: Path) -> bytes:
         If there is no such file, it is larger than any session needs, or it cannot be read.
     """
     try:
-        if path.exists() and not path.is_file():
-            raise BadKeyError(f"{path} is no file; allowed: a file, no folder, pipe or device")
+        is_other = path.exists() and not path.is_file()
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise BadKeyError(f"{path} has {size} bytes; allowed: at most {MOST_BYTES}")
-        return path.read_bytes()
+        content = path.read_bytes() if not is_other and size <= MOST_BYTES else b""
     except FileNotFoundError as error:
         raise BadKeyError(f"no such file: {path}") from error
     except OSError as error:
         raise BadKeyError(f"cannot read {path}: {error.strerror or error}") from error
     except ValueError as error:  # a zero byte in the name
         raise BadKeyError(f"not a file name: {str(path)!r}") from error
+    if is_other:
+        raise BadKeyError(f"cannot read {path}: found no file; allowed: no folder, pipe or device")
+    if size > MOST_BYTES:
+        raise BadKeyError(f"{path} has {size} bytes; allowed: at most {MOST_BYTES}")
+    return content
 
 
 def as_text(content: bytes) -> str:
