@@ -45,6 +45,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
+    "calibration": GROUND
+    | {"sensors", "body", "density", "objective", "search", "fit", "tracking"}
+    | {"frames", "session", "runner"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {
