@@ -14,7 +14,10 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"}
+GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
+    "encoding",
+    "whole_files",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
@@ -22,6 +25,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "selection": set(),
     "constants": set(),
     "threads": set(),
+    "encoding": set(),
+    "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,
@@ -48,6 +53,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "calibration": GROUND
     | {"sensors", "body", "density", "objective", "search", "fit", "tracking"}
     | {"frames", "session", "runner"},
+    "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -49,6 +49,24 @@ LEAST_DELAY_S = 1e-6
 """Sensors that differ by less count as in step."""
 
 
+@dataclass(frozen=True)
+class Memory:
+    """All that a run knows between two frames.
+
+    Attributes
+    ----------
+    track : Track
+    tracked : bool
+        Whether the frame before convinced.
+    """
+
+    track: Track
+    tracked: bool = False
+
+
+Remember: TypeAlias = Callable[[Memory], None]
+
+
 def run(
     session: Session,
     *,
@@ -57,6 +75,8 @@ def run(
     selection: Selection = ALL_FRAMES,
     T_start: Floats | None = None,
     watch: Watch | None = None,
+    memory: Memory | None = None,
+    remember: Remember | None = None,
 ) -> Generator[Estimate, None, None]:
     """Estimate the pose of every frame of a recording.
 
@@ -77,6 +97,10 @@ def run(
         Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
         raw frames and the features found in them, while tracking around the body only; its time
         is not in the latency.
+    memory : Memory or None
+        What a run knew after the frame before the first of `selection`; None: nothing.
+    remember : callable or None
+        Called with what is known after a frame, before its estimate is yielded.
 
     Returns
     -------
@@ -99,7 +123,8 @@ def run(
         session = replace(session, estimator=options)
     tracker, track = begin(session, T_start)
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    return _estimates(session, tracker, track, frames, watch)
+    begun = Memory(track) if memory is None else memory
+    return _estimates(session, tracker, begun, frames, watch, remember)
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
@@ -160,12 +185,13 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 def _estimates(
     session: Session,
     tracker: Tracker,
-    track: Track,
+    memory: Memory,
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
+    remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
     expectation = Expectation(tracker.body, _windowed(session), tracker.free)
-    tracked = False
+    track, tracked = memory.track, memory.tracked
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -176,6 +202,8 @@ def _estimates(
             estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
             if watch is not None:
                 watch(frame_set, step.views, estimate)
+            if remember is not None:
+                remember(Memory(track, tracked))
             yield estimate
 
 

@@ -30,6 +30,15 @@ class Format(StrEnum):
     ros = "ros"
 
 
+class LengthUnit(StrEnum):
+    """Units of length."""
+
+    m = "m"
+    cm = "cm"
+    mm = "mm"
+    um = "um"
+
+
 class ConvertFormat(StrEnum):
     """Formats that poses are converted to."""
 
@@ -147,6 +156,33 @@ def inspect(
     from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
 
     inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
+
+
+@app.command("import")
+def import_(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
+            "and at most one body: .csv, .rom, .vsk or .obj.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The session file, which must be new.")
+    ],
+    unit: Annotated[
+        LengthUnit, typer.Option(help="Unit of lengths in the session.")
+    ] = LengthUnit.mm,
+    lengths: Annotated[
+        LengthUnit | None,
+        typer.Option(help="Unit of translations in files whose format does not fix it."),
+    ] = None,
+) -> None:
+    """Make a session of the calibration files of other programs."""
+    from mixpose.cli.importing import import_files  # noqa: PLC0415
+
+    import_files(files, output, unit=unit.value, lengths=None if lengths is None else lengths.value)
 
 
 @app.command()

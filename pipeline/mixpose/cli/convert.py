@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
+from mixpose.whole_files import appearing_whole
 
 _BY_SUFFIX = {
     ".jsonl": "jsonl",
@@ -86,7 +88,10 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
     if name == "ros" and request.relative_to is not None:
         options["frame_id"] = request.relative_to
     header = header_of(poses, _unit(poses, request), __version__)
-    with Output(request.output, name, header, options=options) as output:
+    with ExitStack() as stack:
+        path = request.output
+        part = None if path is None else stack.enter_context(appearing_whole(path))
+        output = stack.enter_context(Output(part, name, header, options=options, called=path))
         for line in lines:
             output.write(relative_to(T_sensor_world, estimate_of(line)))
 

@@ -6,8 +6,9 @@ import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import TextIO, cast
 
+from mixpose.cli.lines import LineFile
 from mixpose.errors import SessionError
 from mixpose.poses.formats import FORMATS, PoseWriter
 from mixpose.poses.header import Header
@@ -30,10 +31,12 @@ class Output:
     format_name : str
         Of `mixpose.poses.formats.FORMATS`.
     header : Header
-    append : bool
-        Go on in a file of JSON lines that has its header already.
+    goes_on : LineFile or None
+        A file of JSON lines that has its header already, in place of opening `path`.
     options : mapping
         What the writer of the format takes besides.
+    called : Path or None
+        What messages call the file, where that is not `path`.
     """
 
     def __init__(
@@ -42,13 +45,17 @@ class Output:
         format_name: str,
         header: Header,
         *,
-        append: bool = False,
+        goes_on: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
+        called: Path | None = None,
     ) -> None:
+        self._called = called or path
         self._path, self._format, self._header = path, format_name, header
-        self._append, self._options = append, options or {}
-        self._stream: TextIO | None = None
+        self._options = options or {}
         self._writer: PoseWriter | None = None
+        self.file = goes_on
+        if goes_on is not None:
+            self._writer = JsonlWriter(_as_stream(goes_on), header, resume=True)
 
     def __enter__(self) -> Output:
         return self
@@ -59,12 +66,14 @@ class Output:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is None and self._writer is None and not (self._path and self._path.exists()):
-            self._open()  # a run without frames says at least what it was
-        if self._writer is not None and not isinstance(error, OSError):
-            self._writer.close()
-        if self._stream is not None and self._path is not None:
-            self._stream.close()
+        try:
+            if error is None and self._writer is None:
+                self._open()  # a run without frames says at least what it was
+            if self._writer is not None and not isinstance(error, OSError | SessionError):
+                self._writer.close()
+        finally:
+            if self.file is not None:
+                self.file.close()
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame, at once."""
@@ -72,25 +81,16 @@ class Output:
         writer.write(estimate)
 
     def _open(self) -> PoseWriter:
-        stream: TextIO = sys.stdout
         if self._path is not None:
-            try:
-                stream = open_text(self._path, append=self._append)
-            except OSError as error:
-                raise SessionError(
-                    f"-o {self._path}: cannot be written: {error.strerror}"
-                ) from error
-        if self._format == "jsonl":
-            self._writer = JsonlWriter(stream, self._header, resume=self._append)
-        else:
-            self._writer = FORMATS[self._format](stream, self._header, **self._options)
-        self._stream = stream
+            self.file = LineFile(self._path, called=self._called)
+        stream = sys.stdout if self.file is None else _as_stream(self.file)
+        self._writer = FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
-def open_text(path: Path, *, append: bool) -> TextIO:
-    """Open a text file for writing, the same bytes on every system."""
-    return path.open("a" if append else "w", encoding="utf-8", newline="\n")
+def _as_stream(file: LineFile) -> TextIO:
+    """The writers only ever write and flush."""
+    return cast(TextIO, file)
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -178,28 +179,48 @@ def _is_json(line: bytes) -> bool:
     return True
 
 
-def resume_point(path: str | Path, header: Header) -> int | None:
-    """Find the frame that an interrupted run wrote last, and drop a half-written line after it.
+@dataclass(frozen=True)
+class ResumePoint:
+    """The last whole line of an interrupted run.
+
+    Attributes
+    ----------
+    frame : int
+        Its frame.
+    lines : int
+        Lines of this frame.
+    size, checksum : int
+        Of the file up to its end: bytes and CRC-32.
+    """
+
+    frame: int
+    lines: int
+    size: int
+    checksum: int
+
+
+def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
+    """Find the frame that an interrupted run wrote last.
 
     Parameters
     ----------
     path : path
-        What the interrupted run wrote.
+        What the interrupted run wrote; it is left as it is.
     header : Header
         Header of the run that is to go on.
 
     Returns
     -------
-    int or None
-        Number of the last whole frame; the caller appends with ``JsonlWriter(..., resume=True)``.
-        None where no frame is whole or no file is there: the caller writes the file afresh.
+    ResumePoint or None
+        What follows it is a half-written line, to be cut off.  None where no frame is whole or no
+        file is there: the caller writes the file afresh.
 
     Raises
     ------
     SessionError
         If the file is of another session, seed, unit, recording or version of mixpose.
     RecordingError
-        If the file is not a poses file; it is left as it is.
+        If the file is not a poses file.
     """
     path = Path(path)
     if not path.exists():
@@ -214,13 +235,9 @@ def resume_point(path: str | Path, header: Header) -> int | None:
         _check_same_run(path, so_far.header, header)
     if not so_far.poses:
         return None
-    if whole < len(data):
-        try:
-            with path.open("r+b") as stream:
-                stream.truncate(whole)
-        except OSError as error:
-            raise RecordingError(f"{path}: {error.strerror}, so no run can go on in it") from error
-    return so_far.poses[-1].frame
+    frame = so_far.poses[-1].frame
+    lines = sum(line.frame == frame for line in so_far.poses)
+    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]))
 
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import Floats
 from mixpose.session.arrays import is_number, numbers
-from mixpose.session.markers import Markers, read_markers
+from mixpose.session.marker_files import read_marker_file
+from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
+from mixpose.session.setup import Unit
 from mixpose.session.values import SIGMA_ALLOWED
 
 FEWEST_FEATURES = 3
@@ -20,7 +22,7 @@ FEWEST_FEATURES = 3
 _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 
 
-def build_body(table: ObjectTable, folder: Path) -> Body:
+def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
     Parameters
@@ -28,13 +30,15 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     table : ObjectTable
     folder : Path
         What the marker file's path is relative to.
+    unit : {"m", "cm", "mm", "um"}
+        Of the session, into which lengths of other programs' files are converted.
 
     Raises
     ------
     BadKeyError
         If there are fewer than three features, or spread or normals do not fit them.
     """
-    markers = _markers(table, folder)
+    markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
@@ -64,7 +68,7 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
-    normals = _normals(table.normals, count)
+    normals = _normals(_stated_normals(table, markers, count), count)
     return Body(table.name, tuple(features), normals, _gravity(table))
 
 
@@ -80,12 +84,12 @@ def _gravity(table: ObjectTable) -> Gravity | None:
     return Gravity(table.gravity.direction, table.gravity.sigma)
 
 
-def _markers(table: ObjectTable, folder: Path) -> Markers | None:
+def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers | None:
     if table.file is not None:
         if table.points is not None:
             raise BadKeyError("stands beside points; allowed: one of the two", "file")
         with under("file"):
-            return read_markers(folder / table.file)
+            return read_marker_file(folder / table.file, unit)
     if table.points is not None:
         return Markers(table.points, None)
     if table.segments is None:
@@ -197,6 +201,13 @@ def _positive(covariance: Floats) -> Floats:
             "whose eigenvalues is negative"
         )
     return covariance
+
+
+def _stated_normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+    """Those of the session, else those of the marker file where it has all features."""
+    if table.normals is not None or markers is None or markers.normals is None:
+        return table.normals
+    return markers.normals if len(markers.normals) == count else None
 
 
 def _normals(normals: Floats | None, count: int) -> Floats | None:

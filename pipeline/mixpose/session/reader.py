@@ -65,7 +65,7 @@ def _parse(text: str) -> dict[str, Any]:
 def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
     table: SessionTable = validate(SessionTable, data)
     with under("object"):
-        body = build_body(table.object, path.parent)
+        body = build_body(table.object, path.parent, table.unit)
     with under("start"):
         start = _start(table.start)
     with under("estimator"):
@@ -77,7 +77,7 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
         body=body,
         start=start,
         estimator=estimator,
-        sensors=build_sensors(table.sensor, table.extract, path.parent),
+        sensors=build_sensors(table.sensor, table.extract, path.parent, table.unit),
     )
 
 

@@ -53,10 +53,12 @@ class ObjectTable(Table):
     Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`
     """
     file: Annotated[
-        str | None, Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]")
+        str | None,
+        Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"),
     ] = None
     """A table of points in place of `points`: a row per point under the header `name,x,y,z`, with
-    one, three or nine more columns for the spread of each.
+    one, three or nine more columns for the spread of each. Or a body of another program: NDI's
+    `.rom` and Vicon's `.vsk` (both in mm), AsterTrack's `.obj` (in m), converted to `unit`.
 
     Example: `file = "markers.csv"`
     """

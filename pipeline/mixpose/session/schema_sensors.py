@@ -5,7 +5,7 @@ How keys are described is said in `schema`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
@@ -13,7 +13,9 @@ from mixpose.rigid import Floats
 from mixpose.session.arrays import RESOLUTION_FORM
 from mixpose.session.arrays import resolution as resolution_of
 from mixpose.session.intrinsics import MATRIX_FORM
+from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
+from mixpose.session.setup import Unit
 from mixpose.session.values import (
     SOURCE_ALLOWED,
     ArrayOf,
@@ -29,8 +31,9 @@ class CalibrationTable(Table):
     """
 
     file: Text
-    """An OpenCV file (YAML or XML), a Kalibr camchain or a ROS camera_info, told apart by
-    content.
+    """A file of OpenCV (YAML, XML or JSON), Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP,
+    told apart by content. Where it says how cameras stand to each other, and `T_sensor_world` is
+    left out, that is taken over; the world is then the one of the file.
 
     Example: `file = "stereo.yml"`
     """
@@ -49,11 +52,17 @@ class CalibrationTable(Table):
     Example: `distortion = "D2"`
     """
     camera: Annotated[
-        str | None, Field(min_length=1, description='a camera of a Kalibr file, like "cam0"')
+        str | None, Field(min_length=1, description='a camera of the file, like "cam0"')
     ] = None
-    """Camera to take where a Kalibr file holds several.
+    """Camera to take where a file holds several.
 
     Example: `camera = "cam1"`
+    """
+    unit: Annotated[Unit | None, Field(description=one_of(get_args(Unit)))] = None
+    """Unit of the file's translations, where its format does not fix it (Kalibr and caliscope work
+    in metres).
+
+    Example: `unit = "mm"`
     """
 
 

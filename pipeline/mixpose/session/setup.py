@@ -17,6 +17,11 @@ Unit: TypeAlias = Literal["m", "cm", "mm", "um"]
 METRES_PER_UNIT: dict[Unit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 
 
+def scale_between(unit: Unit, other: Unit) -> float:
+    """What lengths in one unit are multiplied by to be in another; exactly 1 for the same."""
+    return float(f"{METRES_PER_UNIT[unit] / METRES_PER_UNIT[other]:.0e}")
+
+
 @dataclass(frozen=True)
 class Start:
     """Where the object is at first, ``[start]``.
