@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
+    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -49,10 +50,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
-    "calibration": GROUND
-    | {"sensors", "body", "density", "objective", "search", "fit", "tracking"}
-    | {"frames", "session", "runner"},
+    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
+    | {"frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
@@ -62,6 +61,18 @@ MAY_IMPORT["rerun_file"] = GROUND | {
     "density",
     "frames",
     "poses",
+    "session",
+    "runner",
+}
+MAY_IMPORT["calibration"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "objective",
+    "search",
+    "fit",
+    "tracking",
+    "frames",
     "session",
     "runner",
 }

@@ -15,7 +15,7 @@ from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import SIGMA_ALLOWED
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED
 
 FEWEST_FEATURES = 3
 
@@ -69,7 +69,31 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
     normals = _normals(_stated_normals(table, markers, count), count)
-    return Body(table.name, tuple(features), normals, _gravity(table))
+    radii = _radii(table, normals, len(points), count)
+    return Body(table.name, tuple(features), normals, _gravity(table), table.shape, radii)
+
+
+def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) -> Floats | None:
+    """Radii (N,) of spheres or disks, 0 for segments; None for points."""
+    if table.shape == "point":
+        if table.radius is not None:
+            raise BadKeyError(
+                'stands beside shape = "point"; allowed: a shape that has one', "radius"
+            )
+        return None
+    if table.radius is None:
+        raise BadKeyError(f'missing; shape = "{table.shape}" needs {RADIUS_ALLOWED}', "radius")
+    if table.shape == "disk" and normals is None:
+        raise BadKeyError('missing; shape = "disk" needs the normal of each disk', "normals")
+    with under("radius"):
+        given = table.radius if isinstance(table.radius, list) else [table.radius] * points
+        own = numbers(given, (None,), RADIUS_ALLOWED)
+        if len(own) != points:
+            text = f"found {len(own)} radii for {points} points"
+            raise BadKeyError(f"{text}; allowed: {RADIUS_ALLOWED}")
+        if (own <= 0).any():
+            raise BadKeyError(f"found {own.min():g}; allowed: {RADIUS_ALLOWED}, greater than 0")
+    return np.concatenate([own, np.zeros(count - points)])
 
 
 def _gravity(table: ObjectTable) -> Gravity | None:

@@ -19,6 +19,7 @@ THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
 SIGMA_ALLOWED = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
+RADIUS_ALLOWED = "a length greater than 0, or a list with one per point"
 FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
 SOURCE_ALLOWED = (
     "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
