@@ -21,6 +21,7 @@ GaugeOf = Callable[[Rig], Floats]
 Weighted = tuple[int, Pairs, Rows, Floats]
 
 _SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
+_BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,15 +183,20 @@ def _noise(
     dimensions = [eye.dimension for eye in rig.sensors]
     used = _unknowns(bundle, alone, dimensions)
     found = np.array(sigmas, dtype=np.float64)
-    for (sensor, _, rows, _), weight in zip(weighted, alone, strict=True):
-        m = dimensions[sensor]
-        total = float(weight.sum())
-        if total > 3:
-            tilted = float(weight @ (rows.residual**2).sum(axis=1)) / (m * total * (1 - used))
-            # a Gaussian of variance s² under the weight exp(-d²/4b²) has 1/(1/s² + 1/2b²)
-            inverse = max(1 / max(tilted, 1e-300) - 1 / (2 * blur[sensor] ** 2), 1e-300)
-            spread = np.sqrt(1 / inverse)
-            found[sensor] = np.clip(spread, _SHARPEST * sigmas[sensor], 2 * sigmas[sensor])
+    for unit in sorted({eye.unit for eye in rig.sensors}):
+        # sensors of a kind have one noise, in σ_ε: with one each, poses would be drawn to the
+        # sensor that happens to fit best until it had no noise at all
+        alike = [s for s, eye in enumerate(rig.sensors) if eye.unit == unit]
+        squared = [weighted[s][2].residual / sigmas[s] for s in alike]
+        total = sum(dimensions[s] * float(alone[s].sum()) for s in alike)
+        if total <= 6:
+            continue
+        spent = sum(float(alone[s] @ (r**2).sum(axis=1)) for s, r in zip(alike, squared))
+        tilted = spent / (total * (1 - used))
+        # a Gaussian of variance s² under the weight exp(-d²/4b²) has 1/(1/s² + 1/2b²)
+        width = float(np.median(blur[alike] / sigmas[alike]))
+        inverse = max(1 / max(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
+        found[alike] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
     return found
 
 

@@ -22,13 +22,14 @@ from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import lines_of
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import open_text, refuse_to_overwrite_but
+from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Floats
 from mixpose.session import Session, load_session
+from mixpose.whole_files import appearing_whole
 
 
 @dataclass(frozen=True)
@@ -86,8 +87,8 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
             saved.close(finished=finished)
     text = calibrated_text(session, found, output, __version__)
     try:
-        with open_text(output, append=False) as stream:
-            stream.write(text)
+        with appearing_whole(output) as part:
+            part.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
     sys.stdout.write("\n".join(lines_of(found, session.unit)) + "\n")
