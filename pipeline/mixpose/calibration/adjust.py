@@ -20,6 +20,7 @@ from mixpose.records import Floats
 GaugeOf = Callable[[Rig], Floats]
 Weighted = tuple[int, Pairs, Rows, Floats]
 
+_MOST_BLURS = 40
 _SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
 _BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
 
@@ -63,7 +64,7 @@ def first_blurs(
         if len(off):
             widest = rules.widest * feature_spacing(rig, poses, sensor)
             wanted = rules.first_blur * float(np.median(off))
-            blurs[sensor] = max(min(wanted, widest), sigmas[sensor])
+            blurs[sensor] = max(min(wanted, widest), _SHARPEST * sigmas[sensor])
     return blurs
 
 
@@ -96,18 +97,19 @@ def adjust(
         Known noise, of which none is learnt.
     """
     blur = first_blurs(bundle, rig, poses, sigmas, rules) if blurs is None else blurs
-    for _ in range(64):
+    for _ in range(_MOST_BLURS):
         for _ in range(rules.steps):
             weighted, _ = _weighted(bundle, rig, poses, blur, blur, rules)
-            rig, poses, _ = _climbed(bundle, rig, poses, gauge_of, weighted, sigmas)
-        if (blur <= sigmas).all():
+            rig, poses, _ = _climbed(bundle, rig, poses, gauge_of, weighted)
+        learnt = _noise(bundle, rig, poses, blur, sigmas, rules) if noise is None else noise
+        last = rules.blur * learnt
+        if (blur <= last / rules.narrowing).all():
             break
-        blur = np.maximum(blur * rules.narrowing, sigmas)
-    learnt = _noise(bundle, rig, poses, blur, sigmas, rules) if noise is None else noise
+        blur = np.maximum(blur * rules.narrowing, last)
     for _ in range(rules.last_steps):
         blur = rules.blur * learnt
         weighted, _ = _weighted(bundle, rig, poses, blur, learnt, rules)
-        rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted, learnt)
+        rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
         before = learnt
         if noise is None:
             learnt = _noise(bundle, rig, poses, blur, sigmas, rules)
@@ -143,7 +145,6 @@ def _climbed(
     poses: Floats,
     gauge_of: GaugeOf,
     weighted: Sequence[Weighted],
-    noise: Floats,
 ) -> tuple[Rig, Floats, float]:
     """One step; its size in standard deviations of the rig's parameters."""
     normal = normal_equations(bundle, len(poses), weighted, 1e-9)

@@ -20,7 +20,7 @@ from mixpose.calibration.residuals import met_share, residuals_of, sights_of
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.start import Start, searched, start_from_cameras
+from mixpose.calibration.start import Start, searched, start_from_cameras, start_together
 from mixpose.calibration.task import Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
@@ -48,8 +48,11 @@ def calibrate(
     RecordingError
         If the body is not found in enough frames.
     """
-    known = searched(task, rules, progress, {} if found is None else found)
-    start = start_from_cameras(task, known, rules)
+    if task.cameras:
+        known = searched(task, rules, progress, {} if found is None else found)
+        start = start_from_cameras(task, known, rules)
+    else:
+        start = start_together(task, rules, progress)
     if not len(start.poses):
         raise RecordingError(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "

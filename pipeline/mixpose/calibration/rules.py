@@ -42,6 +42,10 @@ class CalibrationRules:
         "standard deviation by the size of what is sought (the rig, a focal length, a turn of "
         "1 rad): nothing is known of such a direction",
     )
+    widened: tuple[float, ...] = constant(
+        (1.0, 4.0, 12.0), "σ_ε with which sensors that know no pose alone are tried together"
+    )
+    convinced: float = constant(0.8, "of the frames: then no wider blur is tried")
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")
     moved: float = constant(
         4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"

@@ -9,6 +9,7 @@ import numpy as np
 
 from mixpose.calibration.alone import Hypotheses, hypotheses
 from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.jointly import joint_poses
 from mixpose.calibration.linking import Link, agreed, link_all
 from mixpose.calibration.rig import Rig
 from mixpose.calibration.rules import CalibrationRules
@@ -99,6 +100,16 @@ def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Sta
         {s: (a, n) for s, (a, n) in through.items()},
         unlinked,
     )
+
+
+def start_together(task: Task, rules: CalibrationRules, progress: Progress) -> Start:
+    """Poses that all sensors together know, or that are known anyway."""
+    if task.known is None:
+        frames, poses = joint_poses(task, rules, progress)
+        return Start(task.rig, frames, poses, {}, ())
+    frames = tuple(frame for frame in task.frames if frame.number in task.known)
+    poses = np.array([task.known[frame.number] for frame in frames]).reshape(-1, 4, 4)
+    return Start(task.rig, frames, poses, {}, ())
 
 
 def _without(frame: SeenFrame, sensors: tuple[int, ...]) -> SeenFrame:

@@ -42,6 +42,10 @@ class Task:
         World directions of the body's poses that are not known.
     T_held : (4, 4) float64 or None
         Where the other directions stay.
+    around : (float or None, float or None)
+        Half-widths in degrees and length of where the body is about `T_held`.
+    fuse : bool
+        Whether a frame's pose tells of the next one's where sensors alone tell little.
     known : mapping of int to (4, 4) float64, or None
         Poses of the body by frame number, where they are known.
     length : (int, int) or None
@@ -56,6 +60,8 @@ class Task:
     body_free: bool = False
     pose_free: NDArray[np.bool_] = field(default_factory=lambda: np.ones(6, dtype=np.bool_))
     T_held: Floats | None = None
+    around: tuple[float | None, float | None] = (None, None)
+    fuse: bool = True
     known: Mapping[int, Floats] | None = None
     length: tuple[int, int] | None = None
 

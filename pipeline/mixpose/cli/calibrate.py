@@ -113,6 +113,7 @@ def task_of(
             f"{session.path}: --free delay: found frames without times; allowed: fps or times for "
             "every sensor, or a video"
         )
+    start = session.start
     return Task(
         rig=rig,
         body=session.body,
@@ -121,7 +122,9 @@ def task_of(
         free=free,
         body_free=body,
         pose_free=free_mask(session.estimator),
-        T_held=None if session.start is None else session.start.T_world_object,
+        T_held=None if start is None else start.T_world_object,
+        around=(None, None) if start is None else (start.rotation_deg, start.distance),
+        fuse=session.estimator.fuse,
         known=known,
     )
 
