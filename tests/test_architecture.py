@@ -38,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
+    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -49,7 +50,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
+    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
+    | {"frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO, cast
 
 from mixpose.cli.lines import LineFile
 from mixpose.errors import SessionError
-from mixpose.poses.formats import FORMATS, PoseWriter
+from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY, PoseWriter
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
 from mixpose.records import Estimate
@@ -86,6 +87,75 @@ class Output:
         stream = sys.stdout if self.file is None else _as_stream(self.file)
         self._writer = FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
+
+
+class OutputPerBody:
+    """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
+
+    Parameters
+    ----------
+    path : Path or None
+        ``poses.tum`` stands for ``poses.<body>.tum``.
+    format_name : str
+    labels : sequence of str
+        Names of the bodies, identical ones numbered.
+    start : callable
+        Makes the output of one body from the path of its file.
+
+    Raises
+    ------
+    SessionError
+        If there is no path.
+    """
+
+    file: LineFile | None = None
+
+    def __init__(
+        self,
+        path: Path | None,
+        format_name: str,
+        labels: Sequence[str],
+        start: Callable[[Path], Output],
+    ) -> None:
+        if path is None:
+            raise SessionError(
+                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
+                "with -o: each body gets one with its own name in it"
+            )
+        self._outputs = {label: start(body_path(path, label)) for label in labels}
+
+    def __enter__(self) -> OutputPerBody:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with ExitStack() as stack:
+            for output in self._outputs.values():
+                stack.callback(output.__exit__, kind, error, trace)
+
+    def write(self, estimate: Estimate) -> None:
+        """Write one frame of one body, at once."""
+        self._outputs[estimate.label].write(estimate)
+
+
+def body_path(path: Path, label: str) -> Path:
+    """Where the poses of one of several bodies go: ``poses.tum`` → ``poses.tool.tum``."""
+    word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
+    return path.with_name(f"{path.stem}.{word}{path.suffix}")
+
+
+def is_apart(format_name: str, labels: Sequence[str]) -> bool:
+    """Whether a format needs a file for each of the bodies."""
+    return format_name in ONE_TRAJECTORY and len(labels) > 1
+
+
+def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
+    """The files that poses go to."""
+    return [body_path(path, label) for label in labels] if is_apart(format_name, labels) else [path]
 
 
 def _as_stream(file: LineFile) -> TextIO:

@@ -10,8 +10,15 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
+from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
@@ -40,8 +47,14 @@ def run_session(path: Path, request: RunRequest) -> None:
     replaced = named_sources(request.sources)
     header = header_of(session, replaced)
     opened = open_sources(session, replaced)
-    if request.output is not None and not _is_device(request.output):
-        refuse_to_overwrite(request.output, _inputs(session))
+    outputs = (
+        []
+        if request.output is None
+        else written_paths(request.output, request.format, header.labels)
+    )
+    for each in outputs:
+        if not _is_device(each):
+            refuse_to_overwrite(each, _inputs(session))
     go_on = Continuation(None, request.selection)
     if request.resume:
         _refuse_live(opened)
@@ -52,7 +65,7 @@ def run_session(path: Path, request: RunRequest) -> None:
         return
     warn_of_sources(opened)
     summary = Summary(session)
-    output = Output(request.output, request.format, header, goes_on=go_on.file)
+    output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
         watch = _overlay(stack, session, request)
         memories: deque[Memory] = deque(maxlen=1)
@@ -69,13 +82,25 @@ def run_session(path: Path, request: RunRequest) -> None:
         shown = _with_progress(estimates, session, quiet=request.output is None)
         for estimate in _not_there(shown, go_on.there):
             output.write(estimate)
-            if notes is not None and output.file is not None:
+            is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
+            if notes is not None and output.file is not None and is_whole:
                 notes.remember(estimate.frame, output.file, memories[-1])
             summary.add(estimate)
             if request.debug and estimate.proposer != predicted.__name__:
                 say(f"frame {estimate.frame}: {origin_of(estimate)}")
-    written = [str(path) for path in (request.output, request.overlay) if path is not None]
-    summary.say(f" -> {', '.join(written)}" if written else "")
+    names = [str(path) for path in (*outputs, request.overlay) if path is not None]
+    summary.say(f" -> {', '.join(names)}" if names else "")
+
+
+def _output(
+    request: RunRequest, header: Header, goes_on: LineFile | None
+) -> Output | OutputPerBody:
+    name = request.format
+    if not is_apart(name, header.labels):
+        return Output(request.output, name, header, goes_on=goes_on)
+    return OutputPerBody(
+        request.output, name, header.labels, lambda path: Output(path, name, header)
+    )
 
 
 @contextmanager
@@ -156,9 +181,10 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
         session_sha256=session.sha256,
         mixpose=__version__,
         seed=session.estimator.seed,
-        symmetries={session.body.name: session.body.symmetries},
+        symmetries={one.body.name: one.body.symmetries for one in session.objects},
         sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
+        objects={one.body.name: one.count for one in session.objects},
     )
 
 

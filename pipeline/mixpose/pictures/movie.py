@@ -57,6 +57,7 @@ class Overlay:
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
         self._session = session
         self._sink = _sink(path, resume)
+        self._estimates: list[Estimate] = []
 
     def __enter__(self) -> Overlay:
         return self
@@ -70,9 +71,12 @@ class Overlay:
         self._sink.close()
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Draw one frame."""
-        picture = draw_scene(self._session, frame_set, estimate)
-        self._sink.add(picture, estimate.frame, estimate.time_s)
+        """Draw one frame, with the last of its bodies."""
+        self._estimates.append(estimate)
+        if len(self._estimates) == len(self._session.labels):
+            picture = draw_scene(self._session, frame_set, *self._estimates)
+            self._sink.add(picture, estimate.frame, estimate.time_s)
+            self._estimates = []
 
 
 def _sink(path: Path, resume: bool) -> Sink:

@@ -70,6 +70,8 @@ def _header_line(header: Header) -> dict[str, Any]:
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
     }
+    if len(header.labels) > 1:
+        line["objects"] = dict(header.objects)
     if header.sources:
         line["sources"] = dict(header.sources)
     return line
@@ -84,6 +86,7 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
         "frame": int(estimate.frame),  # NumPy integers are no JSON
         "time_s": plain_or_none(estimate.time_s),
         "object": estimate.object,
+        **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
         "T_world_object": plain_or_none(T),
         "quaternion_xyzw": plain_or_none(turn),
@@ -235,9 +238,22 @@ def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
         _check_same_run(path, so_far.header, header)
     if not so_far.poses:
         return None
-    frame = so_far.poses[-1].frame
+    frame, whole = _last_whole_frame(so_far, data[:whole], len(header.labels))
+    if frame is None:
+        return None
     lines = sum(line.frame == frame for line in so_far.poses)
     return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]))
+
+
+def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | None, int]:
+    """The last frame that has a line for each body, and the length of the file up to there."""
+    poses, whole = file.poses, len(data)
+    last = [pose for pose in poses if pose.frame == poses[-1].frame]
+    if len(last) >= bodies:
+        return poses[-1].frame, whole
+    lines = data.split(b"\n")
+    before = poses[-len(last) - 1].frame if len(poses) > len(last) else None
+    return before, sum(len(line) + 1 for line in lines[: last[0].line - 1])
 
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, get_args
 
-from pydantic import Field, PlainValidator
+from pydantic import BeforeValidator, Field, PlainValidator
 
 from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
@@ -20,6 +20,14 @@ from mixpose.session.schema_common import ExtractTable, Placement, Positive, Tab
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
 from mixpose.session.values import FREE_ALLOWED, RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+
+MOST_ALIKE = 1000
+"""Identical bodies that a session may have."""
+
+
+def as_list(value: Any) -> Any:
+    """One table as a list of tables."""
+    return [value] if isinstance(value, dict) else value
 
 
 class GravityTable(Table):
@@ -37,9 +45,47 @@ class GravityTable(Table):
     """
 
 
+class StartTable(Placement):
+    """About where the body is in the first frame that is estimated. Without it the first pose is
+    searched for in all orientations. It needs `T_world_object`, or a rotation and `translation`.
+    """
+
+    T_world_object: Annotated[
+        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
+    ] = None
+    """The pose: maps coordinates of the body to coordinates of the world.
+
+    Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`
+    """
+    euler_xyz_deg: Annotated[
+        Floats | None, ArrayOf((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
+    ] = None
+    """The rotation as turns about the fixed axes, x first.
+
+    Example: `euler_xyz_deg = [0, 0, 45]`
+    """
+    rotation_deg: Annotated[
+        Positive | None,
+        Field(le=180, description="half-width in degrees, greater than 0, at most 180"),
+    ] = None
+    """How far the orientation may be off; where it is left out, 5 degrees.
+
+    Example: `rotation_deg = 10`
+    """
+    distance: Annotated[
+        Positive | None, Field(description="half-width, a length greater than 0")
+    ] = None
+    """How far the position may be off, in `unit`; where it is left out, a tenth of the body's
+    radius.
+
+    Example: `distance = 10`
+    """
+
+
 class ObjectTable(Table):
     """The rigid body: where its features are. It needs `points`, `file` or `segments`, of points
-    and segments together at least three.
+    and segments together at least three. Several bodies in one scene are tables `[[object]]`, in
+    double brackets, one for each; see `docs/several-bodies.md`.
     """
 
     name: Text
@@ -106,42 +152,19 @@ class ObjectTable(Table):
 
     Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`
     """
+    count: Annotated[
+        int, Field(ge=1, le=MOST_ALIKE, description=f"an integer from 1 to {MOST_ALIKE}")
+    ] = 1
+    """How many identical ones there are. Their poses carry the key `instance`, from 0; which one
+    is which is kept while they are tracked.
 
-
-class StartTable(Placement):
-    """About where the body is in the first frame that is estimated. Without it the first pose is
-    searched for in all orientations. It needs `T_world_object`, or a rotation and `translation`.
+    Example: `count = 4`
     """
+    start: Annotated[StartTable | None, Field(description="a table [object.start]")] = None
+    """See `[start]`, which this replaces where there are several bodies; of identical ones the
+    first is there.
 
-    T_world_object: Annotated[
-        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
-    ] = None
-    """The pose: maps coordinates of the body to coordinates of the world.
-
-    Example: `T_world_object = [[1, 0, 0, 20], [0, 1, 0, 10], [0, 0, 1, 900], [0, 0, 0, 1]]`
-    """
-    euler_xyz_deg: Annotated[
-        Floats | None, ArrayOf((3,), "three angles in degrees, R = Rz(c) Ry(b) Rx(a)")
-    ] = None
-    """The rotation as turns about the fixed axes, x first.
-
-    Example: `euler_xyz_deg = [0, 0, 45]`
-    """
-    rotation_deg: Annotated[
-        Positive | None,
-        Field(le=180, description="half-width in degrees, greater than 0, at most 180"),
-    ] = None
-    """How far the orientation may be off; where it is left out, 5 degrees.
-
-    Example: `rotation_deg = 10`
-    """
-    distance: Annotated[
-        Positive | None, Field(description="half-width, a length greater than 0")
-    ] = None
-    """How far the position may be off, in `unit`; where it is left out, a tenth of the body's
-    radius.
-
-    Example: `distance = 10`
+    Example: `start = { rotation_vector = [0, 0, 1], translation = [20, 10, 900] }`
     """
 
 
@@ -198,8 +221,12 @@ class SessionTable(Table):
 
     Example: `unit = "mm"`
     """
-    object: Annotated[ObjectTable, Field(description="a table [object]")]
-    """See `[object]`."""
+    object: Annotated[
+        list[ObjectTable],
+        BeforeValidator(as_list),
+        Field(min_length=1, description="a table [object], or [[object]] for each of several"),
+    ]
+    """See `[object]`; of several bodies `[[object]]`, one for each."""
     start: Annotated[StartTable | None, Field(description="a table [start]")] = None
     """See `[start]`."""
     estimator: Annotated[EstimatorTable, Field(description="a table [estimator]")] = (
