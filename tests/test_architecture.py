@@ -64,6 +64,18 @@ MAY_IMPORT["rerun_file"] = GROUND | {
     "session",
     "runner",
 }
+MAY_IMPORT["calibration"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "objective",
+    "search",
+    "fit",
+    "tracking",
+    "frames",
+    "session",
+    "runner",
+}
 EDGE = {"cli", "__init__", "__main__"}
 
 

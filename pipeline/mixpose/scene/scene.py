@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mixpose.judgement import decide
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.scene.joint import Joint
@@ -54,7 +53,7 @@ class Scene:
         joint = Joint(self.members, tracks, frame, time_s, views, self.rules)
         joint.solve()
         verdicts = [
-            decide(joint.ranked[k], member.tracker.free, member.tracker.rules.acceptance)
+            member.tracker.verdict(joint.data[k], joint.ranked[k])
             for k, member in enumerate(self.members)
         ]
         outcomes = []

@@ -22,6 +22,7 @@ from mixpose.records import Estimate, Hypothesis, SensorReport
 from mixpose.tracking.delays import in_step
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.reflection import is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
@@ -117,9 +118,16 @@ class Tracker:
         """
         data = self.data(track, frame, time_s, views)
         ranked = self.ranked(data)
-        verdict = decide(ranked, self.free, self.rules.acceptance)
+        verdict = self.verdict(data, ranked)
         estimate = self.estimate(frame, time_s, views, verdict, ranked)
         return self.followed(data, frame, time_s, verdict), estimate
+
+    def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
+        """The decision about a frame from all its poses, the most evident first."""
+        verdict = decide(ranked, self.free, self.rules.acceptance)
+        if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
+            verdict = replace(verdict, status="ambiguous")
+        return verdict
 
     def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
