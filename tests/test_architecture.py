@@ -14,7 +14,10 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"}
+GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
+    "encoding",
+    "whole_files",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
@@ -22,17 +25,20 @@ MAY_IMPORT: dict[str, set[str]] = {
     "selection": set(),
     "constants": set(),
     "threads": set(),
+    "encoding": set(),
+    "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,
     "extraction": GROUND,
     "optimise": set(),
     "objective": GROUND | {"sensors", "body", "density"},
-    "search": GROUND | {"sensors", "body", "density", "objective", "optimise"},
+    "search": GROUND | {"sensors", "body", "density", "objective", "optimise", "judgement"},
     "fit": GROUND | {"sensors", "body", "density", "objective", "optimise"},
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
+    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -44,7 +50,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
+    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
+    | {"frames", "session"},
+    "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {
@@ -53,6 +61,18 @@ MAY_IMPORT["rerun_file"] = GROUND | {
     "density",
     "frames",
     "poses",
+    "session",
+    "runner",
+}
+MAY_IMPORT["calibration"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "objective",
+    "search",
+    "fit",
+    "tracking",
+    "frames",
     "session",
     "runner",
 }
