@@ -131,12 +131,36 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
+@dataclass(frozen=True, eq=False)
+class SharedDensities:
+    """C of all sensors at σ_ε, drawn once for several bodies.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    totals : tuple of float
+        Weight of all that was drawn, per sensor.
+    """
+
+    atlas: Atlas
+    totals: tuple[float, ...]
+
+    @classmethod
+    def drawn(cls, views: Sequence[View]) -> SharedDensities:
+        """Draw views of detections, none of which is empty."""
+        observations = [view.observation for view in views]
+        sigmas = [one.sigma for one in observations]
+        totals = tuple(one.weight for one in observations)
+        return cls(matched_atlas(observations, sigmas, STEPS_PER_SIGMA), totals)
+
+
 def matched_objective(
     views: Sequence[View],
     body: Body,
     sigmas: Sequence[float],
     *,
     steps_per_sigma: float | None = None,
+    shared: SharedDensities | None = None,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -149,6 +173,9 @@ def matched_objective(
         Standard deviation of a feature at this level, per view, in sensor units.
     steps_per_sigma : float or None
         Cells per standard deviation of C; None: fine for grey values at σ_ε.
+    shared : SharedDensities or None
+        Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
+        own detections, and others only where they are out of its reach.
     """
     if steps_per_sigma is None:
         at_last = all(
@@ -164,10 +191,16 @@ def matched_objective(
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
+    if shared is None:
+        atlas = matched_atlas(observations, sigmas, steps_per_sigma)
+    else:
+        atlas = shared.atlas
+        parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
+        energies = energies * np.square(parts)
     return MatchedObjective(
         views=tuple(views),
         projection=projection,
-        atlas=matched_atlas(observations, sigmas, steps_per_sigma),
+        atlas=atlas,
         variances=variances[:, None],
         tops=tops[:, None],
         energies=energies[:, None],

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
-from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.objective import MatchedObjective, SharedDensities, View, matched_objective
 from mixpose.records import SensorReport
 from mixpose.search import SearchState
 from mixpose.tracking.association_likelihood import are_associated
@@ -75,7 +75,10 @@ class SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it; `log` is written by the proposer that searches."""
+    """A frame, and what is known before it; `log` is written by the proposer that searches.
+
+    `shared` are the densities of a whole scene, where the views hold what is left for this body.
+    """
 
     views: Sequence[View]
     body: Body
@@ -86,6 +89,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
 
     @cached_property
@@ -108,7 +112,10 @@ class FrameData:
     @cached_property
     def finest(self) -> MatchedObjective:
         """The matched objective at σ_ε."""
-        return self.at_sigma()
+        if self.shared is None:
+            return self.at_sigma()
+        sigmas = [view.observation.sigma for view in self.views]
+        return matched_objective(self.views, self.body, sigmas, shared=self.shared)
 
     def at_sigma(self, *, narrowed: float = 1.0) -> MatchedObjective:
         """The matched objective at a share of σ_ε."""
@@ -120,7 +127,7 @@ class FrameData:
         if not names:
             return self
         views = [view for view in self.views if view.name not in names]
-        return replace(self, views=views)
+        return replace(self, views=views, shared=None)
 
 
 @dataclass(frozen=True, eq=False)
