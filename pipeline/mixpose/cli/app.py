@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    Format,
+    LengthUnit,
+    PosesFile,
+    SessionFile,
+    Start,
+    Step,
+    Stop,
+)
 
 app = typer.Typer(
     name="mixpose",
@@ -16,45 +27,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
-AllowCode = Annotated[
-    bool,
-    typer.Option(
-        "--allow-code",
-        help='Run functions that the session names: method = "module:function".',
-    ),
-]
-
-
-class Format(StrEnum):
-    """Formats of poses."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-
-
-class LengthUnit(StrEnum):
-    """Units of length."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
-    um = "um"
-
-
-class ConvertFormat(StrEnum):
-    """Formats that poses are converted to."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-    rerun = "rerun"
 
 
 def _version(wanted: bool) -> None:
@@ -106,9 +78,9 @@ def run(
             help="Another recording of a sensor, relative to the working folder; repeatable.",
         ),
     ] = None,
-    start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
-    stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
-    step: Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")] = 1,
+    start: Start = None,
+    stop: Stop = None,
+    step: Step = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
@@ -342,7 +314,7 @@ def simulate(
 
 @app.command()
 def evaluate(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -413,7 +385,7 @@ def schema() -> None:
 
 @app.command()
 def report(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
     truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
 ) -> None:
