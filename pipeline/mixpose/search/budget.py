@@ -128,12 +128,7 @@ class SearchBudget:
         ((3.0, 1), (1.5, 2), (1.0, 3)),
         "the same where not all sensors are cameras",
     )
-    final_plan: tuple[tuple[float, int], ...] = constant(
-        ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"
-    )
-    finalists: int = constant(
-        16, "poses refined by the final plan, and rivals of a pose beyond doubt"
-    )
+    finalists: int = constant(16, "guesses refined as rivals of a pose beyond doubt")
     improvement: float = constant(1.1, "factor in detections explained for another such look")
     checked: int = constant(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
@@ -144,5 +139,14 @@ class SearchBudget:
 THOROUGH = SearchBudget()
 """Everything is tried."""
 
-LIVE = SearchBudget(max_guesses=4000, chunk=1024, shortlist=16, min_shortlist=8, finalists=4)
-"""For each frame of a live stream: 4,000 guesses and the rest of the last batch."""
+LIVE = SearchBudget(
+    max_guesses=2500,
+    chunk=1024,
+    shortlist=8,
+    min_shortlist=6,
+    finalists=4,
+    max_rays=12,
+    subsample=6,
+    descent_features=16,
+)
+"""For each frame of a live stream: 2,500 guesses and the rest of the last batch."""
