@@ -122,7 +122,7 @@ def _places(point: Floats, near: _NearRays, distances: Floats, i: int) -> _Place
 
 def _agreeing(places: _Places, distances: Floats, most: int) -> tuple[Indices, Indices]:
     """Pairs of places of two features and two rays that are best the right distance apart."""
-    x = (places.points - places.points.mean(axis=0)).astype(np.float32)
+    x = (places.points - places.points[:1]).astype(np.float32)
     squares, error = (x * x).sum(axis=1), (np.sqrt(0.5) * places.error).astype(np.float32)
     off = -2 * x @ x.T
     off += squares

@@ -199,11 +199,8 @@ class _Run:
     def _refined(
         self, descent: Descent, poses: Floats, plan: Sequence[tuple[float, int]]
     ) -> Floats:
-        count = len(self._detections)
-        stages = [
-            Stage((factor,) * count, steps, left)
-            for (factor, steps), left in zip(plan, self._budget.survivors)
-        ]
+        count, most = len(self._detections), self._budget.survivors
+        stages = [Stage((factor,) * count, steps, most) for factor, steps in plan]
         return descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
