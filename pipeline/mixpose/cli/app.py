@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from mixpose.cli.app_calibrate import calibrate
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    Format,
+    LengthUnit,
+    PosesFile,
+    SessionFile,
+    Start,
+    Step,
+    Stop,
+)
 
 app = typer.Typer(
     name="mixpose",
@@ -16,45 +28,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
-AllowCode = Annotated[
-    bool,
-    typer.Option(
-        "--allow-code",
-        help='Run functions that the session names: method = "module:function".',
-    ),
-]
-
-
-class Format(StrEnum):
-    """Formats of poses."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-
-
-class LengthUnit(StrEnum):
-    """Units of length."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
-    um = "um"
-
-
-class ConvertFormat(StrEnum):
-    """Formats that poses are converted to."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-    rerun = "rerun"
 
 
 def _version(wanted: bool) -> None:
@@ -106,9 +79,9 @@ def run(
             help="Another recording of a sensor, relative to the working folder; repeatable.",
         ),
     ] = None,
-    start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
-    stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
-    step: Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")] = 1,
+    start: Start = None,
+    stop: Stop = None,
+    step: Step = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
@@ -342,7 +315,7 @@ def simulate(
 
 @app.command()
 def evaluate(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -413,7 +386,7 @@ def schema() -> None:
 
 @app.command()
 def report(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
     truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
 ) -> None:
@@ -423,44 +396,4 @@ def report(
     write_report(poses, truth, output)
 
 
-@app.command()
-def calibrate(
-    session: SessionFile,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="CALIBRATED.toml", help="The calibrated session."),
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(metavar="POSES.jsonl", help="Known poses of the body; else none is known."),
-    ] = None,
-    free: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SENSOR:WHAT",
-            help="What is sought: pose, focal, principal_point, distortion, delay, drift, "
-            "position, range_bias, of a sensor or, without its name, of all; or body, the marker "
-            "coordinates. Repeatable. Else the poses of all cameras but the first and the "
-            "positions of range sensors.",
-        ),
-    ] = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
-    ] = None,
-) -> None:
-    """Calibrate sensors from a recording of the body, without matching markers."""
-    from mixpose.cli.calibrate import (  # noqa: PLC0415
-        CalibrateRequest,
-        calibrate_session,
-        parse_free,
-    )
-
-    request = CalibrateRequest(
-        output=output,
-        poses=poses,
-        free=parse_free(free or ()),
-        sources=tuple(source or ()),
-        report=None,
-    )
-    calibrate_session(session, request)
+app.command()(calibrate)
