@@ -99,10 +99,11 @@ def bumped(side: str, frames: range, degrees: float) -> Change:
         H = K @ R @ np.linalg.inv(K)
         size = setup.resolution
         assert size is not None
-        warp = redrawn(
-            side, frames, lambda before: cv2.warpPerspective(before, H, size, flags=cv2.INTER_CUBIC)
-        )
-        warp(folder)
+
+        def turned(before: Floats) -> Floats:
+            return np.asarray(cv2.warpPerspective(before, H, size, flags=cv2.INTER_CUBIC), float)
+
+        redrawn(side, frames, turned)(folder)
 
     return change
 
@@ -202,22 +203,33 @@ FAULTS: dict[str, Fault] = {
     ),
     "mirrored image": Fault(redrawn("right", FRAMES, lambda a: a[:, ::-1]), "'right'|mirror"),
     "another camera's calibration": Fault(
-        rewritten((r"camera_matrix = \[\[812.4, 0.0, 322.7\], \[0.0, 811.9",
-                   "camera_matrix = [[912.4, 0.0, 322.7], [0.0, 911.9")),
+        rewritten(
+            (
+                r"camera_matrix = \[\[812.4, 0.0, 322.7\], \[0.0, 811.9",
+                "camera_matrix = [[912.4, 0.0, 322.7], [0.0, 911.9",
+            )
+        ),
         "calibration",
-    ),  # fmt: skip
+    ),
     "left and right swapped": Fault(
-        rewritten((r'source = "left\*.png"', 'source = "x*.png"'),
-                  (r'source = "right\*.png"', 'source = "left*.png"'),
-                  (r'source = "x\*.png"', 'source = "right*.png"')),
+        rewritten(
+            (r'source = "left\*.png"', 'source = "x*.png"'),
+            (r'source = "right\*.png"', 'source = "left*.png"'),
+            (r'source = "x\*.png"', 'source = "right*.png"'),
+        ),
         "swapped",
-    ),  # fmt: skip
+    ),
     "left and right swapped, no start": Fault(
-        both(NO_START, rewritten((r'source = "left\*.png"', 'source = "x*.png"'),
-                                 (r'source = "right\*.png"', 'source = "left*.png"'),
-                                 (r'source = "x\*.png"', 'source = "right*.png"'))),
+        both(
+            NO_START,
+            rewritten(
+                (r'source = "left\*.png"', 'source = "x*.png"'),
+                (r'source = "right\*.png"', 'source = "left*.png"'),
+                (r'source = "x\*.png"', 'source = "right*.png"'),
+            ),
+        ),
         "swapped",
-    ),  # fmt: skip
+    ),
     "points in metres": Fault(both(NO_START, points(lambda m: m / 1000)), "unit", False),
     "translations in metres": Fault(
         both(
@@ -278,7 +290,7 @@ def outcome(fault: Fault, folder: Path) -> Result:
     session = load_session(folder / "session.toml")
     summary = Summary(session)
     counts = {"right": 0, "wrong": 0, "ambiguous": 0, "lost": 0}
-    for estimate in run(session):
+    for estimate in run(session, watch=summary.watch):
         summary.add(estimate)
         if estimate.status != "ok":
             counts[estimate.status] += 1
@@ -305,7 +317,8 @@ def main() -> int:
     unknown = {*options.faults} - {*FAULTS}
     if unknown:
         parser.error(f"no such fault: {sorted(unknown)[0]}")
-    print("| fault | ok and right | ambiguous | lost | wrong | named |\n| --- | --- | --- | --- | --- | --- |")
+    print("| fault | ok and right | ambiguous | lost | wrong | named |")
+    print("| --- | --- | --- | --- | --- | --- |")
     good = True
     for name in options.faults or FAULTS:
         with tempfile.TemporaryDirectory() as folder:

@@ -127,6 +127,27 @@ class SensorReport:
 
 
 @dataclass(frozen=True)
+class Offsets:
+    """By how much a sensor met the features of a pose; n of them are in view.
+
+    Attributes
+    ----------
+    features : (n,) int
+        Their places in the body.
+    met : (n,) bool
+    offsets : (n, m) float64
+        Observed minus predicted place, sensor units; 0 where it was not met.
+    by_shift : (n, m, 3) float64
+        Derivative of the predicted place by a shift of the body in the world.
+    """
+
+    features: NDArray[np.intp]
+    met: NDArray[np.bool_]
+    offsets: Floats
+    by_shift: Floats
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """A pose that explains a frame, with its share of belief among its rivals."""
 
@@ -159,6 +180,10 @@ class Estimate:
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
+    doubt : str
+        Why a frame is ambiguous whose pose has no rival; no part of it either.
+    offsets : mapping of str to Offsets
+        By sensor, of the best pose.
     """
 
     frame: int
@@ -173,6 +198,8 @@ class Estimate:
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
     proposer: str = field(default="", compare=False)
+    doubt: str = field(default="", compare=False)
+    offsets: Mapping[str, Offsets] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def label(self) -> str:

@@ -13,6 +13,7 @@ from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
 from mixpose.checking.sensor_keys import key_warnings
+from mixpose.checking.trials import explanation
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "advice",
     "depends_on_distance",
     "expected_count",
+    "explanation",
     "image_of",
     "judge",
     "key_warnings",

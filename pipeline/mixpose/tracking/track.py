@@ -18,6 +18,9 @@ from mixpose.tracking.motion import MotionRules, RandomWalk
 Floats: TypeAlias = NDArray[np.float64]
 
 
+_MOST = 0.5  # of the features in view: a sensor that meets so many has met the body
+
+
 @dataclass(frozen=True)
 class Branch:
     """One place where the body may be.
@@ -90,6 +93,8 @@ class Track:
         Where a search with a budget goes on while nothing convinces.
     doubted : bool
         Whether another body of the scene may have what the last pose meets.
+    agreed : bool
+        Whether two sensors met most of the body in some frame.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -101,6 +106,7 @@ class Track:
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
     doubted: bool = False
+    agreed: bool = False
 
     def missed(self, search: SearchState) -> Track:
         """The track after a frame without a pose."""
@@ -229,7 +235,9 @@ def follow(
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), rules.steady(body))
         branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
-    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies)
+    met = [one for one in tallies.values() if one.met >= _MOST * one.in_view > 0]
+    agreed = track.agreed or len(met) > 1
+    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, agreed=agreed)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

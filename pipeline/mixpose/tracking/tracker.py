@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import Judged, Verdict, decide, insert
+from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert
 from mixpose.objective import View
-from mixpose.records import Estimate, Hypothesis, SensorReport
+from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.delays import in_step
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
-from mixpose.tracking.reflection import is_reflection
+from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
@@ -125,8 +125,14 @@ class Tracker:
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
-        if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
-            verdict = replace(verdict, status="ambiguous")
+        best = verdict.best
+        if best is None or verdict.status != "ok":
+            return verdict
+        if is_reflection(data, best):
+            return replace(verdict, status="ambiguous", doubt=MIRRORED)
+        track, noise = data.track, self.rules.judgement.noise
+        if contradict(best, track.noise, track.agreed, self.rules.acceptance, noise):
+            return replace(verdict, status="ambiguous", doubt=APART)
         return verdict
 
     def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
@@ -193,6 +199,8 @@ class Tracker:
             sensors=reports | (told.sensors if told else {}),
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
+            doubt=verdict.doubt,
+            offsets=_offsets(told, self.body) if told else {},
         )
 
     def followed(
@@ -232,6 +240,17 @@ class Tracker:
             start_uncertainty=self.start_uncertainty,
             rules=self.rules,
         )
+
+
+def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
+    """By how much each sensor met the features of a body whose features are points."""
+    if len(body.nodes.points) != len(body):
+        return {}
+    return {
+        one.name: Offsets(one.features, one.shares > 0, one.offsets, one.J[..., :3])
+        for one in judged.associations
+        if judged.sensors[one.name].used
+    }
 
 
 def _tallies(judged: Judged) -> dict[str, SensorTally]:
