@@ -212,7 +212,10 @@ class Findings:
         lines = []
         bodies = {one.body.name: one.body for one in self._session.objects}
         for label, markers in self._markers.items():
-            name = next(each for each in bodies if label == each or label.startswith(f"{each}-"))
+            names = [each for each in bodies if label == each or label.startswith(f"{each}-")]
+            if not names:
+                continue
+            name = max(names, key=len)
             of = f" of {label!r}" if len(self._session.labels) > 1 else ""
             typical = self._typical(markers)
             for i, marker in sorted(markers.items()):
