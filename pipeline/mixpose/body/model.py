@@ -75,6 +75,8 @@ class Body:
         lie across their normals.
     radii : (N,) float64 or None
         Of spheres or disks, length units; 0 for a point.
+    names : tuple of str
+        Of the features, where the user has given any.
     """
 
     name: str
@@ -83,9 +85,14 @@ class Body:
     gravity: Gravity | None = None
     shape: Shape = "point"
     radii: Floats | None = None
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.features)
+
+    def name_of(self, feature: int) -> str:
+        """What a feature is called: its name, else its number from 1."""
+        return self.names[feature] if feature < len(self.names) else str(feature + 1)
 
     @cached_property
     def means(self) -> Floats:

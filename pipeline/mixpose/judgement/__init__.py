@@ -13,7 +13,7 @@ from mixpose.judgement.acceptance import (
 )
 from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior
-from mixpose.judgement.expected_covariance import expected_covariance
+from mixpose.judgement.expected_covariance import expected_covariance, invert_information
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
 from mixpose.judgement.noise import Noise, NoiseModel
 
@@ -34,6 +34,7 @@ __all__ = [
     "expected_covariance",
     "flat_prior",
     "insert",
+    "invert_information",
     "is_possible",
     "is_sure",
     "judge",

@@ -70,7 +70,9 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
         features.append(SegmentFeature(a, b, C, kind))
     normals = _normals(_stated_normals(table, markers, count), count)
     radii = _radii(table, normals, len(points), count)
-    return Body(table.name, tuple(features), normals, _gravity(table), table.shape, radii)
+    names = () if markers is None else markers.names
+    gravity = _gravity(table)
+    return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names)
 
 
 def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) -> Floats | None:
