@@ -62,6 +62,11 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"sigma": "segments = [[[1, 2, 3], [1, 2, 3]]]"},
         ["object.segments[0]: found a segment without length"],
     ),
+    # time
+    ({"left": LINES["left"] + '\ndelay = "late"'}, ["delay", 'found "late"', '"estimate"']),
+    ({"left": LINES["left"] + "\ndelay = 6"}, ["delay: found 6", "from -1 to 1"]),
+    ({"left": LINES["left"] + "\nreadout = -0.1"}, ["readout: found -0.1", "from 0 to 1"]),
+    ({"left": LINES["left"] + "\nexposure = 2"}, ["exposure: found 2", "from 0 to 1"]),
     # markers with a size
     ({"points": LINES["points"] + '\nshape = "ball"'}, ['object.shape: found "ball"', '"sphere"']),
     (

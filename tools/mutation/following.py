@@ -292,8 +292,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-left-out-for-free",
         "tracking/likelihood.py",
-        "log_evidence=judged.log_evidence + missed,",
-        "log_evidence=judged.log_evidence,",
+        "unmet=others,",
+        "unmet=(),",
         "leaving a sensor out makes a pose better",
         (_STARTS,),
     ),
@@ -454,36 +454,47 @@ _TRACKER = (
     ),
 )
 
-_SEARCH_EVIDENCE = (
+_REFLECTION = (
     Mutant(
-        "search-clutter-does-not-count",
-        "search/evidence.py",
-        "gain = -share * chance - 0.5 * spare",
-        "gain = -0.5 * spare",
-        "poses in clutter are as evident as poses without",
-        ("test_search_evidence.py",),
+        "tracking-mirror-images-pass",
+        "tracking/reflection.py",
+        "return rival.log_evidence > judged.log_evidence + ",
+        "return rival.log_evidence > 1e9 + ",
+        "the body in a window is taken for the body",
+        ("test_tracking_reflection.py",),
     ),
+    Mutant(
+        "tracking-mirror-images-are-suspected-everywhere",
+        "tracking/reflection.py",
+        "return rival.log_evidence > judged.log_evidence + ",
+        "return rival.log_evidence > -1e9 + ",
+        "a flat body with a hidden marker is never sure",
+        ("test_tracking_reflection.py",),
+    ),
+)
+
+_SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "gain + options.missed * missed",
-        "gain",
+        "visible.astype(float), shares, offsets",
+        "shares, shares, offsets",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),
     Mutant(
         "search-errors-count-alike",
         "search/evidence.py",
-        " - 0.5 * spare * np.log(s2)",
-        "",
-        "a pose met to a pixel is as good as one met to a tenth",
+        "variance /= degrees + spare",
+        "variance = np.full(len(poses), 0.04)",
+        "a pose met to a tenth of a pixel is hardly better than one met to a pixel",
         ("test_search_evidence.py",),
     ),
     Mutant(
         "search-crowds-are-no-clutter",
         "search/evidence.py",
-        "density = np.maximum(density, k / (np.pi * reach**2))",
-        "density = np.maximum(density, 0.0)",
+        "np.maximum(overall, inside / (2 * half).prod(axis=1))",
+        "np.full(len(y), overall)",
         "where false detections crowd poses are found by chance",
         ("test_search_evidence.py",),
     ),
@@ -562,6 +573,7 @@ MUTANTS = (
     *_RANGE_POSTERIOR,
     *_PROPOSALS,
     *_TRACKER,
+    *_REFLECTION,
     *_SEARCH_EVIDENCE,
     *_SEARCH,
 )

@@ -220,12 +220,46 @@ def simulate(
     deform: Annotated[
         bool, typer.Option("--deform", help="Displace features by the spread the object states.")
     ] = False,
+    readout: Annotated[
+        float | None,
+        typer.Option(help="Seconds from a camera's first row to its last; else the session's."),
+    ] = None,
+    exposure: Annotated[
+        float | None, typer.Option(help="Seconds for which a row is lit; else the session's.")
+    ] = None,
+    delay: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=SECONDS", help="A sensor that is late; else the session's."),
+    ] = None,
+    out_of_step: Annotated[
+        float, typer.Option(help="Seconds from the first sensor to the last, in their times.")
+    ] = 0.0,
+    lamps: Annotated[int, typer.Option(min=0, help="Lamps behind the body.")] = 0,
+    mirror: Annotated[
+        float, typer.Option(help="Brightness of mirror images in a table below, as a share.")
+    ] = 0.0,
+    others: Annotated[
+        int, typer.Option(min=0, help="Other bodies with as many markers, beside this one.")
+    ] = 0,
+    occluder: Annotated[int, typer.Option(min=0, help="Dark bars that swing before it.")] = 0,
+    jpeg: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Quality of lossy compression.")
+    ] = None,
+    bayer: Annotated[
+        bool, typer.Option("--bayer", help="Images of a colour sensor, interpolated.")
+    ] = False,
+    turned_camera: Annotated[
+        float, typer.Option(help="Degrees by which the last camera was turned meanwhile.")
+    ] = 0.0,
+    away_from: Annotated[
+        int | None, typer.Option(min=0, help="Frames after which the body is gone.")
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a recording in the folder.")
     ] = False,
 ) -> None:
     """Render a recording with truth.jsonl that `run` can play."""
-    from mixpose.cli.simulate import simulate_session  # noqa: PLC0415
+    from mixpose.cli.simulate import delays_of, simulate_session  # noqa: PLC0415
     from mixpose.simulation import SimulationOptions  # noqa: PLC0415
 
     options = SimulationOptions(
@@ -245,6 +279,18 @@ def simulate(
         range_noise=range_noise,
         range_snr=range_snr,
         deform=deform,
+        readout=readout,
+        exposure=exposure,
+        delay=delays_of(delay or []),
+        out_of_step=out_of_step,
+        lamps=lamps,
+        mirror=mirror,
+        others=others,
+        occluder=occluder,
+        jpeg=jpeg,
+        bayer=bayer,
+        turned_camera_deg=turned_camera,
+        away_from=away_from,
     )
     simulate_session(session, output, options, overwrite=overwrite)
 
@@ -397,3 +443,46 @@ def report(
     from mixpose.cli.report import write_report  # noqa: PLC0415
 
     write_report(poses, truth, output)
+
+
+@app.command()
+def calibrate(
+    session: SessionFile,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="CALIBRATED.toml", help="The calibrated session."),
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="POSES.jsonl", help="Known poses of the body; else none is known."),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR:WHAT",
+            help="What is sought: pose, focal, principal_point, distortion, delay, drift, "
+            "position, range_bias, of a sensor or, without its name, of all; or body, the marker "
+            "coordinates. Repeatable. Else the poses of all cameras but the first and the "
+            "positions of range sensors.",
+        ),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """Calibrate sensors from a recording of the body, without matching markers."""
+    from mixpose.cli.calibrate import (  # noqa: PLC0415
+        CalibrateRequest,
+        calibrate_session,
+        parse_free,
+    )
+
+    request = CalibrateRequest(
+        output=output,
+        poses=poses,
+        free=parse_free(free or ()),
+        sources=tuple(source or ()),
+        report=None,
+    )
+    calibrate_session(session, request)

@@ -84,6 +84,13 @@ class Observation:
         return int(self.pattern.values.size)
 
     @property
+    def weight(self) -> float:
+        """Sum of all weights or values."""
+        pattern = self.pattern
+        values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
+        return float(values.sum())
+
+    @property
     def is_sparse(self) -> bool:
         """Whether its density costs little to draw everywhere: detections, and profiles."""
         return self.cell is None or self.dimension == 1

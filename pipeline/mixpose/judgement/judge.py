@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -88,6 +88,7 @@ def judge(
     *,
     before: Noise = Noise(),
     prior: Prior | None = None,
+    unmet: Sequence[Association] = (),
     rules: JudgementRules = JudgementRules(),
 ) -> Judged:
     """Judge a pose by the matched densities at the finest blur.
@@ -103,13 +104,19 @@ def judge(
         Residuals of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
+    unmet : sequence of Association
+        Other sensors, which count as if they had met nothing.
     rules : JudgementRules
     """
     found, value = associate(objective, T_world_object, rules.association)
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
     information = information_of(found)
     noise, remembered = noises(before, noise_of(found, free), rules.noise)
-    evidence = log_evidence(found, information, noise, free, prior, rules.detection, rules.noise)
+    blind = [replace(one, shares=np.zeros(len(one.features))) for one in unmet]
+    size = 2 * objective.projection.body.radius
+    evidence = log_evidence(
+        [*found, *blind], information, noise, free, prior, size, rules.detection, rules.noise
+    )
     count = len(found)
     return Judged(
         T_world_object=T_world_object,

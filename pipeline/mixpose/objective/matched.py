@@ -139,6 +139,29 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
+@dataclass(frozen=True, eq=False)
+class SharedDensities:
+    """C of all sensors at σ_ε, drawn once for several bodies.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    totals : tuple of float
+        Weight of all that was drawn, per sensor.
+    """
+
+    atlas: Atlas
+    totals: tuple[float, ...]
+
+    @classmethod
+    def drawn(cls, views: Sequence[View]) -> SharedDensities:
+        """Draw views of detections, none of which is empty."""
+        observations = [view.observation for view in views]
+        sigmas = [one.sigma for one in observations]
+        totals = tuple(one.weight for one in observations)
+        return cls(matched_atlas(observations, sigmas, LAST_STEPS), totals)
+
+
 def steps_at(view: View, sigma: float) -> float:
     """Cells per standard deviation with which a sensor's density is drawn at a blur."""
     if sigma > view.observation.sigma:
@@ -154,6 +177,7 @@ def matched_objective(
     *,
     steps_per_sigma: float = STEPS_PER_SIGMA,
     around: float = REACH,
+    shared: SharedDensities | None = None,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -170,6 +194,9 @@ def matched_objective(
         Cells per standard deviation of C.
     around : float
         Standard deviations of C about the projection within which grey values are drawn.
+    shared : SharedDensities or None
+        Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
+        own detections, and others only where they are out of its reach.
     """
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
@@ -184,10 +211,16 @@ def matched_objective(
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
+    if shared is None:
+        atlas = matched_atlas(observations, sigmas, steps_per_sigma, places, around)
+    else:
+        atlas = shared.atlas
+        parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
+        energies = energies * np.square(parts)
     return MatchedObjective(
         views=tuple(views),
         projection=projection,
-        atlas=matched_atlas(observations, sigmas, steps_per_sigma, places, around),
+        atlas=atlas,
         variances=variances[:, None],
         tops=tops[:, None],
         energies=energies[:, None],

@@ -17,12 +17,16 @@ from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
 from mixpose.session.setup import Unit
 from mixpose.session.values import (
+    DELAY_ALLOWED,
     SOURCE_ALLOWED,
     ArrayOf,
     read_calibration_key,
+    read_delay,
     read_sensor_name,
     read_source,
 )
+
+SPAN_ALLOWED = "seconds, from 0 to 1"
 
 
 class CalibrationTable(Table):
@@ -97,6 +101,15 @@ class SensorTable(Table):
 
     Example: `fps = 25`
     """
+    delay: Annotated[
+        float | Literal["estimate"], PlainValidator(read_delay), Field(description=DELAY_ALLOWED)
+    ] = 0.0
+    """Seconds by which this sensor's frames are taken later than their times say; negative where
+    they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
+    delay is known (`docs/sensors-in-time.md`).
+
+    Example: `delay = 0.006`
+    """
     extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
     """Keys of `[extract]` that differ for this sensor.
 
@@ -122,6 +135,18 @@ class PlacedTable(SensorTable, Placement):
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
 
     Example: `resolution = [640, 512]`
+    """
+    readout: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    """Rolling shutter: seconds from when the first row of an image is read to when the last is. A
+    frame's time is when its middle row is read. Left out: all rows at once.
+
+    Example: `readout = 0.020`
+    """
+    exposure: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    """Seconds for which a row collects light. A frame's time is the middle of it, where a moving
+    marker's streak has its middle; it matters to `check` and `simulate`, not to poses.
+
+    Example: `exposure = 0.004`
     """
 
 

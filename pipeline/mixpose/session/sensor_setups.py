@@ -135,6 +135,9 @@ def _build_sensor(
         range_min=getattr(table, "range_min", None),
         bin_size=getattr(table, "bin_size", None),
         resolution=resolution,
+        delay=table.delay,
+        readout=getattr(table, "readout", 0.0),
+        exposure=getattr(table, "exposure", 0.0),
     )
 
 

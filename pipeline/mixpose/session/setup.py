@@ -93,6 +93,10 @@ class SensorSetup:
         Range of a profile's first bin and from bin to bin, in length units; both or neither.
     resolution : (int, int) or None
         Width and height of a camera's images in px.
+    delay : float or "estimate"
+        Seconds by which frames are taken later than their times say; to be estimated.
+    readout, exposure : float
+        Seconds from a camera's first row to its last, and for which a row collects light.
     """
 
     name: str
@@ -105,6 +109,9 @@ class SensorSetup:
     range_min: float | None = None
     bin_size: float | None = None
     resolution: tuple[int, int] | None = None
+    delay: float | Literal["estimate"] = 0.0
+    readout: float = 0.0
+    exposure: float = 0.0
 
 
 @dataclass(frozen=True)

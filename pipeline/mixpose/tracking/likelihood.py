@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
-from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.objective import MatchedObjective, SharedDensities, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
 from mixpose.records import SensorReport
 from mixpose.search import SearchState
@@ -76,7 +76,10 @@ class SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it; `log` is written by the proposer that searches."""
+    """A frame, and what is known before it; `log` is written by the proposer that searches.
+
+    `shared` are the densities of a whole scene, where the views hold what is left for this body.
+    """
 
     views: Sequence[View]
     body: Body
@@ -87,6 +90,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
 
     @cached_property
@@ -119,11 +123,14 @@ class FrameData:
         if not names:
             return self
         views = [view for view in self.views if view.name not in names]
-        return replace(self, views=views)
+        return replace(self, views=views, shared=None)
 
     @cached_property
     def finest(self) -> MatchedObjective | None:
         """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
+        if self.shared is not None:
+            sigmas = [view.observation.sigma for view in self.views]
+            return matched_objective(self.views, self.body, sigmas, shared=self.shared)
         sparse = all(view.observation.is_sparse for view in self.views)
         detected = any(view.observation.cell is None for view in self.views)
         return self.at_sigma() if sparse and detected else None
@@ -164,20 +171,19 @@ class MatchedLikelihood:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        rules, others = data.rules.judgement, []
+        if start.left_out:
+            found, _ = associate(self.data.objective_near(T), T, rules.association)
+            others = [one for one in found if one.name in start.left_out]
         judged = judge(
             data.objective_near(T),
             T,
             data.free,
             before=data.track.noise,
             prior=data.prior(T),
-            rules=data.rules.judgement,
+            unmet=others,
+            rules=rules,
         )
-        if not start.left_out:
-            return judged
-        rules = self.data.rules.judgement
-        found, _ = associate(self.data.objective_near(T), T, rules.association)
-        others = [one for one in found if one.name in start.left_out]
-        missed = sum(one.expected for one in others) * rules.detection.log_missed
         reports = {
             one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
             for one in others
@@ -185,7 +191,6 @@ class MatchedLikelihood:
         return replace(
             judged,
             sensors=judged.sensors | reports,
-            log_evidence=judged.log_evidence + missed,
             associations=(*judged.associations, *others),
         )
 
