@@ -28,6 +28,7 @@ from mixpose.design import (
 )
 from mixpose.design.equality import scaled
 from mixpose.design.prediction import at_tip
+from mixpose.design.study import SHARE_OF_RADIUS
 from mixpose.rigid import Floats, perturb, rotation_angle_deg, rotation_matrix, transform
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.session import load_session
@@ -289,6 +290,21 @@ def test_markers_that_lie_like_those_of_another_body_are_named() -> None:
     assert alike.misfit < 1.0
     mirrored = congruent_subsets(body_of(first), body_of(second * [1, 1, -1]), 2.0)
     assert mirrored is None or len(mirrored.markers) == 3  # three are their own mirror image
+
+
+def test_bodies_of_a_recording_that_are_taken_for_each_other_are_told() -> None:
+    folder = Path(os.environ.get("MIXPOSE_RECORDINGS", "")) / "several_bodies"
+    if not os.environ.get("MIXPOSE_RECORDINGS") or not folder.is_dir():
+        pytest.skip("MIXPOSE_RECORDINGS names no folder of recordings")
+    forearm, arm = (
+        load_session(folder / "wheelchair_4_bodies" / f"session_{name}.toml").body
+        for name in ("ForearmL", "ArmL")
+    )
+    tolerance = SHARE_OF_RADIUS * min(forearm.radius, arm.radius)
+    alike = congruent_subsets(forearm, arm, tolerance)
+    assert alike is not None
+    assert len(alike.markers) == 3
+    assert congruent_subsets(forearm, arm, tolerance / 2) is None
 
 
 def test_markers_on_a_line_do_not_count_as_alike() -> None:

@@ -18,9 +18,9 @@ from mixpose.design.summary import Summary, pooled, summarise
 from mixpose.rigid import Floats
 from mixpose.session import SensorSetup, Session
 
-SHARE_OF_RADIUS = 0.03
-"""Bodies whose markers lie alike to within this share of the smaller one's radius are told: about
-what frames confuse in recordings of soft bodies (2 to 5 mm of 80)."""
+SHARE_OF_RADIUS = 0.1
+"""Bodies whose markers lie alike to within this share of the smaller one's radius are told: two of
+a motion capture recording that are taken for each other, rigid to 2 to 5 mm, have 0.08."""
 
 
 @dataclass(frozen=True)
