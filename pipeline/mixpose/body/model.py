@@ -76,7 +76,7 @@ class Body:
     radii : (N,) float64 or None
         Of spheres or disks, length units; 0 for a point.
     names : tuple of str
-        Of the features, where the user has given any.
+        What people call the features, those of them that have a name; they come first.
     """
 
     name: str
@@ -90,9 +90,10 @@ class Body:
     def __len__(self) -> int:
         return len(self.features)
 
-    def name_of(self, feature: int) -> str:
-        """What a feature is called: its name, else its number from 1."""
-        return self.names[feature] if feature < len(self.names) else str(feature + 1)
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """What each feature (N) is called in messages: its name, else its number from 1."""
+        return self.names + tuple(str(i + 1) for i in range(len(self.names), len(self)))
 
     @cached_property
     def means(self) -> Floats:

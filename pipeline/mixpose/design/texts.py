@@ -82,7 +82,7 @@ def _system_lines(system: System, study: Study) -> list[str]:
     if system.confirmation is not None:
         say("simulated", _confirmation_text(system.confirmation, plan))
     if system.move is not None:
-        name, gain = plan.body.name_of(system.move.marker), _gain(system.move.error, system.error)
+        name, gain = plan.body.labels[system.move.marker], _gain(system.move.error, system.error)
         say("marker", f"moving {name} by {_vector(system.move.shift)} {unit} gains {gain}")
     if system.new is not None:
         gain = _gain(system.new.error, system.error)
@@ -186,8 +186,8 @@ def _equal_text(system: System, equal: Equal, first: str, unit: str) -> str:
 
 def _congruence_text(alike: Congruence, bodies: dict[str, Body], unit: str) -> str:
     first, second = (bodies[name] for name in alike.bodies)
-    ours = ", ".join(first.name_of(i) for i, _ in alike.markers)
-    theirs = ", ".join(second.name_of(j) for _, j in alike.markers)
+    ours = ", ".join(first.labels[i] for i, _ in alike.markers)
+    theirs = ", ".join(second.labels[j] for _, j in alike.markers)
     return (
         f"{len(alike.markers)} markers of {alike.bodies[0]} ({ours}) lie like those of "
         f"{alike.bodies[1]} ({theirs}), to {_number(alike.misfit)} {unit}: one body may be taken "
@@ -267,7 +267,7 @@ def _system_json(system: System) -> dict[str, Any]:
     if system.move is not None:
         move = system.move
         result["move_marker"] = {
-            "marker": plan.body.name_of(move.marker),
+            "marker": plan.body.labels[move.marker],
             "shift": move.shift.tolist(),
             "error": _finite(move.error),
         }
