@@ -287,6 +287,18 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     assert "is there already" in again.stderr
 
 
+def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
+    (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    for folder, x in (("a", 5), ("b", 7)):
+        (tmp_path / folder).mkdir()
+        table = f"name,x,y,z\np,0,0,0\nq,{x},0,0\nr,0,9,0\n"
+        (tmp_path / folder / "marks.csv").write_text(table, encoding="utf-8")
+    paths = [tmp_path / "chain.yaml", tmp_path / "a" / "marks.csv", tmp_path / "b" / "marks.csv"]
+    session = imported(paths, "mm", None, tmp_path / "s.toml")
+    assert [one.body.name for one in session.objects] == ["marks_1", "marks_2"]
+    assert [one.body.means[1, 0] for one in session.objects] == [5, 7]
+
+
 def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
     """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
     chain = texts.kalibr()
