@@ -19,7 +19,7 @@ from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.judgement import Judged, Verdict, decide, insert
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, SensorReport
-from mixpose.tracking.delays import in_step
+from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.reflection import is_reflection
@@ -117,7 +117,6 @@ class Tracker:
             The track for the next frame, and the frame's estimate without its latency.
         """
         usable = [view for view in views if not view.observation.is_empty]
-        usable = in_step(usable, track, frame, time_s, self.rules.motion)
         data = self.data(track, frame, time_s, usable)
         ranked = self.ranked(data) if usable else []
         verdict = decide(ranked, self.free, self.rules.acceptance)
@@ -127,7 +126,10 @@ class Tracker:
         estimate = self._estimate(frame, time_s, views, verdict, told)
         if verdict.best is None:
             return track.missed(data.log.state), estimate
-        return self._followed(track, frame, time_s, verdict, verdict.best), estimate
+        followed = self._followed(track, frame, time_s, verdict, verdict.best)
+        if verdict.status == "ok":
+            followed = replace(followed, delays=_delays(data, verdict.best))
+        return followed, replace(estimate, delays=followed.delays.seconds())
 
     def ranked(self, data: FrameData) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
@@ -183,7 +185,12 @@ class Tracker:
     ) -> Track:
         """The track after a frame with poses."""
         found = [
-            Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
+            Found(
+                one.T_world_object,
+                weight,
+                one.spread if self.options.fuse else None,
+                np.sqrt(np.diagonal(one.covariance)),
+            )
             for one, weight in verdict.kept
         ]
         noise = best.noise if verdict.status == "ok" else track.noise
@@ -199,7 +206,13 @@ class Tracker:
     ) -> FrameData:
         """A frame, and what is known before it; arguments as of `advance`."""
         predictions = self.predictions(track, frame, time_s)
-        return FrameData(
+        elapsed = None
+        if time_s is not None and track.time_s is not None:
+            elapsed = time_s - track.time_s
+        views = believed(track.delays.applied(views), elapsed)
+        if time_s is None:
+            views = [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        data = FrameData(
             views=views,
             body=self.body,
             options=self.options,
@@ -209,7 +222,25 @@ class Tracker:
             T_reference=predictions[0].T_world_object if predictions else self.T_start,
             start_uncertainty=self.start_uncertainty,
             rules=self.rules,
+            elapsed=elapsed,
         )
+        if predictions and is_timed(views):
+            return data.in_motion(data.motion(predictions[0].T_world_object))
+        return data
+
+
+def _delays(data: FrameData, best: Judged) -> DelayEvidence:
+    """What the frames so far say of how late sensors are, with this one."""
+    before, T = data.track.delays, best.T_world_object
+    used = [one for one in best.associations if best.sensors[one.name].used]
+    expected = data.expected(T)
+    if len(used) < 2 or not expected.gain.any():
+        return before
+    seen = data.offsets(T, used)
+    names = [one.name for one in used]
+    views = [view for view in data.views if view.name in names]
+    rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
+    return before.joined(seen, views, expected, max(rest, LEAST_VARIANCE))
 
 
 def _tallies(judged: Judged) -> dict[str, SensorTally]:
