@@ -33,7 +33,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extraction": GROUND,
     "optimise": set(),
     "objective": GROUND | {"sensors", "body", "density"},
-    "search": GROUND | {"sensors", "body", "density", "objective", "optimise"},
+    "search": GROUND | {"sensors", "body", "density", "objective", "optimise", "judgement"},
     "fit": GROUND | {"sensors", "body", "density", "objective", "optimise"},
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
@@ -61,6 +61,18 @@ MAY_IMPORT["rerun_file"] = GROUND | {
     "density",
     "frames",
     "poses",
+    "session",
+    "runner",
+}
+MAY_IMPORT["calibration"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "objective",
+    "search",
+    "fit",
+    "tracking",
+    "frames",
     "session",
     "runner",
 }

@@ -173,18 +173,17 @@ class _Run:
     def _rank(self, poses: Floats) -> Floats:
         """Evidence where all sensors are cameras, else the score."""
         if self._by_evidence:
-            options = self._budget.evidence
-            free = self._constraint.free
-            return evidence(self._detections, self._body, poses, free, options)
+            free, gate = self._constraint.free, self._budget.gate
+            return evidence(self._detections, self._body, poses, free, gate)
         return np.asarray(self._descent.objective().shares(poses).sum(axis=0))
 
     def _is_settled(self) -> bool:
         """Whether no other kind of guess is needed.
 
-        Where the evidence of several cameras is overwhelming, only a pose that explains most of
+        Where the evidence of several cameras is beyond doubt, only a pose that explains most of
         the detections could still be better.
         """
-        if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.overwhelming:
+        if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.beyond_doubt:
             best = self._poses[self._ranks.argmax()]
             explainable = sum(min(image.count, len(self._body)) for image in self._images)
             explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
@@ -267,7 +266,7 @@ class _Run:
         budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._rank(guesses).max() < budget.beyond_doubt / 2:
+        if self._rank(guesses).max() < 0:
             return False
         self._keep(self._descended(guesses))
         return self._ranks.max() > budget.beyond_doubt and self._is_settled()

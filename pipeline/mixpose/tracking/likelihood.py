@@ -25,9 +25,15 @@ from mixpose.judgement import (
     judge,
     nearest_alike,
 )
-from mixpose.objective import MatchedObjective, View, matched_objective, project_body
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
+from mixpose.objective import (
+    MatchedObjective,
+    SharedDensities,
+    View,
+    matched_objective,
+    project_body,
+)
 from mixpose.records import SensorReport
+from mixpose.rigid import twist_between
 from mixpose.search import SearchState
 from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
@@ -93,6 +99,7 @@ class FrameData:
     `log` is written by the proposer that searches.  `elapsed` is the time since the last pose,
     seconds, None where it is not known.  Where views see the body in motion as of the common time,
     `still` is the frame with the sensors as they stand.
+    `shared` are the densities of a whole scene, where the views hold what is left for this body.
     """
 
     views: Sequence[View]
@@ -104,6 +111,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
     elapsed: float | None = None
     still: FrameData | None = None
@@ -125,13 +133,22 @@ class FrameData:
             self.rules.judgement.detection,
         )
 
-    def at_sigma(
-        self, near: Floats | None = None, *, narrowed: float = 1.0, fine: bool = False
-    ) -> MatchedObjective:
-        """The matched objective at σ_ε, or at a share of it."""
+    @cached_property
+    def finest(self) -> MatchedObjective:
+        """The matched objective at σ_ε."""
+        if self.still is not None:  # densities do not move with the sensors
+            views = tuple(self.views)
+            projection = project_body(tuple(view.sensor for view in views), self.body)
+            return replace(self.still.finest, views=views, projection=projection)
+        if self.shared is None:
+            return self.at_sigma()
+        sigmas = [view.observation.sigma for view in self.views]
+        return matched_objective(self.views, self.body, sigmas, shared=self.shared)
+
+    def at_sigma(self, *, narrowed: float = 1.0) -> MatchedObjective:
+        """The matched objective at a share of σ_ε."""
         sigmas = [narrowed * view.observation.sigma for view in self.views]
-        steps = FINE_STEPS if fine else LAST_STEPS
-        return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
+        return matched_objective(self.views, self.body, sigmas)
 
     def without(self, names: Mapping[str, str]) -> FrameData:
         """The frame without some sensors."""
@@ -139,7 +156,7 @@ class FrameData:
             return self
         views = [view for view in self.views if view.name not in names]
         still = self.still.without(names) if self.still else None
-        return replace(self, views=views, still=still)
+        return replace(self, views=views, still=still, shared=None)
 
     def in_motion(self, motion: Motion) -> FrameData:
         """The frame as of the common time, of a body that moves."""
@@ -160,6 +177,19 @@ class FrameData:
         is_far = (np.abs(expected.velocity) > nothing.deviation).any()
         return nothing if is_far else expected
 
+    def steady(self, T_world_object: Floats) -> Expected:
+        """The velocity at a pose, by the last two steps alone."""
+        nothing = unknown(self.body.radius, self.rules.course)
+        branch = (
+            nearest_branch(self.track, T_world_object, self.body) if self.track.branches else None
+        )
+        if branch is None or branch.velocity is None or not self.elapsed:
+            return nothing
+        T = nearest_alike(T_world_object, self.body, branch.T_world_object)
+        mean = twist_between(branch.T_world_object, T) / self.elapsed
+        velocity = mean + (mean - branch.velocity) / 2
+        return Expected(velocity, np.full(6, 1.5 / self.elapsed), nothing.deviation, np.zeros(6))
+
     def motion(self, T_world_object: Floats) -> Motion:
         """How the body is expected to move at a pose."""
         expected = self.expected(T_world_object)
@@ -171,7 +201,7 @@ class FrameData:
         """How far off features are met at a pose, and when they were seen."""
         if found is None:
             rules = self.rules.judgement.association
-            found, _ = associate(self.objective_near(T_world_object), T_world_object, rules)
+            found, _ = associate(self.finest, T_world_object, rules)
         names = {view.name: k for k, view in enumerate(self.views)}
         chosen = [names[one.name] for one in found]
         views = [(self.still or self).views[k] for k in chosen]
@@ -181,22 +211,6 @@ class FrameData:
             y = project_body(sensors, self.body).project(T_world_object[None]).y[:, 0]
             places = [at[one.features] for at, one in zip(y, found, strict=True)]
         return offsets_of(found, views, places)
-
-    @cached_property
-    def finest(self) -> MatchedObjective | None:
-        """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
-        if self.still is not None:
-            drawn = self.still.finest  # densities do not move with the sensors
-            sensors = tuple(view.sensor for view in self.views)
-            projection = project_body(sensors, self.body)
-            return drawn and replace(drawn, views=tuple(self.views), projection=projection)
-        sparse = all(view.observation.is_sparse for view in self.views)
-        detected = any(view.observation.cell is None for view in self.views)
-        return self.at_sigma() if sparse and detected else None
-
-    def objective_near(self, T_world_object: Floats) -> MatchedObjective:
-        """The objective at σ_ε around a pose."""
-        return self.finest or self.at_sigma(T_world_object, fine=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +256,10 @@ class MatchedLikelihood:
             data = data.in_motion(motion)
         rules, others = data.rules.judgement, []
         if start.left_out:
-            found, _ = associate(self.data.objective_near(T), T, rules.association)
+            found, _ = associate(self.data.finest, T, rules.association)
             others = [one for one in found if one.name in start.left_out]
         judged = judge(
-            data.objective_near(T),
+            data.finest,
             T,
             data.free,
             before=data.track.noise,
@@ -298,7 +312,7 @@ class AssociationLikelihood:
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by the sum over all associations."""
         data, T = self.data, fit.T_world_object
-        judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
+        judged = judge(data.finest, T, data.free, rules=data.rules.judgement)
         anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
             judged,

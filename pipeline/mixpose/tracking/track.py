@@ -37,7 +37,7 @@ class Branch:
         Standard deviations of the pose itself, where they are as large as its motion: then the
         next frame takes it as a prior, and no velocity is believed.
     course : Course or None
-        From which its velocity at a moment is known; None before the first pose.
+        From which its velocity at a moment is known; None where nobody asks for that.
     """
 
     T_world_object: Floats
@@ -92,6 +92,8 @@ class Track:
         Where a search with a budget goes on while nothing convinces.
     delays : DelayEvidence
         How late sensors are, as far as it was seen.
+    doubted : bool
+        Whether another body of the scene may have what the last pose meets.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -103,6 +105,7 @@ class Track:
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
     delays: DelayEvidence = field(default_factory=DelayEvidence)
+    doubted: bool = False
 
     def missed(self, search: SearchState) -> Track:
         """The track after a frame without a pose."""
@@ -179,7 +182,7 @@ def prior_of(
 class Found(NamedTuple):
     """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior.
 
-    `deviation` are its standard deviations (6,), None where they are not known.
+    `deviation` are its standard deviations (6,), None where nobody asks for velocities at moments.
     """
 
     T_world_object: Floats
@@ -235,12 +238,13 @@ def follow(
                 change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), rules.steady(body))
-        own = np.zeros(6) if deviation is None else deviation
-        before = parent.course if parent is not None else None
-        if before is not None and 0 < elapsed <= course_rules.longest_s:
-            course = before.followed(T, own, elapsed, course_rules)
-        else:
-            course = Course.begun(T, own, body.radius, course_rules)
+        course = None
+        if deviation is not None:
+            before = parent.course if parent is not None else None
+            if before is not None and 0 < elapsed <= course_rules.longest_s:
+                course = before.followed(T, deviation, elapsed, course_rules)
+            else:
+                course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
     return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
 

@@ -28,6 +28,8 @@ from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track
 
 Floats: TypeAlias = NDArray[np.float64]
 
+SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
+
 
 @dataclass(frozen=True)
 class Tracker:
@@ -116,38 +118,39 @@ class Tracker:
         Track, Estimate
             The track for the next frame, and the frame's estimate without its latency.
         """
-        usable = [view for view in views if not view.observation.is_empty]
-        data = self.data(track, frame, time_s, usable)
-        ranked = self.ranked(data) if usable else []
+        data = self.data(track, frame, time_s, views)
+        ranked = self.ranked(data)
+        verdict = self.verdict(data, ranked)
+        followed = self.followed(data, frame, time_s, verdict)
+        return followed, self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
+
+    def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
+        """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
         if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
             verdict = replace(verdict, status="ambiguous")
-        told = verdict.best or (ranked[0] if ranked else None)
-        estimate = self._estimate(frame, time_s, views, verdict, told)
-        if verdict.best is None:
-            return track.missed(data.log.state), estimate
-        followed = self._followed(track, frame, time_s, verdict, verdict.best)
-        if verdict.status == "ok":
-            followed = replace(followed, delays=_delays(data, verdict.best))
-        return followed, replace(estimate, delays=followed.delays.seconds())
+        return verdict
 
-    def ranked(self, data: FrameData) -> list[Judged]:
+    def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
         Parameters
         ----------
         data : FrameData
-            With at least one view, none of which saw nothing.
+        quickly : bool
+            Whether to look where the body is expected only.
         """
-        likelihood = likelihood_of(data)
         ranked: list[Judged] = []
+        if not data.views:
+            return ranked
+        likelihood = likelihood_of(data)
 
         def consider(start: Start, name: str) -> Judged:
             judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=name)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)
             return judged
 
-        for propose in self.proposers:
+        for propose in self.proposers[:1] if quickly else self.proposers:
             for start in propose(data, ranked):
                 judged = consider(start, propose.__name__)
                 for refine in self.refinements:
@@ -155,16 +158,31 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def _estimate(
+    def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
+        """The same poses, judged by other views, most evident first."""
+        if not data.views:
+            return []
+        likelihood = likelihood_of(data)
+        found = []
+        for one in ranked:
+            left_out = {n: report.why for n, report in one.sensors.items() if report.why}
+            start = Start(one.T_world_object, left_out=left_out)
+            judged = likelihood.judge(likelihood.fit(start), start)
+            found.append(replace(judged, proposer=one.proposer))
+        return sorted(found, key=lambda one: -one.log_evidence)
+
+    def estimate(
         self,
         frame: int,
         time_s: float | None,
         views: Sequence[View],
         verdict: Verdict,
-        told: Judged | None,
+        ranked: Sequence[Judged],
+        delays: DelayEvidence = DelayEvidence(),
     ) -> Estimate:
         """The estimate of a frame, with reports of the best pose, believed or not."""
         best = verdict.best
+        told = best or (ranked[0] if ranked else None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
         return Estimate(
@@ -178,24 +196,41 @@ class Tracker:
             sensors=reports | (told.sensors if told else {}),
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
+            delays=delays.seconds(),
         )
 
-    def _followed(
-        self, track: Track, frame: int, time_s: float | None, verdict: Verdict, best: Judged
+    def followed(
+        self, data: FrameData, frame: int, time_s: float | None, verdict: Verdict
     ) -> Track:
-        """The track after a frame with poses."""
+        """The track after a frame."""
+        track, best = data.track, verdict.best
+        if best is None:
+            return track.missed(data.log.state)
         found = [
             Found(
                 one.T_world_object,
                 weight,
                 one.spread if self.options.fuse else None,
-                np.sqrt(np.diagonal(one.covariance)),
+                np.sqrt(np.diagonal(one.covariance)) if is_timed(data.views) else None,
             )
             for one, weight in verdict.kept
         ]
         noise = best.noise if verdict.status == "ok" else track.noise
         motion = self.rules.motion
-        return follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
+        followed = follow(
+            track,
+            self.body,
+            found,
+            frame,
+            time_s,
+            noise,
+            _tallies(best),
+            motion,
+            self.rules.course,
+        )
+        if verdict.status != "ok":
+            return followed
+        return replace(followed, delays=_delays(data, best, frame))
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
@@ -205,6 +240,7 @@ class Tracker:
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
         """A frame, and what is known before it; arguments as of `advance`."""
+        views = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         elapsed = None
         if time_s is not None and track.time_s is not None:
@@ -229,12 +265,15 @@ class Tracker:
         return data
 
 
-def _delays(data: FrameData, best: Judged) -> DelayEvidence:
+def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
     """What the frames so far say of how late sensors are, with this one."""
     before, T = data.track.delays, best.T_world_object
     used = [one for one in best.associations if best.sensors[one.name].used]
-    expected = data.expected(T)
-    if len(used) < 2 or not expected.gain.any():
+    timed = is_timed(data.views)
+    if len(used) < 2 or not data.elapsed or (frame % SOME_FRAMES and not timed):
+        return before
+    expected = data.expected(T) if timed else data.steady(T)
+    if not expected.gain.any():
         return before
     seen = data.offsets(T, used)
     names = [one.name for one in used]
