@@ -45,7 +45,7 @@ def seen_at(camera: Sensor, x: Floats, seconds: float) -> Floats:
     T = perturb(BODY, MOTION.velocity * seconds + 0.5 * MOTION.acceleration * seconds**2)
     y, seen = camera.project(transform(T @ inverse(BODY), x[None]))
     assert seen.all()
-    return y[0]
+    return np.asarray(y[0])
 
 
 @pytest.mark.parametrize("name", CAMERAS)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,13 +44,7 @@ FAST = {"amplitude_translation": 150.0, "amplitude_rotation_deg": 30.0, "period_
 
 
 def recording(
-    folder: Path,
-    *,
-    left: str = "",
-    right: str = "",
-    seed: int = 0,
-    frames: int = 30,
-    **fault: object,
+    folder: Path, *, left: str = "", right: str = "", frames: int = 25, **fault: Any
 ) -> Path:
     """A session with its recording: what the cameras are told, and what is the matter."""
     folder.mkdir(parents=True)
@@ -59,8 +54,8 @@ def recording(
     ]
     draft = folder / "draft.toml"
     draft.write_text(HEAD + "".join(cameras), encoding="utf-8")
-    settings = {**FAST, "frames": frames, "seed": seed, "pixel_noise": 0.02, **fault}
-    simulate(load_session(draft), folder / "out", SimulationOptions(**settings))  # type: ignore[arg-type]
+    settings = {**FAST, "frames": frames, "seed": 0, "pixel_noise": 0.02, **fault}
+    simulate(load_session(draft), folder / "out", SimulationOptions(**settings))
     return folder / "out" / "session.toml"
 
 
@@ -77,10 +72,8 @@ def estimated(path: Path) -> tuple[list[Estimate], Floats]:
 
 def rms(errors: Floats) -> tuple[float, float]:
     """Degrees, and mm."""
-    turn, shift = (
-        float(np.sqrt((part**2).sum(axis=1).mean())) for part in np.hsplit(errors, 2)[::-1]
-    )
-    return np.degrees(turn), shift
+    shift, turn = np.sqrt((errors.reshape(-1, 2, 3) ** 2).sum(axis=2).mean(axis=0)).tolist()
+    return float(np.degrees(turn)), float(shift)
 
 
 def per_dimension(estimates: list[Estimate], errors: Floats) -> float:
@@ -103,14 +96,15 @@ def per_dimension(estimates: list[Estimate], errors: Floats) -> float:
     ids=["a late camera", "rolling shutters", "out of step by their times"],
 )
 def test_what_is_told_costs_little_accuracy(
-    told: dict[str, str], fault: dict[str, float], tmp_path: Path
+    told: dict[str, Any], fault: dict[str, Any], tmp_path: Path
 ) -> None:
     _, plain = estimated(recording(tmp_path / "plain"))
     estimates, errors = estimated(recording(tmp_path / "fault", **told, **fault))
-    # not known of the velocity adds to the noise: by half at most
-    for bad, good in zip(rms(errors), rms(plain), strict=True):
+    # what is not known of the velocity adds to the noise, by half at most; it takes three frames to
+    # know how the body moves
+    for bad, good in zip(rms(errors[3:]), rms(plain[3:]), strict=True):
         assert bad < 1.5 * good
-    # of 30 frames with 6 dimensions each
+    # of 25 frames with 6 dimensions each
     assert 0.5 < per_dimension(estimates, errors) < 2
 
 
@@ -119,15 +113,11 @@ def test_the_first_frame_does_not_know_its_velocity_and_says_so(tmp_path: Path) 
     plain = recording(tmp_path / "b", frames=6)
     (first, *_, last), errors = estimated(path)
     (usual, *_), _ = estimated(plain)
-    for one in (first, usual, last):
-        assert one.covariance is not None
-    sure, unsure, later = (
-        float(np.sqrt(np.trace(one.covariance[:3, :3])))  # type: ignore[index]
-        for one in (usual, first, last)
-    )
+    covariances = [one.covariance for one in (usual, first, last) if one.covariance is not None]
+    sure, unsure, later = (float(np.sqrt(np.trace(one[:3, :3]))) for one in covariances)
     assert unsure > 2 * sure
     assert later < unsure / 2
-    assert errors[0] @ np.linalg.solve(first.covariance, errors[0]) < 22.5  # 99.9 %, of six
+    assert errors[0] @ np.linalg.solve(covariances[1], errors[0]) < 22.5  # 99.9 %, of six
 
 
 def test_an_unknown_delay_is_found_and_taken_off(tmp_path: Path) -> None:
@@ -143,9 +133,11 @@ def test_an_unknown_delay_is_found_and_taken_off(tmp_path: Path) -> None:
 
 
 def test_run_says_in_the_end_which_camera_is_late(tmp_path: Path) -> None:
-    late = recording(tmp_path / "late", delay={"right": -0.005})
-    plain = recording(tmp_path / "plain")
-    asked = recording(tmp_path / "asked", right='delay = "estimate"', delay={"right": 0.003})
+    late = recording(tmp_path / "late", delay={"right": -0.005}, frames=15)
+    plain = recording(tmp_path / "plain", frames=15)
+    asked = recording(
+        tmp_path / "asked", right='delay = "estimate"', delay={"right": 0.003}, frames=15
+    )
 
     def said(path: Path) -> str:
         command = [sys.executable, "-m", "mixpose", "run", str(path), "-o"]
@@ -161,7 +153,7 @@ def test_run_says_in_the_end_which_camera_is_late(tmp_path: Path) -> None:
     assert "late" not in said(plain)
     found = re.search(r"sensor 'right': delay estimated as (\S+) s", said(asked))
     assert found is not None
-    assert float(found[1]) == pytest.approx(0.003, abs=1e-4)
+    assert float(found[1]) == pytest.approx(0.003, abs=2e-4)
 
 
 def test_a_delay_without_times_is_an_error(tmp_path: Path) -> None:

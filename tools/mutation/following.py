@@ -94,14 +94,6 @@ _PREDICTION = (
         (_DELAYS,),
     ),
     Mutant(
-        "tracking-a-late-body-keeps-its-velocity",
-        "sensors/moving.py",
-        "(self.velocity + 0.5 * seconds * self.acceleration) * seconds",
-        "self.velocity * seconds",
-        "sensors that are late by much see the body off its course",
-        (_DELAYS,),
-    ),
-    Mutant(
         "tracking-sudden-motion-goes-unnoticed",
         "tracking/track.py",
         "uncertainty = np.maximum(_per_kind(half), rules.steady(body))",
