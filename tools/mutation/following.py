@@ -372,8 +372,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-live-search-forgets",
         "tracking/tracker.py",
-        "return track.missed(data.log.state), estimate",
-        "return track.missed(track.search), estimate",
+        "return track.missed(data.log.state)",
+        "return track.missed(track.search)",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
