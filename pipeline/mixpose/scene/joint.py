@@ -144,8 +144,11 @@ class Joint:
         data = tracker.data(track, self._frame, self._time_s, left.views)
         if expected is not None and self._may_share(data, left, expected):
             data = replace(data, shared=self._shared)
-        self.data[k], self._left[k], self._owners[k] = data, left, owners
         self.ranked[k] = tracker.ranked(data, quickly=expected is not None)
+        if track is not self.tracks[k]:
+            known = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
+            data = replace(known, log=data.log)
+        self.data[k], self._left[k], self._owners[k] = data, left, owners
 
     def _rejudge(self, k: int, left: Left) -> None:
         """The poses of a body again, by what is left for it in the end."""
