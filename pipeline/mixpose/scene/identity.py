@@ -25,6 +25,9 @@ from mixpose.tracking.likelihood import FrameData
 Floats: TypeAlias = NDArray[np.float64]
 
 
+_EVEN = float(np.log(0.5))  # odds of an exchange where nobody knows, against the likelier way
+
+
 @dataclass(frozen=True)
 class Identities:
     """The outcome for one group of identical bodies.
@@ -46,6 +49,7 @@ def identify(
     found: Mapping[int, Floats],
     data: Mapping[int, FrameData],
     rival: float,
+    forgotten: int,
 ) -> Identities:
     """Tell which identical body has which pose.
 
@@ -59,6 +63,9 @@ def identify(
         What was known of each before the frame.
     rival : float
         Odds from which an exchange casts doubt.
+    forgotten : int
+        Frames without a pose after which two that were lost together may have changed places,
+        wherever they were before.
     """
     known = [k for k in group if data[k].predictions]
     finders = sorted(found, key=lambda k: tuple(np.round(found[k][:3, 3], 6)))
@@ -66,7 +73,8 @@ def identify(
         return Identities({}, {})
     likely = _likelihoods(known, finders, found, data)
     poses = _assigned(group, known, finders, likely)
-    return Identities(poses, _exchanges(known, poses, finders, likely, rival))
+    lost = {k for k in known if data[k].track.misses > forgotten}
+    return Identities(poses, _exchanges(known, poses, finders, likely, rival, lost))
 
 
 def _likelihoods(
@@ -124,6 +132,7 @@ def _exchanges(
     finders: Sequence[int],
     likely: Floats,
     rival: float,
+    lost: set[int],
 ) -> dict[int, list[tuple[int, float]]]:
     """Members whose poses might be each other's; one without a pose might have any other's."""
     exchanged: dict[int, list[tuple[int, float]]] = {}
@@ -143,6 +152,8 @@ def _exchanges(
                 odds -= likely[row[a], mine] + likely[row[b], theirs]
             else:
                 continue
+            if {a, b} <= lost:
+                odds = max(odds, _EVEN)
             if odds > limit:
                 share = float(np.exp(min(odds, 0.0)))
                 exchanged.setdefault(a, []).append((poses.get(b, poses[a]), share))

@@ -76,7 +76,7 @@ class Scene:
             if found[k].verdict.best is not None
         }
         rules = self.members[group[0]].tracker.rules.acceptance
-        told = identify(group, poses, data, rules.rival)
+        told = identify(group, poses, data, rules.rival, self.rules.forgotten)
         by_finder = {k: found[k] for k in group}
         spare = [by_finder[k] for k in group if k not in told.poses.values()]
         for k in group:
