@@ -21,33 +21,25 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
-from mixpose.density.atlas import REACH
 from mixpose.objective.base import Quadratic, View
 from mixpose.objective.kernel import Matched, Overlaps, Slopes, inner_products, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, Projected, project_body
 
 Floats: TypeAlias = NDArray[np.float64]
 
-STEPS_PER_SIGMA = 3.0
-"""Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
-
-LAST_STEPS = 5.0
-"""The same at σ_ε, where estimates end: places are 4e-4 standard deviations off at most, a part of
+STEPS_PER_SIGMA = 4.0
+"""Cells per standard deviation of C: places are 4e-4 standard deviations off at most, a part of
 what the best centres of blobs err by."""
 
-FINE_STEPS = 8.0
-"""The same where grey values are judged, which have no detection noise."""
-
-ZOOM_STEPS, ZOOM = 256.0, 0.0625
-"""The same for the last digits, and how far around features, in standard deviations of C: where
-features overlap, gradients are looked up beside their zeros and err by the square of a cell."""
+FINE_STEPS = 48.0
+"""The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
 
 def look_up_error(steps_per_sigma: float) -> float:
-    """Of a height, what looking it up linearly errs by along one axis: 1/8n²."""
-    return 1 / (8 * steps_per_sigma**2)
+    """Of a height, what looking it up errs by along an axis: √3/216 n⁻³ of the third derivative."""
+    return 0.011 / steps_per_sigma**3
 
 
 def value_error(steps_per_sigma: float) -> float:
@@ -159,24 +151,15 @@ class SharedDensities:
         observations = [view.observation for view in views]
         sigmas = [one.sigma for one in observations]
         totals = tuple(one.weight for one in observations)
-        return cls(matched_atlas(observations, sigmas, LAST_STEPS), totals)
-
-
-def steps_at(view: View, sigma: float) -> float:
-    """Cells per standard deviation with which a sensor's density is drawn at a blur."""
-    if sigma > view.observation.sigma:
-        return STEPS_PER_SIGMA
-    return LAST_STEPS if view.observation.cell is None else FINE_STEPS
+        return cls(matched_atlas(observations, sigmas, STEPS_PER_SIGMA), totals)
 
 
 def matched_objective(
     views: Sequence[View],
     body: Body,
     sigmas: Sequence[float],
-    near: Floats | None = None,
     *,
-    steps_per_sigma: float = STEPS_PER_SIGMA,
-    around: float = REACH,
+    steps_per_sigma: float | None = None,
     shared: SharedDensities | None = None,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
@@ -188,23 +171,20 @@ def matched_objective(
     body : Body
     sigmas : sequence of float
         Standard deviation of a feature at this level, per view, in sensor units.
-    near : (4, 4) array or None
-        Densities are wanted only around the projection of this pose; None: anywhere.
-    steps_per_sigma : float
-        Cells per standard deviation of C.
-    around : float
-        Standard deviations of C about the projection within which grey values are drawn.
+    steps_per_sigma : float or None
+        Cells per standard deviation of C; None: fine for grey values at σ_ε.
     shared : SharedDensities or None
         Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
         own detections, and others only where they are out of its reach.
     """
+    if steps_per_sigma is None:
+        at_last = all(
+            view.observation.cell is not None and sigma <= view.observation.sigma
+            for view, sigma in zip(views, sigmas, strict=True)
+        )
+        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
-    places: list[Floats | None] = [None] * len(views)
-    if near is not None:
-        at = projection.project(near[None])
-        dimensions = projection.dimensions.tolist()
-        places = [y[0][seen[0]][:, :m] for y, seen, m in zip(at.y, at.seen, dimensions)]
     energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
     variances = 2 * np.square(sigmas)
     tops = np.array([peak(v, m) for v, m in zip(variances, projection.dimensions)])
@@ -212,7 +192,7 @@ def matched_objective(
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
     if shared is None:
-        atlas = matched_atlas(observations, sigmas, steps_per_sigma, places, around)
+        atlas = matched_atlas(observations, sigmas, steps_per_sigma)
     else:
         atlas = shared.atlas
         parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
