@@ -94,8 +94,8 @@ def test_a_recording_of_two_different_and_two_identical_bodies() -> None:
     found = evaluate(
         PoseFile(Path("poses"), {}, tuple(lines), "mm"), read_poses(RECORDING / "truth.jsonl")
     )
-    assert len(lines) == 4 * 25
-    assert found.ok == 100
+    assert len(lines) == 4 * 30
+    assert found.ok == 120
     assert found.swaps is not None
     assert found.swaps.count == 0
     # one body alone before such cameras has 0.03 degrees at worst over 16 recordings; a rod is

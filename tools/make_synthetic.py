@@ -359,13 +359,13 @@ RECORDINGS = {
     "several_bodies": Recording(
         SEVERAL_BODIES,
         SimulationOptions(
-            frames=25,
+            frames=30,
             seed=15,
             background=-2.5,  # nearly all noise is clipped
             noise=1.0,
-            amplitude_translation=30.0,
+            amplitude_translation=22.0,
             amplitude_rotation_deg=20.0,
-            period_s=2.0,
+            period_s=2.7,
         ),
     ),
     "one_camera_video": Recording(
