@@ -363,9 +363,9 @@ RECORDINGS = {
             seed=15,
             background=-2.5,  # nearly all noise is clipped
             noise=1.0,
-            amplitude_translation=22.0,
-            amplitude_rotation_deg=20.0,
-            period_s=2.7,
+            amplitude_translation=30.0,
+            amplitude_rotation_deg=18.0,
+            period_s=3.3,
         ),
     ),
     "one_camera_video": Recording(
