@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mixpose.cli.app_calibrate import calibrate
+from mixpose.cli.app_design import design
 from mixpose.cli.words import (
     AllowCode,
     ConvertFormat,
@@ -397,3 +398,4 @@ def report(
 
 
 app.command()(calibrate)
+app.command()(design)
