@@ -141,6 +141,22 @@ def test_errors_at_the_tip_follow_those_of_the_pose(tip: list[float]) -> None:
     np.testing.assert_allclose(covariance, expected, rtol=1e-6, atol=1e-9)
 
 
+def test_markers_on_the_back_do_not_count() -> None:
+    towards = np.repeat([[0.0, 0.0, -1.0]], len(POINTS), axis=0)  # to the first beam's source
+    averted = towards.copy()
+    averted[0] *= -1
+    beam = (three_beams()[0],)
+    free = np.array([True, True, False, False, False, True])
+    predictions = []
+    for body in (
+        Body("b", body_of(POINTS).features, averted),
+        Body("b", body_of(POINTS[1:]).features, towards[1:]),
+    ):
+        predictions.append(predict(Plan(("a",), beam, (1.0,), (1.0,), body, free), np.eye(4)[None]))
+    assert predictions[0].seen.sum() == len(POINTS) - 1
+    np.testing.assert_allclose(predictions[0].covariances, predictions[1].covariances)
+
+
 def test_a_direction_that_no_sensor_sees_is_infinite_at_the_tip_too() -> None:
     beam = three_beams()[0]
     plan = Plan(("a",), (beam,), (1.0,), (1.0,), body_of(POINTS), ALL)

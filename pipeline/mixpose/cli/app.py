@@ -184,7 +184,7 @@ def import_(
         typer.Argument(
             metavar="FILE...",
             help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and at most one body: .csv, .rom, .vsk or .obj.",
+            "and bodies: .csv, .rom, .vsk or .obj.",
         ),
     ],
     output: Annotated[
