@@ -105,6 +105,14 @@ class FrameSet:
 
 
 @dataclass(frozen=True)
+class DelaySeen:
+    """How late a sensor is against the first one, in seconds, and its standard deviation."""
+
+    seconds: float
+    deviation: float
+
+
+@dataclass(frozen=True)
 class SensorReport:
     """How one sensor took part in an estimate.
 
@@ -180,6 +188,9 @@ class Estimate:
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
+    delays : mapping of str to DelaySeen
+        How late sensors are beyond what the session says, as far as the frames so far show it; no
+        part of the pose line.
     doubt : str
         Why a frame is ambiguous whose pose has no rival; no part of it either.
     offsets : mapping of str to Offsets
@@ -198,6 +209,7 @@ class Estimate:
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
     proposer: str = field(default="", compare=False)
+    delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
     doubt: str = field(default="", compare=False)
     offsets: Mapping[str, Offsets] = field(default_factory=dict, compare=False, repr=False)
 
