@@ -126,12 +126,16 @@ class SensorReport:
         Residual of the explained features, px or length units.
     why : str or None
         Why a sensor with features was not used.
+    residuals : mapping of str to float or None
+        How far off each feature in view was met, px or length units, by what it is called; None
+        where it was not met.
     """
 
     used: bool
     explained: float | None = None
     rms: float | None = None
     why: str | None = None
+    residuals: Mapping[str, float | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -205,6 +205,10 @@ class Tracker:
         told = best or (ranked[0] if ranked else None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
+        offsets = _offsets(told, self.body) if told else {}
+        for name, report in (told.sensors if told else {}).items():
+            residuals = _residuals(offsets[name], self.body) if name in offsets else {}
+            reports[name] = replace(report, residuals=residuals)
         return Estimate(
             frame=frame,
             time_s=time_s,
@@ -213,11 +217,11 @@ class Tracker:
             T_world_object=best.T_world_object if best else None,
             covariance=best.covariance if best else None,
             score=told.score if told else 0.0,
-            sensors=reports | (told.sensors if told else {}),
+            sensors=reports,
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
             doubt=verdict.doubt,
-            offsets=_offsets(told, self.body) if told else {},
+            offsets=offsets,
             delays=delays.seconds(),
         )
 
@@ -312,6 +316,15 @@ def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
         one.name: Offsets(one.features, one.shares > 0, one.offsets, one.J[..., :3])
         for one in judged.associations
         if judged.sensors[one.name].used
+    }
+
+
+def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
+    """Lengths of offsets by the name of their feature."""
+    lengths = np.linalg.norm(offsets.offsets, axis=1).tolist()
+    return {
+        body.labels[i]: length if met else None
+        for i, met, length in zip(offsets.features, offsets.met, lengths, strict=True)
     }
 
 
