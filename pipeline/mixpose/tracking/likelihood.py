@@ -19,7 +19,7 @@ from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
 from mixpose.objective import MatchedObjective, SharedDensities, View, matched_objective
 from mixpose.records import SensorReport
-from mixpose.search import SearchState
+from mixpose.search import SearchReport, SearchState
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
@@ -68,9 +68,10 @@ class Likelihood(Protocol):
 
 @dataclass
 class SearchLog:
-    """Where the search of a frame goes on in the next."""
+    """What the search of a frame cost, and where it goes on in the next."""
 
     state: SearchState = SearchState()
+    report: SearchReport | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.proposal_rules import ProposalRules
 from mixpose.tracking.range_rules import RangeRules
+from mixpose.tracking.static_clutter import StaticRules
 
 
 @dataclass(frozen=True)
@@ -22,5 +23,6 @@ class Rules:
     motion: MotionRules = MotionRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
+    static: StaticRules = StaticRules()
     search: SearchBudget = THOROUGH
     live: SearchBudget = LIVE

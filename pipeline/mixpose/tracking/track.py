@@ -14,6 +14,7 @@ from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_
 from mixpose.rigid import perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.static_clutter import StaticClutter
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -90,6 +91,8 @@ class Track:
         Where a search with a budget goes on while nothing convinces.
     doubted : bool
         Whether another body of the scene may have what the last pose meets.
+    clutter : StaticClutter
+        What stayed where it was while the body was lost.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -101,10 +104,11 @@ class Track:
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
     doubted: bool = False
+    clutter: StaticClutter = StaticClutter()
 
-    def missed(self, search: SearchState) -> Track:
+    def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
-        return replace(self, misses=self.misses + 1, search=search)
+        return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
 
 
 @dataclass(frozen=True)
@@ -229,7 +233,8 @@ def follow(
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), rules.steady(body))
         branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
-    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies)
+    clutter = track.clutter
+    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, clutter=clutter)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

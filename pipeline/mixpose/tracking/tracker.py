@@ -8,7 +8,7 @@ everywhere else, and invents nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -120,6 +120,8 @@ class Tracker:
         ranked = self.ranked(data)
         verdict = self.verdict(data, ranked)
         estimate = self.estimate(frame, time_s, views, verdict, ranked)
+        if data.log.report:
+            estimate = replace(estimate, guesses=astuple(data.log.report))
         return self.followed(data, frame, time_s, verdict), estimate
 
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
@@ -201,7 +203,8 @@ class Tracker:
         """The track after a frame."""
         track, best = data.track, verdict.best
         if best is None:
-            return track.missed(data.log.state)
+            clutter = track.clutter.learnt(data.views, self.rules.static)
+            return track.missed(data.log.state, clutter)
         found = [
             Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
             for one, weight in verdict.kept
