@@ -130,7 +130,7 @@ _BLUR = (
     Mutant(
         "density-overlap-ends-early",
         "density/overlap.py",
-        "REACH = 7.5",
+        "REACH = 5.7",
         "REACH = 2.0",
         "bodies of many features have too little energy where features lie close",
     ),
@@ -244,8 +244,8 @@ _KERNEL = (
     Mutant(
         "objective-overlap-counted-twice",
         "objective/kernel.py",
-        "half = -(scaled * (along_i - along_j)).sum(axis=2)",
-        "half = -2 * (scaled * (along_i - along_j)).sum(axis=2)",
+        "half = -(scaled[:, :, None] @ (along_i - along_j))",
+        "half = -2 * (scaled[:, :, None] @ (along_i - along_j))",
         "the gradient is wrong where features overlap",
     ),
     Mutant(
@@ -265,7 +265,7 @@ _KERNEL = (
     Mutant(
         "objective-overlap-ends-early",
         "objective/kernel.py",
-        "_NEGLIGIBLE = -28.0",
+        "_NEGLIGIBLE = -16.0",
         "_NEGLIGIBLE = -1.0",
         "overlaps of features more than 1.4 standard deviations apart are left out",
     ),

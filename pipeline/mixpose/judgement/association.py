@@ -128,16 +128,17 @@ def associate(
     float
         The objective at the pose.
     """
-    at, sampled, matched, _ = objective.match(T_world_object[None])
+    at, sampled, over = objective.match(T_world_object[None])
     node_weights = objective.projection.body.nodes.weights
-    found = []
+    found, value = [], 0.0
     for k, view in enumerate(objective.views):
         m, observation = int(objective.projection.dimensions[k]), view.observation
         variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
         features = np.flatnonzero(at.seen[k, 0])
         y, weights = at.y[k, 0, features, :m], at.weights[k, 0, features]
         J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
-        product, norm = float(matched.product[k, 0]), float(matched.norm[k, 0])
+        product, norm = float(weights @ C[:, 0]), float(over.norm[k, 0])
+        value += float(objective.weights[k, 0]) / energy * product**2 / norm
         shares, offsets, merged = np.zeros(len(y)), np.zeros(y.shape), 0
         detections = np.full(len(y), -1)
         if product > 0:
@@ -169,5 +170,4 @@ def associate(
                 surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
             )
         )
-    explained = matched.product**2 / matched.norm
-    return found, float((objective.weights / objective.energies * explained).sum())
+    return found, value

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
 from mixpose.objective.base import Quadratic, View
-from mixpose.objective.kernel import Matched, Overlaps, Slopes, inner_products, overlaps, slopes
+from mixpose.objective.kernel import Overlaps, Slopes, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, Projected, project_body
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -90,18 +90,20 @@ class MatchedObjective:
         """
         parts = []
         for some in self._blocks(poses):
-            at, _, matched, _ = self.match(some)
-            norm = matched.norm
+            at, sampled, over = self.match(some)
+            norm = over.norm
             if whole:
                 hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
                 norm = norm + self.tops * (hidden**2).sum(axis=2)
-            parts.append(self.weights / self.energies * matched.product**2 / norm)
+            product = (sampled[..., 0] * at.weights).sum(axis=2)
+            parts.append(self.weights / self.energies * product**2 / norm)
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
 
-    def match(self, poses: Floats) -> tuple[Projected, Floats, Matched, Overlaps]:
-        """The predicted features at poses (H, 4, 4), C at them, and the inner products."""
-        at, sampled, over = self._predicted(poses)
-        return at, sampled, inner_products(sampled[..., 0] * at.weights, over), over
+    def match(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
+        """The predicted features at poses (H, 4, 4), C with its gradient there, and ⟨h, h⟩."""
+        at = self.projection.project(poses)
+        sampled = self.atlas.look_up(at.y)
+        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
@@ -110,13 +112,8 @@ class MatchedObjective:
         parts = [self._slopes(some) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _predicted(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
-        at = self.projection.project(poses)
-        sampled = self.atlas.look_up(at.y)
-        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
-
     def _slopes(self, poses: Floats) -> Slopes:
-        at, sampled, over = self._predicted(poses)
+        at, sampled, over = self.match(poses)
         scales = self.weights / self.energies
         return slopes(at, sampled, over, self.variances, self.tops, scales)
 
