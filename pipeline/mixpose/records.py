@@ -105,6 +105,14 @@ class FrameSet:
 
 
 @dataclass(frozen=True)
+class DelaySeen:
+    """How late a sensor is against the first one, in seconds, and its standard deviation."""
+
+    seconds: float
+    deviation: float
+
+
+@dataclass(frozen=True)
 class SensorReport:
     """How one sensor took part in an estimate.
 
@@ -161,6 +169,9 @@ class Estimate:
         part of the pose line.
     guesses : tuple of int or None
         Where the body was searched for: guesses made, tested on everything, and refined.
+    delays : mapping of str to DelaySeen
+        How late sensors are beyond what the session says, as far as the frames so far show it; no
+        part of the pose line.
     """
 
     frame: int
@@ -176,6 +187,7 @@ class Estimate:
     instance: int | None = None
     proposer: str = field(default="", compare=False)
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
+    delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
 
     @property
     def label(self) -> str:
