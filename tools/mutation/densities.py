@@ -334,13 +334,6 @@ _MATCHED = (
 
 _SAMPLED = (
     Mutant(
-        "objective-behind-the-camera-is-seen",
-        "objective/index_maps.py",
-        "depth[~(depth > NEAREST)] = np.nan",
-        "depth[~(depth > -1e9)] = np.nan",
-        "a body behind the camera explains the image",
-    ),
-    Mutant(
         "objective-left-of-the-image-is-seen",
         "objective/index_maps.py",
         "maps[~((maps >= low) & (maps <= high))] = FAR",
