@@ -156,6 +156,20 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
+    def refitted(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
+        """The same poses, fitted to other views and judged by them, most evident first."""
+        found: list[Judged] = []
+        if data.views:
+            likelihood = likelihood_of(data)
+            close = data.start_uncertainty / data.rules.proposals.narrowing**2
+            for one in ranked:
+                left_out = {n: report.why for n, report in one.sensors.items() if report.why}
+                start = Start(one.T_world_object, close, left_out=left_out)
+                judged = likelihood.judge(likelihood.fit(start), start)
+                judged = replace(judged, proposer=one.proposer)
+                insert(found, judged, self.body, self.free, self.rules.acceptance)
+        return found
+
     def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
         """The same poses, judged by other views, most evident first."""
         if not data.views:
