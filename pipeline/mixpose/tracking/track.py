@@ -16,6 +16,7 @@ from mixpose.search import SearchState
 from mixpose.tracking.course import Course, CourseRules
 from mixpose.tracking.delays import DelayEvidence
 from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.static_clutter import StaticClutter
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -99,6 +100,8 @@ class Track:
         Whether another body of the scene may have what the last pose meets.
     agreed : bool
         Whether two sensors met most of the body in some frame.
+    clutter : StaticClutter
+        What stayed where it was while the body was lost.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -112,10 +115,11 @@ class Track:
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
     agreed: bool = False
+    clutter: StaticClutter = StaticClutter()
 
-    def missed(self, search: SearchState) -> Track:
+    def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
-        return replace(self, misses=self.misses + 1, search=search)
+        return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
 
 
 @dataclass(frozen=True)
@@ -253,10 +257,8 @@ def follow(
                 course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
     met = [one for one in tallies.values() if one.met >= _MOST * one.in_view > 0]
-    agreed = track.agreed or len(met) > 1
-    return Track(
-        tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays, agreed=agreed
-    )
+    after = Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
+    return replace(after, clutter=track.clutter, agreed=track.agreed or len(met) > 1)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
