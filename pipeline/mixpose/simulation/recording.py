@@ -139,7 +139,7 @@ def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -
     last = max(len(session.sensors) - 1, 1)
     steps = []
     for i, (setup, kind) in enumerate(zip(session.sensors, kinds, strict=True)):
-        tells = setup.times is not None or kind == "detections"
+        tells = setup.times is not None or (kind == "detections" and setup.fps is None)
         if options.out_of_step and not tells:
             raise SessionError(
                 f"sensor {setup.name!r}: times: missing; sensors that are out of step need a table "
