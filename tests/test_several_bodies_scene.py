@@ -191,6 +191,17 @@ def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_no
     assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
 
 
+def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
+    isosceles = np.array([[0, 45, 0], [-30, 0, 0], [30, 0, 0.0]])
+    whole = np.concatenate([isosceles, [[10, 15, 60.0]], [[-20, -40, 35.0]], [[45, 30, -50.0]]])
+    one, other, part = body("one", whole), body("other", OTHER), body("part", isosceles)
+    T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
+    scene = scene_of(one, other)
+    outcomes = scene.advance(scene.begin(), 0, None, views_of([part, other], [T, elsewhere], 5))
+    assert outcomes[0].estimate.status != "ok"
+    assert outcomes[1].estimate.status == "ok"
+
+
 def claim(numbers: list[int], places: list[list[float]], squared: list[float]) -> Claim:
     return Claim(np.array(numbers), np.array(places), np.array(squared))
 

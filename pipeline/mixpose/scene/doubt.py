@@ -1,4 +1,4 @@
-"""Poses that may be another body: where all that is met is a part that both have.
+"""Poses that may be another body, or another way up: all that is met is a part that both have.
 
 A body of which three markers are met looks like every body that has three markers in the same
 places.  Where such another one of the session is not surely somewhere else, its pose there is a
@@ -27,7 +27,7 @@ def may_be_another(
     elsewhere: Sequence[bool],
     alike: float,
 ) -> bool:
-    """Whether a pose of member k might as well be one of another body.
+    """Whether a pose of member k might as well be one of another body, or another of its own.
 
     Parameters
     ----------
@@ -45,7 +45,8 @@ def may_be_another(
     body = members[k].tracker.body
     for j, other in enumerate(members):
         theirs = other.tracker.body
-        if j == k or theirs is body or elsewhere[j]:
+        # a body's own markers may repeat themselves: then it may be turned another way
+        if j != k and (theirs is body or elsewhere[j]):
             continue
         limit = best.log_evidence + float(np.log(other.tracker.rules.acceptance.rival))
         for part in parts_of(body, theirs, alike):
