@@ -5,8 +5,8 @@
 Session files, calibrations, tables of markers, detections and times, profiles, images, videos and
 poses are flipped, cut, doubled, nested, filled with absurd numbers and exchanged for each other,
 and given to the command line in a process of their own.  A finding is a traceback, a crash, an exit
-status other than 0, 2 and 3, more than one line that is no warning, more than 10 s, or more than
-2 GB.  The mutator knows nothing of the code that it runs through; `atheris` would, but it cannot
+status other than 0, 2 and 3, more than one line that is no warning, more than 10 s (of processor time), or
+more than 2 GB.  The mutator knows nothing of the code that it runs through; `atheris` would, but it cannot
 see into the decoders of OpenCV and FFmpeg, where most bytes of these inputs go.
 """
 
@@ -34,6 +34,9 @@ from mixpose.frames.quiet import quieten_opencv
 
 LONGEST_S = 10.0
 LARGEST_BYTES = 2 * 10**9
+PATIENCE_S = (
+    600.0  # by the clock; `LONGEST_S` is processor time, which a busy machine does not change
+)
 SESSION = """unit = "mm"
 [object]
 name = "body"
@@ -272,7 +275,7 @@ def said_by(folder: Path, arguments: tuple[str, ...]) -> tuple[str | None, float
     if child == 0:
         _run_in_child(folder, arguments)
     os.set_blocking(0, True)
-    with _alarm(LONGEST_S + 50, child):
+    with _alarm(PATIENCE_S, child):
         _, status, usage = os.wait4(child, 0)
     seconds = usage.ru_utime + usage.ru_stime
     size = usage.ru_maxrss * 1024
