@@ -5,9 +5,9 @@
 Session files, calibrations, tables of markers, detections and times, profiles, images, videos and
 poses are flipped, cut, doubled, nested, filled with absurd numbers and exchanged for each other,
 and given to the command line in a process of their own.  A finding is a traceback, a crash, an exit
-status other than 0, 2 and 3, more than one line that is no warning, more than 10 s (of processor time), or
-more than 2 GB.  The mutator knows nothing of the code that it runs through; `atheris` would, but it cannot
-see into the decoders of OpenCV and FFmpeg, where most bytes of these inputs go.
+status other than 0, 2 and 3, more than one line that is no warning, more than 10 s of processor
+time, or more than 2 GB.  The mutator knows nothing of the code that it runs through; `atheris`
+would, but it cannot see into the decoders of OpenCV and FFmpeg, where most of these bytes go.
 """
 
 from __future__ import annotations
