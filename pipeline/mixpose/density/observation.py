@@ -31,6 +31,10 @@ STEPS_PER_SIGMA = 4.0
 MOST_CELLS = 1_500_000
 """Grid points of a dense window; a larger one gets coarser."""
 
+MOST_SIGMAS = 4000.0
+"""Extent of features over the narrowest blur at which they are drawn: pages are 9.9 σ wide, and a
+plane has 400 000 of them."""
+
 _MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 
 
@@ -101,6 +105,16 @@ class Observation:
             return pattern.points.min(axis=0), pattern.points.max(axis=0)
         size = np.array(pattern.values.shape[::-1])[: self.dimension]
         return pattern.origin, np.asarray(pattern.origin + (size - 1) * pattern.step)
+
+    def narrowest(self, share: float, y: Floats) -> float:
+        """Narrowest blur in σ_ε: a share for detections, as far as an atlas reaches.
+
+        `y` (n, m) are predicted features, about which it is drawn.
+        """
+        if self.cell is not None or not len(y):
+            return 1.0
+        extent = float((y.max(axis=0) - y.min(axis=0)).max())
+        return min(max(share, extent / (MOST_SIGMAS * self.sigma)), 1.0)
 
     def density(
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False

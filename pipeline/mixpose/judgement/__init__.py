@@ -15,7 +15,7 @@ from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior
 from mixpose.judgement.expected_covariance import expected_covariance
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
-from mixpose.judgement.noise import Noise, NoiseModel
+from mixpose.judgement.noise import NoiseModel, Residuals
 
 __all__ = [
     "AcceptanceRules",
@@ -23,9 +23,9 @@ __all__ = [
     "DetectionModel",
     "Judged",
     "JudgementRules",
-    "Noise",
     "NoiseModel",
     "Prior",
+    "Residuals",
     "Verdict",
     "associate",
     "beliefs",

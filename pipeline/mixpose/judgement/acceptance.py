@@ -166,7 +166,7 @@ def _alike(
     if apart < rules.same_distance * body.radius and turned < rules.same_rotation_deg:
         return True
     # one peak, of which one of the two is not the top: as in depth, seen by one camera
-    better = a if a.log_evidence >= b.log_evidence else b
     away = twist_between(T_a, T_b)[free]
-    inside = away @ np.linalg.solve(better.covariance[np.ix_(free, free)], away) < rules.same_peak
+    both = (a.covariance + b.covariance)[np.ix_(free, free)]
+    inside = away @ np.linalg.solve(both, away) < rules.same_peak
     return bool(inside and turned < rules.same_peak_deg)

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.association import Association
-from mixpose.judgement.noise import Noise, NoiseModel
+from mixpose.judgement.noise import information_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -89,12 +89,10 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 
 def log_evidence(
     associations: Sequence[Association],
-    information: Floats,
-    noise: Noise,
+    variances: Floats,
     free: NDArray[np.bool_],
     prior: Prior,
     detection: DetectionModel,
-    model: NoiseModel,
 ) -> float:
     """Logarithm of the odds for the body at a pose against mere clutter.
 
@@ -102,25 +100,22 @@ def log_evidence(
     ----------
     associations : sequence of Association
         One per sensor that saw something.
-    information : (6, 6) array
-        For noise of one σ.
-    noise : Noise
+    variances : (L,) array
+        Of the noise of each, in σ_ε².
     free : (6,) bool
     prior : Prior
     detection : DetectionModel
-    model : NoiseModel
     """
     if not any(one.met for one in associations):
         return -np.inf
-    typical = Noise(model.typical_degrees * model.typical**2, model.typical_degrees)
-    variance = typical.joined(noise).variance
     gained, missed = 0.0, 0.0
-    for one in associations:
+    for one, variance in zip(associations, variances.tolist(), strict=True):
         gained += float(one.shares @ _gains(one, variance, detection.probability))
         missed += one.missed * detection.log_missed
         missed += one.unseen * detection.log_unseen
     # a direction that the data leave open is as uncertain as before
-    inner = information[np.ix_(free, free)] / variance + np.diag(1 / prior.spread[free] ** 2)
+    information = information_of(associations, variances)[np.ix_(free, free)]
+    inner = information + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
     by_volume = gained + missed + laplace + prior.log_density
     if not detection.by_count:

@@ -15,12 +15,9 @@ from mixpose.density import AssociationRules
 from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.noise import (
-    Noise,
     NoiseModel,
-    covariance_of,
-    information_of,
+    Residuals,
     noise_of,
-    noises,
 )
 from mixpose.objective import MatchedObjective
 from mixpose.records import SensorReport
@@ -55,8 +52,8 @@ class Judged:
         Zero in directions that are not estimated.
     log_evidence : float
         Logarithm of the odds for this pose against mere clutter.
-    noise : Noise
-        Residuals of this frame and, fading, of those before it, for the next frame.
+    residuals : Residuals
+        Of this frame and, fading, of those before it, for the next frame.
     associations : tuple of Association
         The pose against each sensor that saw something.
     spread : (6,) float64 or None
@@ -74,7 +71,7 @@ class Judged:
     measurements: float
     covariance: Floats
     log_evidence: float
-    noise: Noise
+    residuals: Residuals
     associations: tuple[Association, ...] = ()
     spread: Floats | None = None
     proposer: str = ""
@@ -86,7 +83,7 @@ def judge(
     T_world_object: Floats,
     free: NDArray[np.bool_],
     *,
-    before: Noise = Noise(),
+    before: Residuals = Residuals(),
     prior: Prior | None = None,
     rules: JudgementRules = JudgementRules(),
 ) -> Judged:
@@ -99,17 +96,16 @@ def judge(
     T_world_object : (4, 4) array
     free : (6,) bool
         Directions that were estimated.
-    before : Noise
-        Residuals of the frames before.
+    before : Residuals
+        Of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
     rules : JudgementRules
     """
-    found, value = associate(objective, T_world_object, rules.association)
+    narrowest = rules.noise.errors.narrowest
+    found, value = associate(objective, T_world_object, rules.association, narrowest)
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
-    information = information_of(found)
-    noise, remembered = noises(before, noise_of(found, free), rules.noise)
-    evidence = log_evidence(found, information, noise, free, prior, rules.detection, rules.noise)
+    noise = noise_of(found, free, before, rules.noise)
     count = len(found)
     return Judged(
         T_world_object=T_world_object,
@@ -117,9 +113,9 @@ def judge(
         score=sum(math.sqrt(one.explained) for one in found) / count,
         coverage=sum(one.coverage for one in found) / count,
         measurements=sum(one.measurements for one in found),
-        covariance=covariance_of(information, noise, free, rules.noise),
-        log_evidence=evidence,
-        noise=remembered,
+        covariance=noise.covariance,
+        log_evidence=log_evidence(found, noise.variances, free, prior, rules.detection),
+        residuals=noise.remembered,
         associations=tuple(found),
         value=value,
     )

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.density import Noise
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
 from mixpose.objective import MatchedObjective, View, matched_objective
@@ -94,6 +95,12 @@ class FrameData:
         """Directions that are estimated."""
         return free_mask(self.options)
 
+    @cached_property
+    def noise(self) -> list[Noise]:
+        """What is remembered of each view's noise."""
+        memory, known = self.rules.judgement.noise.memory, self.track.residuals.noise
+        return [known.get(view.name, Noise()).faded(memory) for view in self.views]
+
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
         return prior_of(
@@ -157,6 +164,8 @@ class MatchedLikelihood:
             data.options,
             data.samples,
             finest=data.finest,
+            noise=data.noise,
+            errors=data.rules.judgement.noise.errors,
             rules=data.rules.fit,
         )
 
@@ -168,7 +177,7 @@ class MatchedLikelihood:
             data.objective_near(T),
             T,
             data.free,
-            before=data.track.noise,
+            before=data.track.residuals,
             prior=data.prior(T),
             rules=data.rules.judgement,
         )
@@ -227,7 +236,7 @@ class AssociationLikelihood:
         return judge_ranges(
             judged,
             self._posterior(start),
-            data.track.noise,
+            data.track.residuals.total,
             # the posterior holds the prediction already
             replace(data.prior(T), spread=anywhere.spread),
             data.rules.judgement.noise,
@@ -236,7 +245,7 @@ class AssociationLikelihood:
 
     def _posterior(self, start: Start) -> Posterior:
         data = self.data
-        noise = noise_ratio(data.track.noise, data.rules.ranges)
+        noise = noise_ratio(data.track.residuals.total, data.rules.ranges)
         detection = data.rules.judgement.detection
         return Posterior(data.views, data.body, data.free, noise, _prior_of(start), detection)
 

@@ -183,9 +183,9 @@ class Tracker:
             Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
             for one, weight in verdict.kept
         ]
-        noise = best.noise if verdict.status == "ok" else track.noise
+        residuals = best.residuals if verdict.status == "ok" else track.residuals
         motion = self.rules.motion
-        return follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
+        return follow(track, self.body, found, frame, time_s, residuals, _tallies(best), motion)
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
