@@ -2,8 +2,8 @@
 
 Offsets of the met features from their prediction are of two kinds.  What the extraction errs by is
 independent from feature to feature.  What a calibration, a clock or a lens errs by is alike in all
-features of a sensor: a field over its coordinates, an offset and, half as large, what turns, scales
-and shears the features' image.  In units of each sensor's noise let the variance of the former be
+features of a sensor: a field over its coordinates, an offset and, less than that, what turns,
+scales and shears the features' image.  In units of each sensor's noise let the variance of the former be
 s², that of the latter τ².  With the weights W, R = 1 − J (JᵀWJ)⁻¹ JᵀW that a pose leaves of errors,
 the fields P as columns and K = PᵀWRP, the residuals r have the expectations
 
@@ -66,9 +66,9 @@ class NoiseModel:
         4.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
     )
     slanted: float = constant(
-        0.5,
-        "of a field's offset: what turns, scales and shears (a chessboard, web cams and action "
-        "cameras: 0.25-0.65)",
+        0.7,
+        "of a field's offset: what turns, scales and shears (a chessboard 0.65, web cams and "
+        "action cameras 0.25-0.4)",
     )
 
     def unseen(self, associations: Sequence[Association]) -> Moments:
