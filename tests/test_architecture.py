@@ -14,7 +14,10 @@ import mixpose
 ROOT = Path(mixpose.__file__).parent
 
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
-GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"}
+GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
+    "encoding",
+    "whole_files",
+}
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
     "rigid": set(),
@@ -22,6 +25,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "selection": set(),
     "constants": set(),
     "threads": set(),
+    "encoding": set(),
+    "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,
     "density": GROUND,
@@ -33,6 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
+    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -44,7 +50,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "density", "extraction", "objective", "tracking", "frames", "session"},
+    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
+    | {"frames", "session"},
+    "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
 MAY_IMPORT["rerun_file"] = GROUND | {

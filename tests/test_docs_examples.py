@@ -1,4 +1,4 @@
-"""The examples of README.md, docs/tutorial.md and docs/python.md, run as a reader would."""
+"""The examples of README.md and of pages of docs/, run as a reader would."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def follow(page: str, capfd: pytest.CaptureFixture[str]) -> None:
             assert f"{line}\n" in content
             Path(file).write_text(content.replace(f"{line}\n", ""), encoding="utf-8")
         named = FILE.search(before)
-        if named and kind in ("csv", "toml", "python"):
+        if named and kind in ("csv", "toml", "yaml", "python"):
             Path(named[1]).write_text(text, encoding="utf-8")
         elif kind == "sh":
             printed = "".join(output_of(line, capfd) for line in text.splitlines())
@@ -92,6 +92,14 @@ def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
     (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
     follow("docs/python.md", capfd)
     assert {"left_0.png", "right_0.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_the_page_about_importing_can_be_followed_in_an_empty_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    follow("docs/importing.md", capfd)
+    assert (tmp_path / "poses.jsonl").stat().st_size > 0
 
 
 def test_the_first_two_minutes_print_what_the_readme_shows(

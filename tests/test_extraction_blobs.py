@@ -330,3 +330,21 @@ def test_whole_grey_values_are_above_the_broken_level_below_them() -> None:
     image[10:15, 20:25] = 101
     for threshold, count in ((100.0, 1), (100.5, 1), (101.0, 0), (101.5, 0)):
         assert len(blobs(image, threshold=threshold)) == count, threshold
+
+
+def test_disks_found_together_are_those_found_one_by_one() -> None:
+    # one large, one small, one cut by a straight edge: rims of unlike reach, and of fewer points
+    size, places = 300, ((70.3, 80.6, 30.0), (210.8, 90.2, 9.0), (120.4, 215.7, 16.0))
+    alone = []
+    light = np.zeros((size, size))
+    for u, v, radius in places:
+        own = disk(size, u, v, radius)
+        own[:, : int(u - 0.6 * radius)] = 0
+        light += 150 * own
+        alone.append(blobs(photograph(150 * own, 5)))
+    together = blobs(photograph(light, 5))
+    assert len(together) == 3
+    # noise is the same, as is every number but for the order of sums
+    np.testing.assert_allclose(
+        np.sort(together, axis=0), np.sort(np.concatenate(alone), axis=0), atol=1e-6
+    )

@@ -76,12 +76,47 @@ def test_a_pose_is_sure_from_odds_of_a_thousand(log_evidence: float, expected: s
 
 @pytest.mark.parametrize(
     ("coverage", "log_evidence", "expected"),
-    [(0.5, 0.1, "ambiguous"), (0.5, -0.1, "lost"), (0.6, -4.4, "ambiguous"), (0.6, -4.6, "lost")],
+    [(0.5, 0.6, "ambiguous"), (0.5, 0.4, "lost"), (0.6, -4.4, "ambiguous"), (0.6, -4.6, "lost")],
 )
 def test_less_than_even_odds_are_told_where_most_of_the_body_is_met(
     coverage: float, log_evidence: float, expected: str
 ) -> None:
     assert status(replace(SURE, coverage=coverage, log_evidence=log_evidence)) == expected
+
+
+@pytest.mark.parametrize(("lead", "expected"), [(2.3, "ambiguous"), (2.1, "lost")])
+def test_a_pose_about_as_good_as_others_is_one_of_many_that_meet_by_chance(
+    lead: float, expected: str
+) -> None:
+    # two rivals: their odds add up, ln 2 more than one has
+    best = replace(SURE, log_evidence=-1.0)
+    rival = replace(SURE, T_world_object=ELSEWHERE, log_evidence=-1.0 - lead - np.log(2))
+    assert status(best, rival, rival) == expected
+
+
+@pytest.mark.parametrize(
+    ("met", "in_view", "expected"),
+    [(3, 8, "ambiguous"), (4, 8, "ok"), (3, 5, "ok"), (7, 40, "ambiguous"), (8, 40, "ok")],
+)
+def test_three_markers_of_eight_are_not_sure_whatever_was_expected(
+    met: int, in_view: int, expected: str
+) -> None:
+    one = replace(
+        association("0", 8.0),
+        features=np.arange(in_view),
+        shares=np.where(np.arange(in_view) < met, 1.0, 0.0),
+    )
+    assert status(replace(SURE, associations=(one,))) == expected
+
+
+def test_markers_met_by_different_cameras_count_together() -> None:
+    shares = np.array([1.0, 1, 0, 0, 0, 0, 0, 0])
+    found = (
+        replace(association("0", 8.0), shares=shares),
+        replace(association("1", 8.0), shares=np.roll(shares, 2)),
+    )
+    assert status(replace(SURE, associations=found)) == "ok"
+    assert status(replace(SURE, associations=found[:1])) == "ambiguous"
 
 
 def test_coordinates_too_few_to_fix_a_pose_are_lost() -> None:

@@ -44,7 +44,7 @@ def evidence(
     detection: DetectionModel = BY_VOLUME,
 ) -> float:
     prior = Prior(log_density, np.ones(6))
-    return log_evidence([one], information, Noise(), FREE, prior, detection, MODEL)
+    return log_evidence([one], information, Noise(), FREE, prior, 1.0, detection, MODEL)
 
 
 def test_the_odds_by_volume_are_those_of_the_formula() -> None:
@@ -91,6 +91,53 @@ def test_by_count_features_that_fix_the_pose_earn_nothing_and_choices_cost() -> 
     ways = lgamma(21) - lgamma(18) - lgamma(4) + log(6 * 5 * 4) + log(2)
     by_count = evidence(found, log_density=-1e9, detection=DetectionModel())
     assert by_count == pytest.approx(6 * met * (1 - 6 / 12) - ways)
+
+
+def two_cameras_at_right_angles() -> list[Association]:
+    """Both see a px per length unit across; six features, each met exactly by both."""
+    J = np.zeros((2, 6, 2, 6))
+    J[0, :, 0, 0] = J[0, :, 1, 2] = 1.0
+    J[1, :, 0, 1] = J[1, :, 1, 2] = 1.0
+    return [replace(SIX, name=str(k), J=J[k]) for k in (0, 1)]
+
+
+def odds_by_volume(found: list[Association], *, in_space: bool = True) -> float:
+    detection = DetectionModel(by_count=False, in_space=in_space)
+    prior = Prior(0.0, np.ones(6))
+    return log_evidence(found, KNOWN, Noise(), FREE, prior, 200.0, detection, MODEL)
+
+
+def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it() -> None:
+    both = two_cameras_at_right_angles()
+    # s = 0.4 px: the place is known to s, s and, where both see it, s / √2; a camera sees 1e-5 per
+    # px², each in a depth of 200
+    density = 1e-5 / 200
+    in_space = -log(density * (2 * pi) ** 1.5 * 0.4**3 / 2**0.5)
+    alone = 2 * log(0.75 / (1e-5 * 2 * pi * 0.4**2))
+    assert in_space < alone
+    lost = odds_by_volume(both, in_space=False) - odds_by_volume(both)
+    assert lost == pytest.approx(6 * (alone - in_space), rel=1e-3)
+    # a third camera beside the first adds the precision of a third look, no third coincidence
+    third = odds_by_volume([*both, replace(both[0], name="2")]) - odds_by_volume(both)
+    # along x two see it now in place of one, along z three in place of two
+    assert third == pytest.approx(6 * (log(2) + log(3 / 2)) / 2, rel=1e-3)
+
+
+def test_a_camera_that_misses_a_point_misses_it_whatever_it_is() -> None:
+    both = two_cameras_at_right_angles()
+    blind = replace(both[0], name="2", shares=np.zeros(6))
+    assert odds_by_volume([*both, blind]) == pytest.approx(odds_by_volume(both))
+    assert odds_by_volume([*both, blind], in_space=False) == pytest.approx(
+        odds_by_volume(both, in_space=False) - 6 * log(4)
+    )
+
+
+def test_a_point_in_space_is_off_as_far_as_its_place_is_from_the_feature() -> None:
+    both = two_cameras_at_right_angles()
+    offsets = np.zeros((6, 2))
+    offsets[0, 0] = 0.8  # one camera alone knows this direction: two standard deviations
+    off = odds_by_volume([replace(both[0], offsets=offsets), both[1]])
+    assert odds_by_volume(both) - off == pytest.approx(2.0, rel=1e-3)
 
 
 def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:

@@ -291,7 +291,7 @@ def test_several_objects_are_no_trajectory(
     path = tmp_path / "truth.jsonl"
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     message = refused(capfd, path, "--format", "tum", "--unit", "m")
-    assert "holds a, b, and format 'tum' holds one object; choose with --object" in message
+    assert "holds a, b, and format 'tum' holds one object; choose with --object, or" in message
     assert convert(path, "--format", "tum", "--unit", "m", "--object", "b") == 0
     assert len(capfd.readouterr().out.splitlines()) == 2
     assert convert(path, "--format", "bop", "--unit", "m") == 0

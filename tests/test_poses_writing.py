@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mixpose import rigid
 from mixpose.errors import RecordingError, SessionError
 from mixpose.poses.formats import FORMATS
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import JsonlWriter, read_poses, resume_point
+from mixpose.poses.jsonl import JsonlWriter, ResumePoint, read_poses, resume_point
 from mixpose.records import Estimate, Hypothesis, SensorReport
 
 HALF_TURN = rigid.from_rotation_vector([0.0, 0.0, np.pi], [0.0, 0.0, 0.0])
@@ -197,8 +198,13 @@ def interrupted(path: Path, tail: str) -> None:
 def test_a_run_goes_on_after_its_last_whole_frame(tmp_path: Path) -> None:
     path = tmp_path / "poses.jsonl"
     interrupted(path, written("jsonl", AMBIGUOUS).splitlines()[1][:50])
-    assert resume_point(path, HEADER) == 13
-    with path.open("a") as stream:
+    found = resume_point(path, HEADER)
+    whole = len(written("jsonl", GOOD, LOST))
+    checksum = zlib.crc32(path.read_bytes()[:whole])
+    assert found == ResumePoint(frame=13, lines=1, size=whole, checksum=checksum)
+    with path.open("r+") as stream:
+        stream.truncate(whole)
+        stream.seek(whole)
         JsonlWriter(stream, HEADER, resume=True).write(AMBIGUOUS)
     assert path.read_text() == written("jsonl", GOOD, LOST, AMBIGUOUS)
 
@@ -217,7 +223,7 @@ def test_a_run_never_goes_on_in_a_file_of_another_run(tmp_path: Path) -> None:
     interrupted(path, "")
     for other in (replace(HEADER, seed=8), replace(HEADER, session_sha256="cd"), HEADER):
         if other is HEADER:
-            assert resume_point(path, other) == 13
+            assert resume_point(path, other) is not None
             continue
         with pytest.raises(SessionError, match="--resume"):
             resume_point(path, other)

@@ -135,5 +135,5 @@ def test_frame_numbers_longer_than_an_integer_of_the_machine_are_drawn(tmp_path:
 def test_poses_of_two_objects_are_refused_in_one_line(tmp_path: Path) -> None:
     estimates = [estimate(0, np.eye(4), object=name) for name in ("a", "b")]
     poses = read_poses(write(tmp_path / "p.jsonl", estimates, None))
-    with pytest.raises(RecordingError, match="'a', 'b'; a report is about one object"):
+    with pytest.raises(RecordingError, match="'a', 'b'; a series is of one body"):
         series_of(poses)

@@ -300,7 +300,7 @@ def test_a_wrong_calibration_file(tmp_path: Path, text: str, model: str, words: 
 @pytest.mark.parametrize(
     ("text", "keys", "word"),
     [
-        (ROS, 'camera = "cam0"', 'camera = "cam0" is for a Kalibr file, this is a ROS file'),
+        (ROS, 'camera = "cam0"', '"cam0" is for a file of several cameras, this is a ROS file'),
         (ROS, 'camera_matrix = "K"', "is for an OpenCV file, this is a ROS file"),
         (KALIBR, 'distortion = "D"', "is for an OpenCV file, this is a Kalibr file"),
         (KALIBR, 'camera = "cam7"', 'no camera "cam7"; cameras in the file: cam0, cam1'),

@@ -62,6 +62,31 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"sigma": "segments = [[[1, 2, 3], [1, 2, 3]]]"},
         ["object.segments[0]: found a segment without length"],
     ),
+    # time
+    ({"left": LINES["left"] + '\ndelay = "late"'}, ["delay", 'found "late"', '"estimate"']),
+    ({"left": LINES["left"] + "\ndelay = 6"}, ["delay: found 6", "from -1 to 1"]),
+    ({"left": LINES["left"] + "\nreadout = -0.1"}, ["readout: found -0.1", "from 0 to 1"]),
+    ({"left": LINES["left"] + "\nexposure = 2"}, ["exposure: found 2", "from 0 to 1"]),
+    # markers with a size
+    ({"points": LINES["points"] + '\nshape = "ball"'}, ['object.shape: found "ball"', '"sphere"']),
+    (
+        {"points": LINES["points"] + '\nshape = "sphere"'},
+        ["object.radius: missing", "greater than 0"],
+    ),
+    ({"points": LINES["points"] + "\nradius = 5"}, ["object.radius: stands beside shape"]),
+    (
+        {"points": LINES["points"] + '\nshape = "sphere"\nradius = [5, 5]'},
+        ["object.radius: found 2 radii for 4 points"],
+    ),
+    (
+        {"points": LINES["points"] + '\nshape = "sphere"\nradius = [5, 5, 0, 5]'},
+        ["object.radius: found 0; allowed"],
+    ),
+    (
+        {"points": LINES["points"] + '\nshape = "sphere"\nradius = "big"'},
+        ["object.radius", 'found "big"'],
+    ),
+    ({"normals": 'shape = "disk"\nradius = 3'}, ["object.normals: missing", "normal of each disk"]),
     ({"normals": "normals = [[0, 0, 1]]"}, ["object.normals: found 1 normals for 4 features"]),
     (
         {"normals": "normals = [[0, 0, 1], [0, 0, 1], [0, 0, 0], [0, 0, 1]]"},

@@ -223,6 +223,18 @@ def test_segments_alone_make_an_object(tmp_path: Path) -> None:
     np.testing.assert_array_equal(features[0].covariance, 0.25 * np.eye(3))
 
 
+def test_markers_with_a_size_have_a_radius_each_and_segments_none(tmp_path: Path) -> None:
+    text = """
+    points = [[0, 0, 0], [9, 0, 0], [0, 9, 0]]
+    segments = [[[0, 0, 0], [5, 0, 0]]]
+    shape = "sphere"
+    radius = RADIUS"""
+    for radius, expected in (("7", [7, 7, 7, 0]), ("[1, 2, 3.5]", [1, 2, 3.5, 0])):
+        body = read_object(tmp_path, text.replace("RADIUS", radius)).body
+        assert body.shape == "sphere"
+        np.testing.assert_array_equal(body.radii, expected)
+
+
 def test_points_come_before_segments_and_normals_have_length_one(tmp_path: Path) -> None:
     lines = """points = [[5, 0, 0], [6, 0, 0]]
     segments = [[[0, 0, 0], [0, 0, 2]]]

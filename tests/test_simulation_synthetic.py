@@ -18,7 +18,7 @@ from mixpose.session import load_session
 from mixpose.simulation import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
-NAMES = ["one_camera_video", "parallel_beams", "range_profiles", "two_cameras"]
+NAMES = ["camera_and_ranges", "one_camera_video", "parallel_beams", "range_profiles", "two_cameras"]
 
 
 def _tool() -> ModuleType:

@@ -14,7 +14,14 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions, Fit
-from mixpose.judgement import AcceptanceRules, Association, Judged, Noise, NoiseModel
+from mixpose.judgement import (
+    AcceptanceRules,
+    Association,
+    DetectionModel,
+    Judged,
+    Noise,
+    NoiseModel,
+)
 from mixpose.objective import View
 from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg, twist_between
 from mixpose.search import SearchBudget, SearchReport, SearchState
@@ -225,9 +232,20 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
     views = bumped(pinhole_cameras)
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     fit = Fit(TRUTH, 0.0, True, 0)
+
+    def lost(in_space: bool) -> float:
+        detection = DetectionModel(in_space=in_space)
+        judgement = replace(tracker.rules.judgement, detection=detection)
+        ruled = replace(tracker, rules=replace(tracker.rules, judgement=judgement))
+        data, two = data_of(ruled, views), data_of(ruled, views[:2])
+        left_out = likelihood_of(data).judge(fit, Start(TRUTH, left_out={"2": "bumped"}))
+        return likelihood_of(two).judge(fit, Start(TRUTH)).log_evidence - left_out.log_evidence
+
+    assert lost(in_space=False) == pytest.approx(8 * np.log(4))
+    # a third camera misses points in space, which two cameras see, whatever they are
+    assert lost(in_space=True) == pytest.approx(0.0)
     data, two = data_of(tracker, views), data_of(tracker, views[:2])
     left_out = likelihood_of(data).judge(fit, Start(TRUTH, left_out={"2": "bumped"}))
     alone = likelihood_of(two).judge(fit, Start(TRUTH))
-    assert left_out.log_evidence == pytest.approx(alone.log_evidence + 8 * np.log(0.25))
     assert left_out.sensors["2"].used is False
     assert left_out.measurements == pytest.approx(alone.measurements)

@@ -194,6 +194,69 @@ bin_size = 1.0
 """
 
 
+CAMERA_AND_RANGES = """\
+# A camera and two range sensors together.  The camera tells directions well and distances badly,
+# the range sensors the other way round, so that each has what the other lacks.
+unit = "mm"
+
+[object]
+name = "frame"
+points = [
+    [0.0, 0.0, 0.0],
+    [95.0, 12.0, -8.0],
+    [-62.0, 70.0, 14.0],
+    [-38.0, -84.0, 22.0],
+    [41.0, 48.0, 76.0],
+    [58.0, -57.0, -45.0],
+]
+
+# Near the first pose: about 2.5 degrees and 4 mm away.
+[start]
+rotation_vector = [0.5, -0.4, 0.8]
+translation = [20.0, -10.0, 1500.0]
+
+[[sensor]]
+name = "camera"
+model = "pinhole"
+source = "camera.avi"
+fps = 25
+resolution = [480, 400]
+camera_matrix = [[905.3, 0.0, 238.2], [0.0, 904.8, 203.9], [0.0, 0.0, 1.0]]
+distortion = [-0.1, 0.03, 0.0, 0.0]
+
+[sensor.extract]
+method = "blobs"
+sigma = 1.5
+
+# Beside the camera: along its line of sight, where it is weakest.
+[[sensor]]
+name = "near"
+model = "lateration"
+source = "near.npy"
+fps = 25
+position = [150.0, 0.0, 0.0]
+range_min = 1300.0
+bin_size = 1.0
+
+[sensor.extract]
+spot_sigma = 4.0
+sigma = 1.5
+
+[[sensor]]
+name = "aside"
+model = "lateration"
+source = "aside.npy"
+fps = 25
+position = [-900.0, 300.0, 700.0]
+range_min = 950.0
+bin_size = 1.0
+
+[sensor.extract]
+spot_sigma = 4.0
+sigma = 1.5
+"""
+
+
 @dataclass(frozen=True)
 class Recording:
     """A session and how it is simulated."""
@@ -203,6 +266,20 @@ class Recording:
 
 
 RECORDINGS = {
+    "camera_and_ranges": Recording(
+        CAMERA_AND_RANGES,
+        SimulationOptions(
+            frames=30,
+            seed=15,
+            background=-1.0,
+            noise=1.0,
+            brightness_spread=0.05,
+            range_snr=100.0,
+            amplitude_translation=25.0,
+            amplitude_rotation_deg=20.0,
+            period_s=2.5,
+        ),
+    ),
     "two_cameras": Recording(
         TWO_CAMERAS,
         SimulationOptions(

@@ -134,6 +134,11 @@ class Hypothesis:
     weight: float
 
 
+def label_of(name: str, instance: int | None) -> str:
+    """What a body is called in one word: its name, of identical ones with a number."""
+    return name if instance is None else f"{name}-{instance}"
+
+
 Status: TypeAlias = Literal["ok", "ambiguous", "lost"]
 
 
@@ -149,6 +154,8 @@ class Estimate:
         In the order and axes of `mixpose.rigid`, squared lengths and radians.
     score : float
         0 to 1: how well the predicted densities meet the observed ones, over all sensors.
+    instance : int or None
+        Which of identical bodies, from 0; None where the session has one of this name.
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
@@ -164,4 +171,10 @@ class Estimate:
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...] = ()
     latency_ms: float = field(default=0.0, compare=False)
+    instance: int | None = None
     proposer: str = field(default="", compare=False)
+
+    @property
+    def label(self) -> str:
+        """The body in one word."""
+        return label_of(self.object, self.instance)

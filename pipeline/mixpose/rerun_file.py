@@ -10,6 +10,8 @@ Entities, on the timelines ``frame`` and, where the recording has times, ``time`
   covariance``, the ellipsoid that holds the position with 95 %.
 * ``plots/score`` and ``status``.
 
+Of several bodies each has its name behind ``predicted``, ``plots/score`` and ``status``.
+
 Lengths are in the session's unit.
 """
 
@@ -27,6 +29,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from mixpose import rigid
+from mixpose.body import Body
 from mixpose.density import Observation, Window, render
 from mixpose.frames import Source, pair
 from mixpose.poses.poseline import PoseLine
@@ -37,6 +40,10 @@ from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 
 _COLOURS = {"ok": (80, 200, 120), "ambiguous": (255, 170, 40)}
+_BODY_COLOURS = (
+    *((80, 200, 120), (60, 150, 255), (255, 90, 200), (255, 220, 60)),
+    *((90, 230, 230), (255, 120, 150), (140, 200, 120), (190, 120, 255)),
+)
 _FOUND = (90, 170, 255)
 _CHI2_95 = 7.815  # of three degrees of freedom
 _DENSITY_WIDTH = 640
@@ -89,10 +96,11 @@ class _Scene:
         """Log what does not move: sensors, and the object's features in its own frame."""
         for setup in self.session.sensors:
             self._sensor(setup, lines)
-        body = self.session.body
         # no radii: what stands still overrules what moves, and a lost body's points are hidden
-        points = rr.Points3D(body.means)
-        self._log(["world", body.name, "points"], points, static=True)
+        for one in self.session.objects:
+            for label in one.labels:
+                points = rr.Points3D(one.body.means)
+                self._log(["world", label, "points"], points, static=True)
 
     def play(self, sources: Mapping[str, Source], lines: Sequence[PoseLine]) -> None:
         """Log frame by frame; poses of frames that no source has come last."""
@@ -164,31 +172,45 @@ class _Scene:
             self._log(["density", setup.name], density)
 
     def _pose(self, line: PoseLine) -> None:
-        self._log(["plots", "score"], rr.Scalars(line.score if line.score is not None else 1.0))
-        self._log(["status"], rr.TextLog(f"frame {line.frame}: {line.status}"))
-        places = (["world", line.object], ["world", f"{line.object} covariance"])
+        # of several bodies each has entities of its own
+        own = [line.label] if len(self.session.labels) > 1 else []
+        said = f"{line.label} " if own else ""
+        score = line.score if line.score is not None else 1.0
+        self._log(["plots", "score", *own], rr.Scalars(score))
+        self._log(["status", *own], rr.TextLog(f"frame {line.frame}: {said}{line.status}"))
+        places = (["world", line.label], ["world", f"{line.label} covariance"])
         T = line.T_world_object
-        predicted = [["world", setup.name, "image", "predicted"] for setup in self.session.sensors]
+        predicted = [
+            ["world", setup.name, "image", "predicted", *own] for setup in self.session.sensors
+        ]
         if T is None:
             for place in (*places, *predicted):
                 self._log(place, rr.Clear(recursive=False))
             # a transform that is cleared leaves the points where the world's origin is
-            self._log(["world", line.object, "points"], rr.Points3D.from_fields(radii=[0.0]))
+            self._log(["world", line.label, "points"], rr.Points3D.from_fields(radii=[0.0]))
             return
+        body = self._body_of(line)
         colour = _COLOURS[line.status]
+        labels = self.session.labels
+        if own and line.status == "ok" and line.label in labels:
+            colour = _BODY_COLOURS[labels.index(line.label) % len(_BODY_COLOURS)]
         self._log(places[0], _transform(T))
-        shown = rr.Points3D.from_fields(radii=[0.03 * self.session.body.radius], colors=[colour])
+        shown = rr.Points3D.from_fields(radii=[0.03 * body.radius], colors=[colour])
         self._log([*places[0], "points"], shown)
         if line.covariance is None:
             self._log(places[1], rr.Clear(recursive=False))
         else:
             self._log(places[1], _ellipsoid(T[:3, 3], line.covariance, colour))
-        world = rigid.transform(T, self.session.body.means)
+        world = rigid.transform(T, body.means)
         for setup, place in zip(self.session.sensors, predicted, strict=True):
             if setup.sensor.dimension == 2:
                 points, seen = setup.sensor.project(world)
                 radius = rr.Radius.ui_points(2)
                 self._log(place, rr.Points2D(points[seen] + _HALF, radii=radius, colors=colour))
+
+    def _body_of(self, line: PoseLine) -> Body:
+        bodies = {one.body.name: one.body for one in self.session.objects}
+        return bodies.get(line.object, self.session.body)
 
 
 def _transform(T_parent_child: Floats) -> Any:

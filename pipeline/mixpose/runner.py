@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
@@ -26,6 +26,7 @@ from mixpose.records import (
     RawFrame,
     SensorReport,
 )
+from mixpose.scene import Member, Outcome, Scene
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
@@ -38,15 +39,36 @@ from mixpose.tracking import (
 )
 
 if TYPE_CHECKING:
+    from mixpose.body import Body
     from mixpose.sensors import Sensor
-    from mixpose.session import SensorSetup, Session
+    from mixpose.session import SensorSetup, Session, Start
 
 Floats: TypeAlias = NDArray[np.float64]
 Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
+Starts: TypeAlias = Mapping[str, Floats]
 
 
 LEAST_DELAY_S = 1e-6
 """Sensors that differ by less count as in step."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """All that a run knows between two frames.
+
+    Attributes
+    ----------
+    tracks : tuple of Track
+        One per body.
+    tracked : bool
+        Whether the frame before convinced.
+    """
+
+    tracks: tuple[Track, ...]
+    tracked: bool = False
+
+
+Remember: TypeAlias = Callable[[Memory], None]
 
 
 def run(
@@ -55,10 +77,12 @@ def run(
     sources: Mapping[str, str] | None = None,
     opened: Mapping[str, Source] | None = None,
     selection: Selection = ALL_FRAMES,
-    T_start: Floats | None = None,
+    T_start: Floats | Starts | None = None,
     watch: Watch | None = None,
+    memory: Memory | None = None,
+    remember: Remember | None = None,
 ) -> Generator[Estimate, None, None]:
-    """Estimate the pose of every frame of a recording.
+    """Estimate the poses of every frame of a recording, one per body.
 
     The recording is opened at once, its frames are read as estimates are asked for.
 
@@ -71,17 +95,21 @@ def run(
     opened : mapping of str to Source or None
         Recordings that `open_sources` opened already, in place of `sources`.
     selection : Selection
-    T_start : (4, 4) array or None
-        Pose to begin at in place of the session's ``[start]``.
+    T_start : (4, 4) array, mapping of str to (4, 4) array, or None
+        Pose to begin at in place of the session's ``[start]``; of several bodies by their labels.
     watch : callable or None
         Called as ``watch(frame_set, views, estimate)`` before each estimate is yielded, with the
-        raw frames and the features found in them, while tracking around the body only; its time
+        raw frames and the features found in them, while tracking around the bodies only; its time
         is not in the latency.
+    memory : Memory or None
+        What a run knew after the frame before the first of `selection`; None: nothing.
+    remember : callable or None
+        Called with what is known after a frame, before its first estimate is yielded.
 
     Returns
     -------
     generator of Estimate
-        Each as soon as its frame is done, by ascending frame number.
+        As soon as a frame is done, by ascending frame number; its bodies in the session's order.
 
     Raises
     ------
@@ -97,24 +125,43 @@ def run(
         live = all(source.kind == "live" for source in opened.values())
         options = replace(session.estimator, search="live" if live else "thorough")
         session = replace(session, estimator=options)
-    tracker, track = begin(session, T_start)
+    if T_start is None or isinstance(T_start, Mapping):
+        starts = T_start or {}
+    else:
+        starts = {session.labels[0]: T_start}
+    scene = scene_of(session, starts)
     frames = pair(opened, selection.start, selection.stop, selection.step)
-    return _estimates(session, tracker, track, frames, watch)
+    begun = Memory(scene.begin()) if memory is None else memory
+    return _estimates(session, scene, begun, frames, watch, remember)
+
+
+def scene_of(session: Session, starts: Starts | None = None) -> Scene:
+    """The bodies of a session, with poses to begin at in place of the session's, by label."""
+    members = []
+    for one in session.objects:
+        for instance, label in zip(one.instances, one.labels, strict=True):
+            start = one.start if not instance else None
+            tracker = _tracker(session, one.body, start, (starts or {}).get(label))
+            members.append(Member(tracker, instance))
+    return Scene(tuple(members))
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
-    """The tracker of a session and its track before the first frame."""
-    start = session.start
+    """The tracker of a session's first body, and its track before the first frame."""
+    tracker = _tracker(session, session.body, session.start, T_start)
+    return tracker, tracker.begin()
+
+
+def _tracker(session: Session, body: Body, start: Start | None, T_start: Floats | None) -> Tracker:
     if T_start is None and start is not None:
         T_start = start.T_world_object
-    tracker = Tracker.create(
-        session.body,
+    return Tracker.create(
+        body,
         session.estimator,
         T_start,
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
     )
-    return tracker, tracker.begin()
 
 
 def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Source]:
@@ -159,24 +206,32 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
 
 def _estimates(
     session: Session,
-    tracker: Tracker,
-    track: Track,
+    scene: Scene,
+    memory: Memory,
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
+    remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
-    expectation = Expectation(tracker.body, _windowed(session), tracker.free)
-    tracked = False
+    cameras = _windowed(session)
+    expectations = [
+        Expectation(one.tracker.body, cameras, one.tracker.free) for one in scene.members
+    ]
+    tracks, tracked = memory.tracks, memory.tracked
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
             with one_blas_thread():
-                step = _advance(session, tracker, expectation, track, frame_set, tracked)
-            track, tracked = step.track, step.convinces
-            estimate = _with_silent_sensors(step.estimate, session.sensors)
-            estimate = replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
-            if watch is not None:
-                watch(frame_set, step.views, estimate)
-            yield estimate
+                step = _advance(session, scene, expectations, tracks, frame_set, tracked)
+            tracks, tracked = tuple(one.track for one in step.outcomes), step.convinces
+            latency_ms = 1e3 * (time.perf_counter() - began)
+            for k, outcome in enumerate(step.outcomes):
+                estimate = _with_silent_sensors(outcome.estimate, session.sensors)
+                estimate = replace(estimate, latency_ms=latency_ms)
+                if watch is not None:
+                    watch(frame_set, step.views, estimate)
+                if remember is not None and k == 0:
+                    remember(Memory(tracks, tracked))
+                yield estimate
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
@@ -195,47 +250,69 @@ def _windowed(session: Session) -> dict[str, Sensor]:
 
 
 class _Step(NamedTuple):
-    """A frame's estimate, what it was made from, and whether the next need not be seen whole."""
+    """A frame's estimates, what they are made from, and whether windows will do for the next."""
 
-    track: Track
-    estimate: Estimate
+    outcomes: list[Outcome]
     views: list[View]
     convinces: bool
 
 
 def _advance(
     session: Session,
-    tracker: Tracker,
-    expectation: Expectation,
-    track: Track,
+    scene: Scene,
+    expectations: Sequence[Expectation],
+    tracks: Sequence[Track],
     frame_set: FrameSet,
     tracked: bool,
 ) -> _Step:
-    """Estimate a frame: around the prediction if that convinces, else from all that is there.
+    """Estimate a frame: around the predictions if that convinces, else from all that is there.
 
     `tracked` tells whether the frame before convinced.
     """
 
     def estimated(views: list[View]) -> _Step:
-        after, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
-        share = tracker.rules.acceptance.convincing
-        met = estimate.status == "ok" and is_convincing(after.tallies, expectation.names, share)
-        return _Step(after, estimate, views, met)
+        outcomes = scene.advance(tracks, frame_set.number, frame_set.time_s, views)
+        met = all(
+            one.estimate.status == "ok"
+            and is_convincing(
+                one.track.tallies, expected.names, member.tracker.rules.acceptance.convincing
+            )
+            for one, expected, member in zip(outcomes, expectations, scene.members, strict=True)
+        )
+        return _Step(outcomes, views, met)
 
     if tracked:
-        predictions = tracker.predictions(track, frame_set.number, frame_set.time_s)
-        images = {
-            name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)
-        }
-        windows = expectation.windows(predictions)
-        windows = {name: window for name, window in windows.items() if name in images}
+        windows = _windows(scene, expectations, tracks, frame_set)
         if windows:
             views = observe(session, frame_set, windows)
-            if not have_fewer(views, track.tallies):
+            if not any(have_fewer(views, track.tallies) for track in tracks):
                 step = estimated(views)
-                if step.convinces and are_as_good(step.track.tallies, track.tallies):
+                after = zip(step.outcomes, tracks, strict=True)
+                if step.convinces and all(
+                    are_as_good(one.track.tallies, before.tallies) for one, before in after
+                ):
                     return step
     return estimated(observe(session, frame_set))
+
+
+def _windows(
+    scene: Scene,
+    expectations: Sequence[Expectation],
+    tracks: Sequence[Track],
+    frame_set: FrameSet,
+) -> dict[str, Window]:
+    """In which part of each image the bodies are expected, one window around all of them."""
+    images = {name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)}
+    windows: dict[str, Window] = {}
+    if not images:
+        return windows
+    for member, expected, track in zip(scene.members, expectations, tracks, strict=True):
+        predictions = member.tracker.predictions(track, frame_set.number, frame_set.time_s)
+        for name, (u0, v0, u1, v1) in expected.windows(predictions).items():
+            if name in images:
+                a, b, c, d = windows.get(name, (u0, v0, u1, v1))
+                windows[name] = (min(a, u0), min(b, v0), max(c, u1), max(d, v1))
+    return windows
 
 
 def observe(

@@ -23,7 +23,7 @@ def resident_mb() -> float:
 def main() -> None:
     session = load_session(sys.argv[1])
     counts = {int(text) for text in sys.argv[2:]}
-    with Output(Path(os.devnull), "jsonl", header_of(session), append=False) as output:
+    with Output(Path(os.devnull), "jsonl", header_of(session)) as output:
         for count, estimate in enumerate(run(session), 1):
             if estimate.status != "ok":
                 raise RuntimeError(f"frame {estimate.frame} is {estimate.status}: not tracking")

@@ -14,7 +14,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, Pattern, PointPattern
-from mixpose.rigid import from_parts, transform, twist_between
+from mixpose.rigid import from_parts, perturb, transform, twist_between
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -105,6 +105,12 @@ def two_pinholes(rng: np.random.Generator) -> list[Sensor]:
     return [pinhole(rng, eye, (800.0, 1000.0)) for eye in eyes]
 
 
+def three_pinholes(rng: np.random.Generator) -> list[Sensor]:
+    """Those two and one above between them."""
+    eye = DISTANCE * np.array([0.55, -0.55, 0.63])
+    return [*two_pinholes(rng), pinhole(rng, eye, (800.0, 1000.0))]
+
+
 def one_pinhole(rng: np.random.Generator) -> list[Sensor]:
     return [pinhole(rng, np.array([0.0, -DISTANCE, 0.0]), (800.0, 800.0))]
 
@@ -127,6 +133,7 @@ def three_ranges(_: np.random.Generator) -> list[Sensor]:
 
 SENSORS: dict[str, Callable[[np.random.Generator], list[Sensor]]] = {
     "2 pinhole": two_pinholes,
+    "3 pinhole": three_pinholes,
     "1 pinhole": one_pinhole,
     "2 parallel": two_parallel,
     "3 ranges": three_ranges,
@@ -230,6 +237,35 @@ def absent(row: Row, seed: int, *, sigma: float = SIGMA_PX) -> Trial:
             pattern = PointPattern(points, rng.uniform(0.5, 2.0, count))
         old = view.observation
         views.append(replace(view, observation=replace(old, pattern=pattern)))
+    return replace(present, views=views)
+
+
+def sequence(row: Row, seed: int, frames: int) -> list[Trial]:
+    """A body that moves on evenly; what is hidden and what is false differs from frame to frame."""
+    first = trial(row, seed)
+    rng = np.random.default_rng([seed, row.features, row.false, 2])
+    step = np.concatenate([rng.uniform(-5.0, 5.0, 3), np.radians(rng.uniform(-1.0, 1.0, 3))])
+    T, points, made = first.T_world_object, first.body.means, []
+    for _ in range(frames):
+        views = [
+            _detections(v.name, v.sensor, T, points, row, rng, SIGMA_PX, []) for v in first.views
+        ]
+        made.append(replace(first, views=views, T_world_object=T, labels=[]))
+        T = perturb(T, step)
+    return made
+
+
+def crowded_absent(features: int, false: int, seed: int) -> Trial:
+    """Two cameras that see false detections alone, half of them where the body would be."""
+    row = Row("2 pinhole", features, 0, 0, 1.0)
+    present = trial(row, seed)
+    rng = np.random.default_rng([seed, features, false, 3])
+    views = []
+    for view in present.views:
+        y, _ = view.sensor.project(transform(present.T_world_object, present.body.means))
+        points = false_detections(view.sensor, (y.min(axis=0), y.max(axis=0)), false, rng)
+        seen = Observation(PointPattern(points, np.ones(false)), SIGMA_PX)
+        views.append(replace(view, observation=seen))
     return replace(present, views=views)
 
 

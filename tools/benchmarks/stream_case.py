@@ -75,7 +75,7 @@ def whole_run(session: Session) -> list[Estimate]:
     with (
         prompt_switching(),
         closing(run_session(session)) as frames,
-        Output(Path(os.devnull), "jsonl", header_of(session), append=False) as output,
+        Output(Path(os.devnull), "jsonl", header_of(session)) as output,
     ):
         for estimate in frames:
             output.write(estimate)
@@ -122,7 +122,7 @@ def stage_times(session: Session) -> dict[str, float]:
     estimates = estimate()
 
     def write() -> None:
-        with Output(Path(os.devnull), "jsonl", header_of(session), append=False) as output:
+        with Output(Path(os.devnull), "jsonl", header_of(session)) as output:
             for each in estimates:
                 output.write(each)
 

@@ -22,8 +22,8 @@ _SIMULATION = (
     Mutant(
         "simulation-deformed-in-world-axes",
         "simulation/sighting.py",
-        "T[:3, 3] += T[:3, :3] @ offsets[i]",
-        "T[:3, 3] += offsets[i]",
+        "M[:3, 3] += M[:3, :3] @ offset",
+        "M[:3, 3] += offset",
         "features are displaced by another spread than the body's once it turns",
     ),
     Mutant(
@@ -71,8 +71,8 @@ _SIMULATION = (
     Mutant(
         "simulation-dark-is-bright",
         "simulation/render.py",
-        'return grey if form.polarity == "bright" else',
-        'return grey if form.polarity != "" else',
+        'if form.polarity == "dark":',
+        'if form.polarity == "":',
         "recordings of dark features show bright ones",
     ),
     Mutant(

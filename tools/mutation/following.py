@@ -292,8 +292,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-left-out-for-free",
         "tracking/likelihood.py",
-        "log_evidence=judged.log_evidence + missed,",
-        "log_evidence=judged.log_evidence,",
+        "unmet=others,",
+        "unmet=(),",
         "leaving a sensor out makes a pose better",
         (_STARTS,),
     ),
@@ -454,6 +454,25 @@ _TRACKER = (
     ),
 )
 
+_REFLECTION = (
+    Mutant(
+        "tracking-mirror-images-pass",
+        "tracking/reflection.py",
+        "return rival.log_evidence > judged.log_evidence + ",
+        "return rival.log_evidence > 1e9 + ",
+        "the body in a window is taken for the body",
+        ("test_tracking_reflection.py",),
+    ),
+    Mutant(
+        "tracking-mirror-images-are-suspected-everywhere",
+        "tracking/reflection.py",
+        "return rival.log_evidence > judged.log_evidence + ",
+        "return rival.log_evidence > -1e9 + ",
+        "a flat body with a hidden marker is never sure",
+        ("test_tracking_reflection.py",),
+    ),
+)
+
 _SEARCH_EVIDENCE = (
     Mutant(
         "search-clutter-does-not-count",
@@ -562,6 +581,7 @@ MUTANTS = (
     *_RANGE_POSTERIOR,
     *_PROPOSALS,
     *_TRACKER,
+    *_REFLECTION,
     *_SEARCH_EVIDENCE,
     *_SEARCH,
 )

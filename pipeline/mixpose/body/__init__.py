@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mixpose.body.features import Feature, PointFeature, SegmentFeature, Spread
-from mixpose.body.model import Body, Gravity, Nodes
+from mixpose.body.model import Body, Gravity, Nodes, Shape
 from mixpose.body.sampling import Sampler, uniforms
 from mixpose.body.symmetry import symmetries
 
@@ -15,6 +15,7 @@ __all__ = [
     "PointFeature",
     "Sampler",
     "SegmentFeature",
+    "Shape",
     "Spread",
     "symmetries",
     "uniforms",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from mixpose.body.sampling import Sampler, uniforms
 from mixpose.body.symmetry import default_tolerance, grid_steps, keeps_normals, symmetries
 
 Floats: TypeAlias = NDArray[np.float64]
+
+Shape: TypeAlias = Literal["point", "sphere", "disk"]
 
 RECURRENT = 0.6
 """Share of the features that a shift must map onto others for the body to be followed there by
@@ -68,12 +70,19 @@ class Body:
         Outward normals: a feature is seen only by sensors it faces.
     gravity : Gravity or None
         Spread that stays with the world while the body turns.
+    shape : {"point", "sphere", "disk"}
+        Of the markers, whose images have their centres elsewhere than the marker's own.  Disks
+        lie across their normals.
+    radii : (N,) float64 or None
+        Of spheres or disks, length units; 0 for a point.
     """
 
     name: str
     features: tuple[Feature, ...]
     normals: Floats | None = None
     gravity: Gravity | None = None
+    shape: Shape = "point"
+    radii: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.features)
@@ -103,6 +112,11 @@ class Body:
     def node_normals(self) -> Floats | None:
         """Normals of the nodes (Q, 3), None where the body has none."""
         return None if self.normals is None else self.normals[self.nodes.feature]
+
+    @cached_property
+    def node_radii(self) -> Floats | None:
+        """Radii of the nodes (Q,), None of a body of points."""
+        return None if self.radii is None else self.radii[self.nodes.feature]
 
     @cached_property
     def is_exact(self) -> bool:

@@ -97,6 +97,8 @@ def look_alikes(
         misfit = _misfit(poses, views, body, chosen)
         order = np.argsort(misfit, kind="stable")[:_KEPT]
         poses = poses[order[misfit[order] < _PROMISING**2]]
+        if not len(poses):
+            return []
     found: list[LookAlike] = []
     known = T_world_object @ body.symmetries
     for pose in poses:

@@ -19,6 +19,7 @@ Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
 
 _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
+_LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
 _SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
 
 
@@ -77,7 +78,22 @@ def _twins(session: Session) -> list[str]:
                     f"sensors {a.name!r} and {b.name!r} stand at one place and look the same way: "
                     "does one of them lack its T_sensor_world?"
                 )
+            else:
+                warnings += _too_near(a, b, session)
     return warnings
+
+
+def _too_near(a: SensorSetup, b: SensorSetup, session: Session) -> list[str]:
+    """Cameras nearer to each other than their lenses allow: lengths in another unit."""
+    if not all(isinstance(each.sensor, PinholeCamera | FisheyeCamera) for each in (a, b)):
+        return []
+    apart = float(np.linalg.norm(_centre(a.sensor) - _centre(b.sensor)))
+    if apart * session.metres_per_unit > _LENSES_APART_M:
+        return []
+    return [
+        f"sensors {a.name!r} and {b.name!r} stand {apart:.2g} {session.unit} apart, less than two "
+        f"lenses need: are translations in {session.unit}? Kalibr, ROS and caliscope write metres"
+    ]
 
 
 def _no_common_view(session: Session) -> list[str]:
@@ -205,7 +221,8 @@ def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:
     return np.asarray(sensor.project(transform(T_world_object, session.body.means))[1])
 
 
-def _centre(sensor: PinholeCamera | FisheyeCamera) -> Floats:
+def _centre(sensor: Sensor) -> Floats:
+    assert isinstance(sensor, PinholeCamera | FisheyeCamera)
     return np.asarray(inverse(sensor.T_sensor_world)[:3, 3])
 
 

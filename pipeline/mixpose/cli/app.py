@@ -30,6 +30,15 @@ class Format(StrEnum):
     ros = "ros"
 
 
+class LengthUnit(StrEnum):
+    """Units of length."""
+
+    m = "m"
+    cm = "cm"
+    mm = "mm"
+    um = "um"
+
+
 class ConvertFormat(StrEnum):
     """Formats that poses are converted to."""
 
@@ -149,6 +158,33 @@ def inspect(
     inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
 
 
+@app.command("import")
+def import_(
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
+            "and at most one body: .csv, .rom, .vsk or .obj.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The session file, which must be new.")
+    ],
+    unit: Annotated[
+        LengthUnit, typer.Option(help="Unit of lengths in the session.")
+    ] = LengthUnit.mm,
+    lengths: Annotated[
+        LengthUnit | None,
+        typer.Option(help="Unit of translations in files whose format does not fix it."),
+    ] = None,
+) -> None:
+    """Make a session of the calibration files of other programs."""
+    from mixpose.cli.importing import import_files  # noqa: PLC0415
+
+    import_files(files, output, unit=unit.value, lengths=None if lengths is None else lengths.value)
+
+
 @app.command()
 def simulate(
     session: SessionFile,
@@ -184,12 +220,46 @@ def simulate(
     deform: Annotated[
         bool, typer.Option("--deform", help="Displace features by the spread the object states.")
     ] = False,
+    readout: Annotated[
+        float | None,
+        typer.Option(help="Seconds from a camera's first row to its last; else the session's."),
+    ] = None,
+    exposure: Annotated[
+        float | None, typer.Option(help="Seconds for which a row is lit; else the session's.")
+    ] = None,
+    delay: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=SECONDS", help="A sensor that is late; else the session's."),
+    ] = None,
+    out_of_step: Annotated[
+        float, typer.Option(help="Seconds from the first sensor to the last, in their times.")
+    ] = 0.0,
+    lamps: Annotated[int, typer.Option(min=0, help="Lamps behind the body.")] = 0,
+    mirror: Annotated[
+        float, typer.Option(help="Brightness of mirror images in a table below, as a share.")
+    ] = 0.0,
+    others: Annotated[
+        int, typer.Option(min=0, help="Other bodies with as many markers, beside this one.")
+    ] = 0,
+    occluder: Annotated[int, typer.Option(min=0, help="Dark bars that swing before it.")] = 0,
+    jpeg: Annotated[
+        int | None, typer.Option(min=1, max=100, help="Quality of lossy compression.")
+    ] = None,
+    bayer: Annotated[
+        bool, typer.Option("--bayer", help="Images of a colour sensor, interpolated.")
+    ] = False,
+    turned_camera: Annotated[
+        float, typer.Option(help="Degrees by which the last camera was turned meanwhile.")
+    ] = 0.0,
+    away_from: Annotated[
+        int | None, typer.Option(min=0, help="Frames after which the body is gone.")
+    ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a recording in the folder.")
     ] = False,
 ) -> None:
     """Render a recording with truth.jsonl that `run` can play."""
-    from mixpose.cli.simulate import simulate_session  # noqa: PLC0415
+    from mixpose.cli.simulate import delays_of, simulate_session  # noqa: PLC0415
     from mixpose.simulation import SimulationOptions  # noqa: PLC0415
 
     options = SimulationOptions(
@@ -209,6 +279,18 @@ def simulate(
         range_noise=range_noise,
         range_snr=range_snr,
         deform=deform,
+        readout=readout,
+        exposure=exposure,
+        delay=delays_of(delay or []),
+        out_of_step=out_of_step,
+        lamps=lamps,
+        mirror=mirror,
+        others=others,
+        occluder=occluder,
+        jpeg=jpeg,
+        bayer=bayer,
+        turned_camera_deg=turned_camera,
+        away_from=away_from,
     )
     simulate_session(session, output, options, overwrite=overwrite)
 

@@ -3,23 +3,38 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from mixpose import __version__
 from mixpose.cli.notices import say, warn
-from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
-from mixpose.poses.estimates import estimate_of, first_answers, header_of, relative_to
-from mixpose.poses.header import UNITS_PER_METRE
+from mixpose.poses.estimates import (
+    estimate_of,
+    first_answers,
+    header_of,
+    objects_of,
+    relative_to,
+)
+from mixpose.poses.formats import ONE_TRAJECTORY
+from mixpose.poses.header import UNITS_PER_METRE, Header
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
+from mixpose.whole_files import appearing_whole
 
 _BY_SUFFIX = {
     ".jsonl": "jsonl",
@@ -29,7 +44,6 @@ _BY_SUFFIX = {
     ".yml": "ros",
     ".rrd": "rerun",
 }
-_ONE_TRAJECTORY = ("tum", "ros")
 
 
 @dataclass(frozen=True)
@@ -64,8 +78,11 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
     lines = _selected(poses, name, request)
     if request.only_ok and not lines:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
-    if request.output is not None and request.output.is_file() | (not request.output.exists()):
-        refuse_to_overwrite(request.output, [path])
+    labels = tuple(dict.fromkeys(line.label for line in lines))
+    outputs = [] if request.output is None else written_paths(request.output, name, labels)
+    for output in outputs:
+        if output.is_file() | (not output.exists()):
+            refuse_to_overwrite(output, [path])
     if name == "rerun":
         from mixpose.cli.rerun import write_rerun  # noqa: PLC0415
 
@@ -74,7 +91,7 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
         _write(poses, lines, name, request)
     if request.output is not None:
         count = f"{len(lines)} pose{'s' * (len(lines) != 1)}"
-        say(f"{count} -> {request.output}")
+        say(f"{count} -> {', '.join(map(str, outputs))}")
 
 
 def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: ConvertRequest) -> None:
@@ -86,9 +103,30 @@ def _write(poses: PoseFile, lines: Sequence[PoseLine], name: str, request: Conve
     if name == "ros" and request.relative_to is not None:
         options["frame_id"] = request.relative_to
     header = header_of(poses, _unit(poses, request), __version__)
-    with Output(request.output, name, header, options=options) as output:
+    header = replace(header, objects=objects_of(lines))
+    labels = tuple(dict.fromkeys(line.label for line in lines))
+    with ExitStack() as stack:
+        output = _output(stack, name, header, labels, options, request.output)
+        stack.enter_context(output)
         for line in lines:
             output.write(relative_to(T_sensor_world, estimate_of(line)))
+
+
+def _output(
+    stack: ExitStack,
+    name: str,
+    header: Header,
+    labels: Sequence[str],
+    options: Mapping[str, int | str],
+    path: Path | None,
+) -> Output | OutputPerBody:
+    """Where poses go; files are whole when they appear."""
+
+    def whole(own: Path | None) -> Output:
+        part = None if own is None else stack.enter_context(appearing_whole(own))
+        return Output(part, name, header, options=options, called=own)
+
+    return OutputPerBody(path, name, labels, whole) if is_apart(name, labels) else whole(path)
 
 
 def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
@@ -151,22 +189,25 @@ def _unit(poses: PoseFile, request: ConvertRequest) -> str:
 
 def _selected(poses: PoseFile, name: str, request: ConvertRequest) -> list[PoseLine]:
     """The lines to write, in the order of the file."""
-    objects = list(dict.fromkeys(line.object for line in poses.poses))
+    bodies = list(dict.fromkeys(line.label for line in poses.poses))
+    objects = {*bodies, *(line.object for line in poses.poses)}
     if request.object is not None and request.object not in objects:
-        raise SessionError(f"--object {request.object}: {poses.path} has {', '.join(objects)}")
+        raise SessionError(f"--object {request.object}: {poses.path} has {', '.join(bodies)}")
     lines = [
         line
         for line in poses.poses
-        if request.object in (None, line.object) and (line.status == "ok" or not request.only_ok)
+        if request.object in (None, line.object, line.label)
+        and (line.status == "ok" or not request.only_ok)
     ]
-    if name in _ONE_TRAJECTORY and request.object is None and len(objects) > 1:
+    chosen = {line.label for line in lines}
+    if name in ONE_TRAJECTORY and request.output is None and len(chosen) > 1:
         raise SessionError(
-            f"{poses.path}: holds {', '.join(objects)}, and format {name!r} holds one object; "
-            "choose with --object"
+            f"{poses.path}: holds {', '.join(bodies)}, and format {name!r} holds one object; "
+            "choose with --object, or name a file with -o: each gets one of its own"
         )
     if name == "jsonl":
         return lines
-    answers = Counter((line.frame, line.object) for line in lines)
+    answers = Counter((line.frame, line.label) for line in lines)
     several = sum(count > 1 for count in answers.values())
     if several:
         count = f"{several} frame{'s' * (several != 1)}"

@@ -58,8 +58,9 @@ class Summary:
             setup.name: setup.extract.sigma
             for setup in session.sensors
             # ranges err as the place has it, and features of a soft body are off theirs
-            if setup.sensor.unit == "px" and not session.body.spread
+            if setup.sensor.unit == "px" and not any(one.body.spread for one in session.objects)
         }
+        self.bodies = len(session.labels)
         self.statuses: Counter[Status] = Counter()
         self.posed: Counter[str] = Counter()
         self.idle: Counter[str] = Counter()
@@ -95,7 +96,9 @@ class Summary:
         count = sum(self.statuses.values())
         words: tuple[Status, ...] = ("ok", "ambiguous", "lost")
         parts = [f"{self.statuses[word]} {word}" for word in words if self.statuses[word]]
-        return f"{count} frame{'s' * (count != 1)}: {', '.join(parts)}"
+        count //= self.bodies
+        of = f" of {self.bodies} bodies" if self.bodies > 1 else ""
+        return f"{count} frame{'s' * (count != 1)}{of}: {', '.join(parts)}"
 
     def say(self, where: str) -> None:
         """Print the line, and warn of sensors that took no part or fit badly."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import TextIO, cast
 
+from mixpose.cli.lines import LineFile
 from mixpose.errors import SessionError
-from mixpose.poses.formats import FORMATS, PoseWriter
+from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY, PoseWriter
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import JsonlWriter
 from mixpose.records import Estimate
@@ -30,10 +32,12 @@ class Output:
     format_name : str
         Of `mixpose.poses.formats.FORMATS`.
     header : Header
-    append : bool
-        Go on in a file of JSON lines that has its header already.
+    goes_on : LineFile or None
+        A file of JSON lines that has its header already, in place of opening `path`.
     options : mapping
         What the writer of the format takes besides.
+    called : Path or None
+        What messages call the file, where that is not `path`.
     """
 
     def __init__(
@@ -42,13 +46,17 @@ class Output:
         format_name: str,
         header: Header,
         *,
-        append: bool = False,
+        goes_on: LineFile | None = None,
         options: Mapping[str, int | str] | None = None,
+        called: Path | None = None,
     ) -> None:
+        self._called = called or path
         self._path, self._format, self._header = path, format_name, header
-        self._append, self._options = append, options or {}
-        self._stream: TextIO | None = None
+        self._options = options or {}
         self._writer: PoseWriter | None = None
+        self.file = goes_on
+        if goes_on is not None:
+            self._writer = JsonlWriter(_as_stream(goes_on), header, resume=True)
 
     def __enter__(self) -> Output:
         return self
@@ -59,12 +67,14 @@ class Output:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if error is None and self._writer is None and not (self._path and self._path.exists()):
-            self._open()  # a run without frames says at least what it was
-        if self._writer is not None and not isinstance(error, OSError):
-            self._writer.close()
-        if self._stream is not None and self._path is not None:
-            self._stream.close()
+        try:
+            if error is None and self._writer is None:
+                self._open()  # a run without frames says at least what it was
+            if self._writer is not None and not isinstance(error, OSError | SessionError):
+                self._writer.close()
+        finally:
+            if self.file is not None:
+                self.file.close()
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame, at once."""
@@ -72,25 +82,85 @@ class Output:
         writer.write(estimate)
 
     def _open(self) -> PoseWriter:
-        stream: TextIO = sys.stdout
         if self._path is not None:
-            try:
-                stream = open_text(self._path, append=self._append)
-            except OSError as error:
-                raise SessionError(
-                    f"-o {self._path}: cannot be written: {error.strerror}"
-                ) from error
-        if self._format == "jsonl":
-            self._writer = JsonlWriter(stream, self._header, resume=self._append)
-        else:
-            self._writer = FORMATS[self._format](stream, self._header, **self._options)
-        self._stream = stream
+            self.file = LineFile(self._path, called=self._called)
+        stream = sys.stdout if self.file is None else _as_stream(self.file)
+        self._writer = FORMATS[self._format](stream, self._header, **self._options)
         return self._writer
 
 
-def open_text(path: Path, *, append: bool) -> TextIO:
-    """Open a text file for writing, the same bytes on every system."""
-    return path.open("a" if append else "w", encoding="utf-8", newline="\n")
+class OutputPerBody:
+    """Writes the poses of each body to a file of its own, as formats of one trajectory need it.
+
+    Parameters
+    ----------
+    path : Path or None
+        ``poses.tum`` stands for ``poses.<body>.tum``.
+    format_name : str
+    labels : sequence of str
+        Names of the bodies, identical ones numbered.
+    start : callable
+        Makes the output of one body from the path of its file.
+
+    Raises
+    ------
+    SessionError
+        If there is no path.
+    """
+
+    file: LineFile | None = None
+
+    def __init__(
+        self,
+        path: Path | None,
+        format_name: str,
+        labels: Sequence[str],
+        start: Callable[[Path], Output],
+    ) -> None:
+        if path is None:
+            raise SessionError(
+                f"--format {format_name}: holds one body, found {', '.join(labels)}; name a file "
+                "with -o: each body gets one with its own name in it"
+            )
+        self._outputs = {label: start(body_path(path, label)) for label in labels}
+
+    def __enter__(self) -> OutputPerBody:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with ExitStack() as stack:
+            for output in self._outputs.values():
+                stack.callback(output.__exit__, kind, error, trace)
+
+    def write(self, estimate: Estimate) -> None:
+        """Write one frame of one body, at once."""
+        self._outputs[estimate.label].write(estimate)
+
+
+def body_path(path: Path, label: str) -> Path:
+    """Where the poses of one of several bodies go: ``poses.tum`` → ``poses.tool.tum``."""
+    word = "".join(c if c.isalnum() or c in "-_ " else "_" for c in label)
+    return path.with_name(f"{path.stem}.{word}{path.suffix}")
+
+
+def is_apart(format_name: str, labels: Sequence[str]) -> bool:
+    """Whether a format needs a file for each of the bodies."""
+    return format_name in ONE_TRAJECTORY and len(labels) > 1
+
+
+def written_paths(path: Path, format_name: str, labels: Sequence[str]) -> list[Path]:
+    """The files that poses go to."""
+    return [body_path(path, label) for label in labels] if is_apart(format_name, labels) else [path]
+
+
+def _as_stream(file: LineFile) -> TextIO:
+    """The writers only ever write and flush."""
+    return cast(TextIO, file)
 
 
 def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:

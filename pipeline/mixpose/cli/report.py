@@ -6,11 +6,12 @@ from pathlib import Path
 
 from mixpose import __version__
 from mixpose.cli.notices import say
-from mixpose.cli.output import open_text, refuse_to_overwrite_but
+from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.errors import SessionError
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.report.origin import find_session
 from mixpose.report.page import MARK, render
+from mixpose.whole_files import appearing_whole
 
 
 def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
@@ -29,8 +30,8 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
     refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
     page = render(poses, truth, cut=cut, version=__version__)
     try:
-        with open_text(output, append=False) as stream:
-            stream.write(page)
+        with appearing_whole(output) as part:
+            part.write_text(page, encoding="utf-8", newline="\n")
     except OSError as error:
         raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
     count = len(poses.poses)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,6 +12,7 @@ from mixpose.errors import SessionError
 from mixpose.poses.jsonl import PoseFile
 from mixpose.poses.poseline import PoseLine
 from mixpose.runner import open_sources
+from mixpose.whole_files import appearing_whole
 
 
 def write_rerun(
@@ -48,10 +48,5 @@ def write_rerun(
             )
     from mixpose.rerun_file import write_rerun_file  # noqa: PLC0415 - not everybody has it
 
-    # a half-written file never stands in the place of a whole one
-    half = output.with_name(f".{output.name}.part")
-    try:
-        write_rerun_file(half, session, opened, lines)
-        os.replace(half, output)  # noqa: PTH105 - also where the file exists, on every system
-    finally:
-        half.unlink(missing_ok=True)
+    with appearing_whole(output) as part:
+        write_rerun_file(part, session, opened, lines)

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 from mixpose import __version__
+from mixpose.cli.continuation import Continuation, Notes, continuation, require_file
+from mixpose.cli.lines import LineFile
 from mixpose.cli.notices import Summary, origin_of, say, warn_of_sources
-from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.cli.output import (
+    Output,
+    OutputPerBody,
+    is_apart,
+    refuse_to_overwrite,
+    written_paths,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
 from mixpose.poses.header import Header
-from mixpose.poses.jsonl import read_poses, resume_point
-from mixpose.records import Estimate, Floats
-from mixpose.runner import Watch, open_sources, run
-from mixpose.selection import Selection
+from mixpose.poses.jsonl import ResumePoint
+from mixpose.records import Estimate
+from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
 from mixpose.tracking.proposers.predicted import predicted
 
@@ -38,32 +46,93 @@ def run_session(path: Path, request: RunRequest) -> None:
     session = load_session(path)
     replaced = named_sources(request.sources)
     header = header_of(session, replaced)
-    selection, T_start, resumed = request.selection, None, False
     opened = open_sources(session, replaced)
-    if request.output is not None and not _is_device(request.output):
-        refuse_to_overwrite(request.output, _inputs(session))
+    outputs = (
+        []
+        if request.output is None
+        else written_paths(request.output, request.format, header.labels)
+    )
+    for each in outputs:
+        if not _is_device(each):
+            refuse_to_overwrite(each, _inputs(session))
+    go_on = Continuation(None, request.selection)
     if request.resume:
         _refuse_live(opened)
-        selection, T_start, resumed = _resumed(request, header)
+        poses = require_file(request.output, request.format)
+        go_on = continuation(poses, header, request.selection, opened)
+    if go_on.is_done:
+        say(f"nothing left to do: {request.output} has all frames asked for already")
+        return
     warn_of_sources(opened)
     summary = Summary(session)
-    with ExitStack() as stack:
-        stack.enter_context(prompt_switching())
+    output = _output(request, header, go_on.file)
+    with output, prompt_switching(), ExitStack() as stack:
         watch = _overlay(stack, session, request)
-        estimates = run(session, opened=opened, selection=selection, T_start=T_start, watch=watch)
+        memories: deque[Memory] = deque(maxlen=1)
+        estimates = run(
+            session,
+            opened=opened,
+            selection=go_on.selection,
+            watch=watch,
+            memory=go_on.memory,
+            remember=memories.append,
+        )
         stack.enter_context(closing(estimates))
-        output = Output(request.output, request.format, header, append=resumed)
-        stack.enter_context(output)
-        for estimate in _with_progress(estimates, session, quiet=request.output is None):
+        notes = stack.enter_context(_notes(request))
+        shown = _with_progress(estimates, session, quiet=request.output is None)
+        for estimate in _not_there(shown, go_on.there):
             output.write(estimate)
+            is_whole = estimate.label == session.labels[-1]  # all bodies of the frame are there
+            if notes is not None and output.file is not None and is_whole:
+                notes.remember(estimate.frame, output.file, memories[-1])
             summary.add(estimate)
             if request.debug and estimate.proposer != predicted.__name__:
                 say(f"frame {estimate.frame}: {origin_of(estimate)}")
-    if resumed and not summary.statuses:
-        say(f"nothing left to do: {request.output} has all frames asked for already")
+    names = [str(path) for path in (*outputs, request.overlay) if path is not None]
+    summary.say(f" -> {', '.join(names)}" if names else "")
+
+
+def _output(
+    request: RunRequest, header: Header, goes_on: LineFile | None
+) -> Output | OutputPerBody:
+    name = request.format
+    if not is_apart(name, header.labels):
+        return Output(request.output, name, header, goes_on=goes_on)
+    return OutputPerBody(
+        request.output, name, header.labels, lambda path: Output(path, name, header)
+    )
+
+
+@contextmanager
+def _notes(request: RunRequest) -> Iterator[Notes | None]:
+    """What writes down where the run could go on; gone when the recording is done."""
+    if request.output is None or request.format != "jsonl" or _is_device(request.output):
+        yield None
         return
-    written = [str(path) for path in (request.output, request.overlay) if path is not None]
-    summary.say(f" -> {', '.join(written)}" if written else "")
+    notes = Notes(request.output, __version__)
+    try:
+        yield notes
+    except BaseException:
+        with suppress(OSError):  # as on a full disk: then the frames are estimated again
+            notes.write()
+        raise
+    if request.selection.stop is None:
+        notes.drop()
+    else:
+        notes.write()
+
+
+def _not_there(estimates: Iterable[Estimate], there: ResumePoint | None) -> Iterator[Estimate]:
+    """Estimates after the last line that is there already."""
+    seen = 0
+    for estimate in estimates:
+        if there is not None:
+            seen += estimate.frame == there.frame
+            if estimate.frame < there.frame or (
+                estimate.frame == there.frame and seen <= there.lines
+            ):
+                continue
+        yield estimate
 
 
 @contextmanager
@@ -112,9 +181,10 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
         session_sha256=session.sha256,
         mixpose=__version__,
         seed=session.estimator.seed,
-        symmetries={session.body.name: session.body.symmetries},
+        symmetries={one.body.name: one.body.symmetries for one in session.objects},
         sources=sources or {},
         sensors=tuple(setup.name for setup in session.sensors),
+        objects={one.body.name: one.count for one in session.objects},
     )
 
 
@@ -142,30 +212,6 @@ def _refuse_live(opened: Mapping[str, Source]) -> None:
                 f"--resume: sensor {name!r} is live, what it missed is gone; leave out --resume "
                 "and name another file with -o"
             )
-
-
-def _resumed(request: RunRequest, header: Header) -> tuple[Selection, Floats | None, bool]:
-    """What is left to do after the frames that stand in the output already."""
-    if request.output is None or request.format != "jsonl":
-        raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
-    last = resume_point(request.output, header)
-    if last is None:
-        return request.selection, None, False
-    wanted = request.selection
-    begin = last + 1
-    if wanted.start is not None:
-        # stay on the numbers that the whole run would have taken
-        steps = max(-(-(begin - wanted.start) // wanted.step), 0)
-        begin = wanted.start + steps * wanted.step
-    elif wanted.step > 1:
-        begin = last + wanted.step
-    trusted = [
-        pose.T_world_object
-        for pose in read_poses(request.output).poses
-        if pose.T_world_object is not None
-    ]
-    T_start = trusted[-1] if trusted else None
-    return Selection(begin, wanted.stop, wanted.step), T_start, True
 
 
 def _with_progress(

@@ -5,9 +5,33 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from mixpose.errors import SessionError
 from mixpose.session import load_session
+from mixpose.session.values import LONGEST_DELAY_S
 from mixpose.simulation import SimulationOptions, simulate
 from mixpose.simulation.session_copy import SESSION_NAME
+
+
+def delays_of(given: list[str]) -> dict[str, float]:
+    """Seconds by sensor, of texts NAME=SECONDS.
+
+    Raises
+    ------
+    SessionError
+        If a text is not like that.
+    """
+    delays = {}
+    for text in given:
+        name, _, seconds = text.rpartition("=")
+        try:
+            delays[name] = float(seconds)
+        except ValueError:
+            name = ""
+        if not name or not abs(delays[name]) <= LONGEST_DELAY_S:
+            raise SessionError(
+                f"--delay {text}: allowed: NAME=SECONDS, seconds from -1 to 1, like right=0.006"
+            )
+    return delays
 
 
 def simulate_session(

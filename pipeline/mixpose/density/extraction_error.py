@@ -93,29 +93,21 @@ class Seen(NamedTuple):
 
     Attributes
     ----------
-    squares, degrees : (L,) float64
-        Of each sensor's noise, in σ_ε²; without the degrees of freedom of the pose.
+    own : (2, L) float64
+        Squares, in σ_ε², and degrees of freedom of each sensor's noise in this frame.
     variances : (L,) float64
         Of each sensor's noise, together with what was known.
     blurs : (L,) float64
         In σ_ε.
-    weights : (K,) float64
-        Of the features, 1 on average where all offsets are normal; with their shares.
     """
 
-    squares: Floats
-    degrees: Floats
+    own: Floats
     variances: Floats
     blurs: Floats
-    weights: Floats
-
-    def noise(self, sensor: int) -> Noise:
-        """Of one sensor, as this frame shows it."""
-        return Noise(float(self.squares[sensor]), float(self.degrees[sensor]))
 
 
 def errors_seen(
-    offsets: Offsets, free: int, squares: Floats, degrees: Floats, rules: ErrorRules
+    offsets: Offsets, free: int, known: Floats, rules: ErrorRules = ErrorRules()
 ) -> Seen:
     """How large the extraction's errors are.
 
@@ -125,25 +117,20 @@ def errors_seen(
         At a pose that was fitted to them.
     free : int
         Directions in which it was.
-    squares, degrees : (L,) array
-        What is known of each sensor's noise already.
+    known : (2, L) array
+        Squares and degrees of freedom of each sensor's noise so far.
     rules : ErrorRules
     """
     blurs = np.ones(len(offsets.dimensions))
     while True:
-        seen = _seen_at(blurs, offsets, free, squares, degrees, rules)
+        seen = _seen_at(blurs, offsets, free, known, rules)
         if (seen.blurs > 0.9 * blurs).all():
             return seen
         blurs = np.minimum(seen.blurs, blurs)
 
 
 def _seen_at(
-    blurs: Floats,
-    offsets: Offsets,
-    free: int,
-    known_squares: Floats,
-    known_degrees: Floats,
-    rules: ErrorRules,
+    blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules
 ) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
     squared, shares, sensor, dimensions, finest = offsets
@@ -154,21 +141,20 @@ def _seen_at(
     # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
     factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))
     left = max(1 - free / max(float(factor @ total), 1e-12), 0.0)
-    own_degrees, own = left * factor * total, factor**2 * q * total * (left > 0)
-    variances = pooled(
-        known_squares + own, known_degrees + own_degrees, rules, rules.typical_degrees
-    )
+    own = np.array([(left > 0) * factor**2 * q * total, left * factor * total])
+    variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
-    alone = pooled(own, own_degrees, rules, 0.0)
-    wide = rules.blur * np.sqrt(np.maximum(variances, alone))
-    return Seen(own, own_degrees, variances, np.clip(wide, finest, 1.0), factor[sensor] * weights)
+    blurs = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))
+    return Seen(own, variances, np.clip(blurs, finest, 1.0))
 
 
-def pooled(squares: Floats, degrees: Floats, rules: ErrorRules, typical: float) -> Floats:
+def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     """Variances (L,), each drawn to that of all sensors together, in σ_ε².
 
-    `typical` is the weight of the typical variance in the latter, in degrees of freedom.
+    Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
+    that of all sensors, in degrees of freedom.
     """
+    squares, degrees = sums
     most = float(degrees.sum()) + typical
     common = (float(squares.sum()) + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)

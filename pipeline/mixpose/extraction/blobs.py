@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
+from mixpose.extraction.conics import Ellipse, distances, together
 from mixpose.extraction.contours import (
     Box,
     Contour,
@@ -33,7 +34,7 @@ from mixpose.extraction.contours import (
     outlines,
     pieces,
 )
-from mixpose.extraction.ellipse import Ellipse, EllipseRules, distances, find_rim, is_waisted
+from mixpose.extraction.ellipse import EllipseRules, Rim, find_rims, is_waisted
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.single_spots import all_spots
 from mixpose.extraction.spots import SpotRules, come_apart
@@ -129,7 +130,7 @@ def _search(
     With `islands`, contours in the holes of these are yet to be looked for.
     """
     blobs: list[Blob] = []
-    shapeless: list[Contour] = []
+    large: list[Contour] = []
     small: list[Contour] = []
     small_areas: list[float] = []
     for contour in contours:
@@ -139,37 +140,46 @@ def _search(
         if area <= rules.small_area:
             small.append(contour)
             small_areas.append(area)
-        elif (disk := _disk(scene, contour, level, rules)) is not None:
-            blobs.append(disk)
         else:
-            shapeless.append(contour)
+            large.append(contour)
+    disks = _disks(scene, large, level, rules)
+    blobs += [disk for disk in disks if disk is not None]
+    shapeless = [contour for contour, disk in zip(large, disks, strict=True) if disk is None]
     found = all_spots(scene, small, small_areas, level, rules.spots)
     for area, spots in zip(small_areas, found, strict=True):
         blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
     for group in neighbours(shapeless, rules.contours):
-        whole = _disk(scene, np.concatenate(group), level, rules) if len(group) > 1 else None
-        if whole is not None:
-            blobs.append(whole)
+        parts = [np.concatenate(group)] if len(group) > 1 else []
+        whole = [disk for disk in _disks(scene, parts, level, rules) if disk is not None]
+        blobs += whole
+        if whole:
             continue
         for contour in group:
             blobs += _other(scene, contour, level, min_area, rules, islands=islands)
     return blobs
 
 
-def _disk(scene: Foreground, contour: Contour, level: float, rules: BlobRules) -> Blob | None:
-    """A blob whose rim is an ellipse, even if part of it is hidden or out of the window."""
-    rim = find_rim(scene.grey, contour, level, rules.rims)
-    if (
-        rim is None
-        or not rim.is_good(rules.rims)
-        or is_waisted(scene.grey, rim.ellipse, rules.rims)
-    ):
-        return None
-    if scene.judged:
-        patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
-        if rim.contrast < rules.spots.min_step * _brightness(scene, patch, inside)[0]:
-            return None
-    return Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
+def _disks(
+    scene: Foreground, contours: Sequence[Contour], level: float, rules: BlobRules
+) -> list[Blob | None]:
+    """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
+    rims = find_rims(scene.grey, contours, level, rules.rims)
+    return [
+        Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
+        if rim is not None and _is_disk(scene, contour, rim, rules)
+        else None
+        for contour, rim in zip(contours, rims, strict=True)
+    ]
+
+
+def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) -> bool:
+    """Whether what a contour encloses is a disk with a rim."""
+    if not rim.is_good(rules.rims) or is_waisted(scene.grey, rim.ellipse, rules.rims):
+        return False
+    if not scene.judged:
+        return True
+    patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
+    return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)[0]
 
 
 def _other(
@@ -241,10 +251,12 @@ def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:
 
 def _outside_disks(blobs: list[Blob]) -> list[Blob]:
     """Blobs without those inside of a larger disk: scraps of its own broken rim."""
-    centres = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
+    disks = [(blob.rim, blob.area) for blob in blobs if blob.rim is not None]
+    if not disks:
+        return blobs
+    rims, disk_areas = zip(*disks, strict=True)
+    centres = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64)
     areas = np.array([blob.area for blob in blobs])
-    scrap = np.zeros(len(blobs), dtype=np.bool_)
-    for blob in blobs:
-        if blob.rim is not None:
-            scrap |= (distances(blob.rim, centres) < 0) & (areas < blob.area)
-    return [blob for blob, inner in zip(blobs, scrap, strict=True) if not inner]
+    within = distances(together(list(rims)), centres) < 0
+    scrap = np.any(within & (areas < np.array(disk_areas)[:, None]), axis=0)
+    return [blob for blob, inner in zip(blobs, scrap.tolist(), strict=True) if not inner]

@@ -2,19 +2,21 @@
 
 A disk stays an ellipse when part of its rim is hidden, when it has a hole, or when its light
 is uneven: so the rim is looked for where it is, and what does not lie on the ellipse is left out.
+All features of an image are looked at together, as arrays with one row for each: it is the number
+of calls that takes time, not that of pixels.
 
-`skimage.measure` beside it: `EllipseModel` fits as well, but ten times slower (0.13 to 0.013 ms of
-72 points), its distances are 300 times slower (4.1 to 0.012 ms), and `ransac` triples the error
-where a straight edge cuts a disk (0.17 to 0.05 px).  `find_contours` has one level for all of the
-rim: a disk half in shadow is off by 0.32 px instead of 0.01, and disks behind cables or broken by
-their hole are not found.
+`skimage.measure` beside it: `EllipseModel` fits as well, but ten times slower than
+`cv2.fitEllipseAMS`, whose fit (Taubin's) is the one here; `ransac` triples the error where a
+straight edge cuts a disk (0.17 to 0.05 px).  `find_contours` has one level for all of the rim: a
+disk half in shadow is off by 0.32 px instead of 0.01, and disks behind cables or broken by their
+hole are not found.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,12 +24,25 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
+from mixpose.extraction.conics import (
+    FEWEST,
+    Ellipse,
+    Ellipses,
+    Mask,
+    distances,
+    fit_conics,
+    monomials,
+    turns,
+)
 from mixpose.extraction.contours import Contour
-from mixpose.extraction.sampling import sample
+from mixpose.extraction.sampling import sample, sample_each
 from mixpose.records import Floats
 
 # Directions in which the rim is looked for.
 DIRECTIONS = 72
+
+# Times that an ellipse is fitted again to the points near it.
+REFITS = 3
 
 _ANGLES = np.linspace(0, 2 * np.pi, DIRECTIONS, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -59,20 +74,6 @@ class EllipseRules:
 
 
 @dataclass(frozen=True)
-class Ellipse:
-    """An ellipse in pixel coordinates; `angle` in radians turns the first half-axis from u."""
-
-    centre: tuple[float, float]
-    half_axes: tuple[float, float]
-    angle: float
-
-    @property
-    def area(self) -> float:
-        """Enclosed area in px."""
-        return math.pi * self.half_axes[0] * self.half_axes[1]
-
-
-@dataclass(frozen=True)
 class Rim:
     """An ellipse found in an image.
 
@@ -94,60 +95,79 @@ class Rim:
 
     def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
         """Whether the rim is an ellipse."""
-        near = self.residual <= tolerance(self.ellipse, rules) / 2
-        return self.coverage >= rules.coverage and near
+        near = self.residual <= tolerance(min(self.ellipse.half_axes), rules) / 2
+        return self.coverage >= rules.coverage and bool(near)
 
 
-def find_rim(
+def find_rims(
     signal: Grey,
-    outline: Contour,
+    outlines: Sequence[Contour],
     least_contrast: float,
     rules: EllipseRules = EllipseRules(),
-) -> Rim | None:
-    """The elliptical rim of a bright feature.
+) -> list[Rim | None]:
+    """The elliptical rims of bright features.
 
     Parameters
     ----------
     signal : (H, W) uint8, uint16 or float32
         Grey values.
-    outline : (n, 1, 2) int32
-        Contour of the feature, in pixels of the signal.
+    outlines : sequence of (n, 1, 2) int32
+        Contours of the features, in pixels of the signal.
     least_contrast : float
         An edge is a step of the signal by at least this.
     rules : EllipseRules
 
     Returns
     -------
-    Rim or None
-        None where nothing like an ellipse is found.
+    list of Rim or None
+        One for each outline; None where nothing like an ellipse is found.
     """
+    rims: list[Rim | None] = [None] * len(outlines)
+    if not outlines:
+        return rims
     # Digital straight lines, such as the chord that an occlusion leaves, have few corners in a
     # convex hull, arcs have many: the corners alone favour the true rim.
-    hull = cv2.convexHull(outline)[:, 0].astype(np.float64)
-    rim = _rim_near(signal, fit_ellipse(hull, rules), least_contrast, rules)
+    hulls = [cv2.convexHull(outline)[:, 0] for outline in outlines]
+    ellipses = fit_ellipses(*_side_by_side(hulls), rules)
+    found = np.arange(len(outlines))
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
-    return None if rim is None else _rim_near(signal, rim.ellipse, least_contrast, rules)
+    for _ in range(2):
+        some, sound = ellipses.select(ellipses.sound), found[ellipses.sound]
+        if not sound.size:
+            return rims
+        ellipses, edges = _rims_near(signal, some, least_contrast, rules)
+        found = sound
+    for k, i in enumerate(found.tolist()):
+        if ellipses.sound[k]:
+            numbers = (float(one[k]) for one in edges)
+            rims[i] = Rim(ellipses.one(k), *numbers)
+    return rims
 
 
-def _rim_near(
-    signal: Grey, ellipse: Ellipse | None, least_contrast: float, rules: EllipseRules
-) -> Rim | None:
-    if ellipse is None:
-        return None
-    edges, found, steps = _edges(signal, ellipse, least_contrast, rules)
-    if np.count_nonzero(found) < rules.coverage / 2 * DIRECTIONS:
-        return None
-    better = fit_ellipse(edges[found], rules)
-    if better is None:
-        return None
+def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
+    """Lists of points as one array (B, n, 2), and which of its places (B, n) are filled."""
+    counts = np.array([len(one) for one in points])
+    there = np.arange(counts.max()) < counts[:, None]
+    together = np.zeros((*there.shape, 2))
+    together[there] = np.concatenate(points)
+    return together, there
+
+
+def _rims_near(
+    signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
+) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
+    """Ellipses through the edges near others, with coverage, residual and contrast of each."""
+    edges, found, steps = _edges(signal, ellipses, least_contrast, rules)
+    found &= (found.sum(axis=1) >= rules.coverage / 2 * DIRECTIONS)[:, None]
+    better = fit_ellipses(edges, found, rules)
     distance = np.abs(distances(better, edges))
-    on_rim = found & (distance <= tolerance(better, rules))
-    count = np.count_nonzero(on_rim)
-    if count == 0:
-        return None
-    near = distance[on_rim]
-    residual = math.sqrt(float(near @ near) / count)
-    return Rim(better, count / DIRECTIONS, residual, _median(steps[on_rim]))
+    within = tolerance(better.half_axes.min(axis=1), rules)
+    on_rim = found & (distance <= within[:, None]) & better.sound[:, None]
+    count = on_rim.sum(axis=1)
+    squares = np.where(on_rim, distance, 0.0) ** 2
+    residual = np.sqrt(squares.sum(axis=1) / np.maximum(count, 1))
+    better = replace(better, sound=better.sound & (count > 0))
+    return better, (count / DIRECTIONS, residual, _medians(steps, on_rim))
 
 
 def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRules()) -> bool:
@@ -155,7 +175,7 @@ def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRule
     a, b = ellipse.half_axes
     if max(a, b) < rules.long * min(a, b):
         return False
-    directions = _turn(ellipse.angle).T * np.array([[a], [b]])
+    directions = turns(np.array(ellipse.angle)).T * np.array([[a], [b]])
     major, minor = directions if a >= b else directions[::-1]
     along = np.stack([0 * major, major / 2, -major / 2, rules.waist * minor, -rules.waist * minor])
     middle, one, other, *sides = sample(signal, (ellipse.centre + along)[:, None])[:, 0]
@@ -164,134 +184,152 @@ def is_waisted(signal: Grey, ellipse: Ellipse, rules: EllipseRules = EllipseRule
     return bool(dips and middle - max(sides) > rules.ridge * height)
 
 
-def fit_ellipse(points: Floats, rules: EllipseRules = EllipseRules()) -> Ellipse | None:
-    """Ellipse through points, of which some may lie elsewhere.
+def tolerance(minor: Any, rules: EllipseRules) -> Any:
+    """Distance in px within which an edge counts as on an ellipse of this minor half-axis."""
+    # A tenth of small ones, whose shape pixels blur; of large ones what print and lens bend.
+    return np.maximum(rules.tolerance, np.maximum(np.minimum(0.1 * minor, 1.0), 0.02 * minor))
+
+
+def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules()) -> Ellipses:
+    """Ellipses through points, of which some may lie elsewhere.
 
     Parameters
     ----------
-    points : (n, 2) float64
-        Points in order along the ellipse.
+    points : (B, n, 2) float64
+        Points in order along each ellipse.
+    there : (B, n) bool
+        Which of them count.
     rules : EllipseRules
 
     Returns
     -------
-    Ellipse or None
-        None for less than six points, or where they are not on an ellipse.
+    Ellipses
+        Sound but for less than six points, or where they are not on an ellipse.
     """
-    best, best_spread = None, np.inf
-    for start in _starts(points, rules):
-        ellipse = _fit(start, rules)
-        if ellipse is None:
-            continue
-        spread = _median(np.abs(distances(ellipse, points)))
-        if spread < best_spread:
-            best, best_spread = ellipse, spread
-        if spread < rules.spread:
+    terms = monomials(points, there)
+    best = fit_conics(terms, there, rules.oblique)
+    distance, spread = _spreads(best, points, there)
+    used = there.copy()
+    doubtful = np.flatnonzero(~(spread < rules.spread) & (there.sum(axis=1) >= FEWEST))
+    if doubtful.size:
+        tried, better = _without_an_arc(points[doubtful], there[doubtful], spread[doubtful], rules)
+        best = best.replaced(doubtful[better], tried)
+        used[doubtful[better]] = False
+        distance, spread = _spreads(best, points, there)
+    hopeless = spread > rules.spread + rules.hopeless * best.half_axes.min(axis=1)
+    best = replace(best, sound=best.sound & ~hopeless)
+    for _ in range(REFITS):
+        near = there & (distance <= np.maximum(rules.spread, 3.0 * spread)[:, None])
+        changed = np.flatnonzero((near != used).any(axis=1) & best.sound)
+        if not changed.size:
             break
-    if best is None or best_spread > rules.spread + rules.hopeless * min(best.half_axes):
-        return None
-    for _ in range(3):
-        if best is None:
-            return None
-        distance = np.abs(distances(best, points))
-        near = distance <= max(rules.spread, 3.0 * _median(distance))
-        best = _fit(points[near], rules)
+        refitted = fit_conics(terms.select(changed), near[changed], rules.oblique)
+        best, used = best.replaced(changed, refitted), near
+        distance, spread = _spreads(best, points, there)
     return best
 
 
-def _median(values: Floats) -> float:
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])
+def _spreads(ellipses: Ellipses, points: Floats, there: Mask) -> tuple[Floats, Floats]:
+    """Distances (B, n) of points from ellipses, and their medians (B,); infinite without one."""
+    distance = np.abs(distances(ellipses, points))
+    return distance, np.where(ellipses.sound, _medians(distance, there), np.inf)
 
 
-def tolerance(ellipse: Ellipse, rules: EllipseRules) -> float:
-    """Distance in px within which an edge counts as on the ellipse."""
-    minor = min(ellipse.half_axes)
-    # A tenth of small ones, whose shape pixels blur; of large ones what print and lens bend.
-    return max(rules.tolerance, min(0.1 * minor, 1.0), 0.02 * minor)
+def _without_an_arc(
+    points: Floats, there: Mask, spread: Floats, rules: EllipseRules
+) -> tuple[Ellipses, Mask]:
+    """Ellipses through all points but those of an arc that may be hidden.
 
-
-def _starts(points: Floats, rules: EllipseRules) -> Iterator[Floats]:
-    """All points, then all but each of some arcs, one of which may be hidden."""
-    yield points
-    count = len(points)
-    shown = count - 3 * count // rules.hidden_arcs
-    around = np.concatenate([points, points])
-    for k in range(rules.hidden_arcs):
-        first = k * count // rules.hidden_arcs
-        yield around[first : first + shown]
-
-
-def _fit(points: Floats, rules: EllipseRules) -> Ellipse | None:
-    if len(points) < 6:
-        return None
-    # Near the origin, as OpenCV works in single precision.
-    middle = points.sum(axis=0) / len(points)
-    (u, v), (width, height), degrees = cv2.fitEllipseAMS((points - middle).astype(np.float32))
-    half_axes = (width / 2, height / 2)
-    sound = math.isfinite(u + v + width + height + degrees) and min(half_axes) > 0
-    if not sound or min(half_axes) < rules.oblique * max(half_axes):
-        return None
-    return Ellipse((u + middle[0], v + middle[1]), half_axes, math.radians(degrees))
-
-
-def distances(ellipse: Ellipse, points: Floats) -> Floats:
-    """Signed distances (n,) of points (n, 2) from an ellipse, outside positive.
-
-    To first order (Sampson), which is exact enough within a few px of the rim.
-    """
-    axes = np.asarray(ellipse.half_axes)
-    # On the ellipse |scaled| is 1; its gradient is scaled / axes / |scaled|.
-    scaled = (points - ellipse.centre) @ (_turn(ellipse.angle) / axes)
-    slope = scaled / axes
-    square = np.einsum("ij,ij->i", scaled, scaled)
-    steepness = np.sqrt(np.einsum("ij,ij->i", slope, slope)) + 1e-12
-    return np.asarray((square - np.sqrt(square)) / steepness)
-
-
-def _turn(angle: float) -> Floats:
-    cos, sin = math.cos(angle), math.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
-
-
-def _edges(
-    signal: Grey, ellipse: Ellipse, least_contrast: float, rules: EllipseRules
-) -> tuple[Floats, NDArray[np.bool_], Floats]:
-    """Edges along the normals of an ellipse.
+    Of several arcs that is the first that leaves an ellipse as near to the points as asked for,
+    else the nearest.
 
     Returns
     -------
-    edges : (DIRECTIONS, 2) float64
+    Ellipses, (B,) bool
+        Those that are nearer to the points (B, n, 2) than what is there already, and which.
+    """
+    arcs = rules.hidden_arcs
+    counts = there.sum(axis=1)[:, None]
+    # places along each ellipse
+    order = np.cumsum(there, axis=1) - 1
+    first = np.arange(arcs) * counts // arcs
+    shown = counts - 3 * counts // arcs
+    ahead = (order[:, None] - first[:, :, None]) % counts[:, :, None]
+    parts = there[:, None] & (ahead < shown[:, :, None])
+    around = np.repeat(points, arcs, axis=0)
+    tried = fit_conics(
+        monomials(around, np.repeat(there, arcs, axis=0)),
+        parts.reshape(len(around), -1),
+        rules.oblique,
+    )
+    spreads = _spreads(tried, around, np.repeat(there, arcs, axis=0))[1].reshape(-1, arcs)
+    good = spreads < rules.spread
+    chosen = np.where(good.any(axis=1), good.argmax(axis=1), spreads.argmin(axis=1))
+    rows = np.arange(len(points))
+    better = spreads[rows, chosen] < spread
+    return tried.select((rows * arcs + chosen)[better]), better
+
+
+def _medians(values: Floats, there: Mask) -> Floats:
+    """Medians (B,) of those values (B, n) that are there, the upper of two."""
+    ordered = np.sort(np.where(there, values, np.inf), axis=1)
+    middle = np.minimum(there.sum(axis=1) // 2, values.shape[1] - 1)
+    return np.asarray(ordered[np.arange(len(ordered)), middle])
+
+
+def _edges(
+    signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
+) -> tuple[Floats, Mask, Floats]:
+    """Edges along the normals of ellipses.
+
+    Returns
+    -------
+    edges : (B, DIRECTIONS, 2) float64
         Where the signal falls through half the height of the edge, to parts of a pixel.
-    found : (DIRECTIONS,) bool
+    found : (B, DIRECTIONS) bool
         Whether it falls by `least_contrast` there, well within reach.
-    steps : (DIRECTIONS,) float64
+    steps : (B, DIRECTIONS) float64
         By how much it falls.
     """
-    axes = np.asarray(ellipse.half_axes)
-    turn = _turn(ellipse.angle)
-    on_rim = ellipse.centre + (_CIRCLE * axes) @ turn.T
-    normals = (_CIRCLE / axes) @ turn.T
-    normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
-    reach = int(np.clip(rules.reach * axes.min(), rules.min_reach, rules.max_reach))
-    # Half steps, so that the fall between samples is known at the ellipse itself.
-    offsets = np.arange(-reach - 1.5, reach + 2)
-    places = on_rim[:, None] + normals[:, None] * offsets[:, None]
-    profile = sample(signal, places)
+    axes = ellipses.half_axes[:, None]
+    turned = turns(ellipses.angle).swapaxes(1, 2)
+    on_rim = ellipses.centre[:, None] + (_CIRCLE * axes) @ turned
+    normals = (_CIRCLE / axes) @ turned
+    normals /= np.hypot(normals[..., 0], normals[..., 1])[..., None]
+    reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
+    reach = reach.astype(np.intp)
+    where, found, steps = np.zeros((3, len(reach), DIRECTIONS))
+    for whole in sorted(set(reach.tolist())):
+        some = np.flatnonzero(reach == whole)
+        # Half steps, so that the fall between samples is known at the ellipse itself.
+        offsets = np.arange(-whole - 1.5, whole + 2)
+        u, v = (
+            (on_rim[some, :, k, None] + normals[some, :, k, None] * offsets).reshape(len(some), -1)
+            for k in (0, 1)
+        )
+        profiles = sample_each(signal, u, v)
+        step, place, below = _fall(profiles.reshape(-1, len(offsets)), offsets)
+        sure = (step >= least_contrast) & below & (np.abs(place) <= whole)
+        shape = (len(some), DIRECTIONS)
+        steps[some], where[some], found[some] = (x.reshape(shape) for x in (step, place, sure))
+    return on_rim + normals * where[..., None], found > 0, steps
+
+
+def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats, Mask]:
+    """Of profiles (n, k) how far each falls, where it is at half the height, and whether it is."""
     # The rim is near where the signal falls most over a width that optics blur an edge to...
-    fall = profile[:, :-3] - profile[:, 3:]
-    steepest = np.argmax(fall, axis=1)
-    steps = np.take_along_axis(fall, steepest[:, None], axis=1)[:, 0]
+    fall = profiles[:, :-3] - profiles[:, 3:]
+    rows = np.arange(len(profiles))
+    steepest = fall.argmax(axis=1)
     # ... and at half the height there, which noise moves less than the steepest place.
-    column = np.arange(profile.shape[1])
-    inside, outside = column <= steepest[:, None] + 1, column >= steepest[:, None] + 2
-    high = np.where(inside, profile, -np.inf)
-    low = np.where(outside, profile, np.inf).min(axis=1)
-    half = (high.max(axis=1) + low) / 2
-    below = (column > high.argmax(axis=1)[:, None]) & (profile < half[:, None])
+    column = np.arange(profiles.shape[1])
+    outside = column > (steepest + 1)[:, None]
+    high = np.where(outside, -np.inf, profiles)
+    summit = high.argmax(axis=1)
+    low = np.where(outside, profiles, np.inf).min(axis=1)
+    half = (high[rows, summit] + low) / 2
+    below = (column > summit[:, None]) & (profiles < half[:, None])
     after = np.maximum(below.argmax(axis=1), 1)
-    rows = np.arange(len(profile))
-    upper, lower = profile[rows, after - 1], profile[rows, after]
+    upper, lower = profiles[rows, after - 1].astype(np.float64), profiles[rows, after]
     where = offsets[after - 1] + (upper - half) / np.maximum(upper - lower, 1e-12)
-    found = (steps >= least_contrast) & below.any(axis=1) & (np.abs(where) <= reach)
-    return on_rim + normals * where[:, None], found, steps
+    return fall[rows, steepest], where, below[rows, after]

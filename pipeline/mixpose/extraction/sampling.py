@@ -6,6 +6,7 @@ import math
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.extraction.background import Grey
 from mixpose.records import Floats
@@ -44,3 +45,44 @@ def sample(grey: Grey, places: Floats) -> Floats:
 
 def _remap(patch: Grey, u: Grey, v: Grey) -> Grey:
     return cv2.remap(patch, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def sample_each(grey: Grey, u: Floats, v: Floats) -> NDArray[np.float32]:
+    """Bilinear samples of an image around several features.
+
+    Only what is around each feature is turned into single precision, not all between them.
+
+    Parameters
+    ----------
+    grey : (H, W) uint8, uint16 or float32
+    u, v : (B, n) float64
+        Pixel coordinates, of each feature near each other.
+
+    Returns
+    -------
+    (B, n) float32
+        Outside of the image, the nearest pixel's value.
+    """
+    across, left, columns = _part(u, grey.shape[1])
+    down, top, rows = _part(v, grey.shape[0])
+    most = max(MOST_ROWS // rows, 1)
+    samples = np.empty(u.shape, np.float32)
+    for first in range(0, len(u), most):
+        some = slice(first, first + most)
+        corners = list(zip(left[some].tolist(), top[some].tolist(), strict=True))
+        parts = np.zeros((len(corners), rows, columns), np.float32)
+        for part, (u0, v0) in zip(parts, corners, strict=True):
+            patch = grey[v0 : v0 + rows, u0 : u0 + columns]
+            part[: patch.shape[0], : patch.shape[1]] = patch
+        below = (np.arange(len(corners), dtype=np.float32) * rows)[:, None]
+        samples[some] = _remap(parts.reshape(-1, columns), across[some], down[some] + below)
+    return samples
+
+
+def _part(places: Floats, size: int) -> tuple[NDArray[np.float32], NDArray[np.intp], int]:
+    """Places (B, n) within a part of one side of an image, where it begins, and its length."""
+    inside = np.minimum(np.maximum(places, 0), size - 1)
+    first = inside.min(axis=1).astype(np.intp)
+    # the last pixel's neighbour is not looked at, but has to be there
+    length = int((inside.max(axis=1) - first).max()) + 2
+    return (inside - first[:, None]).astype(np.float32), first, length

@@ -170,20 +170,20 @@ def _to_the_noise(
     rules: FitRules,
 ) -> Ascent[Floats]:
     """The ascent from σ_ε on, while detections are farther off than their noise lets them be."""
-    squares, degrees = np.array([(one.squares, one.degrees) for one in noise]).T
+    known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in views])
     blurs = np.ones(len(views))
-    objective = finest or matched_objective(views, body, sigmas, ascent.state)
+    objective = finest or matched_objective(views, body, sigmas.tolist(), ascent.state)
     while True:
         offsets = _offsets(objective, ascent.state, errors, rules)
-        seen = errors_seen(offsets, int(free.sum()), squares, degrees, errors)
+        seen = errors_seen(offsets, int(free.sum()), known, errors)
         limits = errors.outlying**2 * seen.variances[offsets.sensor]
         clear = (offsets.squared <= limits) | (offsets.shares == 0)
         narrower = np.minimum(seen.blurs, blurs)
         if clear.all() or (narrower > rules.narrower * blurs).all():
             return ascent
         blurs = narrower
-        objective = matched_objective(views, body, blurs * sigmas, ascent.state)
+        objective = matched_objective(views, body, (blurs * sigmas).tolist(), ascent.state)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 

@@ -27,12 +27,23 @@ class AcceptanceRules:
     sure: float = constant(
         7.0, "log odds against clutter from which a pose is ok: one in a thousand by chance"
     )
-    possible: float = constant(0.0, "log odds from which a pose is worth telling: even odds")
-    doubtful: float = constant(
-        -4.5, "the same where `doubtful_coverage` is met: sure, less the share of two misses"
+    possible: float = constant(
+        0.5, "log odds from which a pose is told: chance exceeds it in 3 % of frames of one camera"
     )
-    doubtful_coverage: float = constant(
-        0.6, "share of the body met from which log odds down to `doubtful` are worth telling"
+    doubtful: float = constant(
+        -4.5, "the same of a pose that stands out: sure, less the share of two misses"
+    )
+    doubtful_coverage: float = constant(0.6, "share of the body that a pose must meet to stand out")
+    standing_out: float = constant(
+        2.2,
+        "log odds against all other poses of the frame from which one stands out: the best of "
+        "many that meet by chance has so much in 5 % of frames",
+    )
+    majority: float = constant(
+        0.5, "share of the features in view that some sensor must meet for a pose to be sure"
+    )
+    enough: float = constant(
+        8.0, "features met by some sensor that are enough however many are missed: a shape"
     )
     rival: float = constant(0.01, "belief from which another pose makes a frame ambiguous")
     listed: float = constant(0.001, "belief from which a pose stands among the hypotheses")
@@ -81,10 +92,35 @@ class Verdict:
 
 
 def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
-    """Whether a pose is worth telling."""
-    enough = judged.measurements >= int(free.sum())
-    doubtful = judged.coverage >= rules.doubtful_coverage
-    return enough and judged.log_evidence > (rules.doubtful if doubtful else rules.possible)
+    """Whether a pose is worth telling by itself."""
+    return _is_fixed(judged, free) and judged.log_evidence > rules.possible
+
+
+def stands_out(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+    """Whether the first pose meets most of the body and is far likelier than all others.
+
+    Poses that meet detections by chance come in numbers, and about equally good.
+    """
+    if not ranked or not _is_fixed(ranked[0], free):
+        return False
+    if ranked[0].coverage < rules.doubtful_coverage:
+        return False
+    rest = np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in ranked[1:])])
+    return ranked[0].log_evidence > max(rules.doubtful, float(rest) + rules.standing_out)
+
+
+def _is_fixed(judged: Judged, free: NDArray[np.bool_]) -> bool:
+    return judged.measurements >= int(free.sum())
+
+
+def is_recognised(judged: Judged, rules: AcceptanceRules) -> bool:
+    """Whether enough of the body is met that another one cannot pass for it.
+
+    Three markers of another body may well lie as three of this one, where it was expected even.
+    """
+    in_view = {int(i) for one in judged.associations for i in one.features}
+    met = {int(i) for one in judged.associations for i in one.features[one.shares > 0]}
+    return len(met) >= min(rules.majority * len(in_view), rules.enough)
 
 
 def is_turned_surely(judged: Judged, rules: AcceptanceRules) -> bool:
@@ -97,7 +133,7 @@ def is_turned_surely(judged: Judged, rules: AcceptanceRules) -> bool:
 def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose is believed, if no rival casts doubt on it."""
     possible = is_possible(judged, free, rules) and judged.log_evidence > rules.sure
-    return possible and is_turned_surely(judged, rules)
+    return possible and is_turned_surely(judged, rules) and is_recognised(judged, rules)
 
 
 def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
@@ -110,7 +146,8 @@ def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -
 
 def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
-    best = next((one for one in ranked if is_possible(one, free, rules)), None)
+    told = (one for one in ranked if is_possible(one, free, rules))
+    best = ranked[0] if stands_out(ranked, free, rules) else next(told, None)
     if best is None:
         return Verdict("lost", None, [])
     weights = beliefs(ranked)
@@ -121,7 +158,7 @@ def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceR
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
-        if one is best or (weight >= rules.listed and is_possible(one, free, rules))
+        if one is best or (weight >= rules.listed and _is_fixed(one, free))
     ]
     return Verdict("ok" if clear else "ambiguous", best, kept)
 

@@ -1,12 +1,22 @@
 """How sure it is that the body is there at all.
 
 Either the body is there at this pose, or everything seen is clutter.  The log of the odds is a sum
-over the features in view,
+over the features in view.  Clutter is either false in one sensor alone, and then
 
     met:      ln P_D + ln N(offset; 0, s²) − ln ρ,       missed:   ln (1 − P_D),
 
-with the probability of detection P_D and the density ρ of observed features.  A pose is chosen to
-fit, and pays for that freedom in one of two ways; the cheaper counts.
+with the probability of detection P_D and the density ρ of observed features; or it is a point in
+space, a screw or another body's marker, which several cameras see where they see it.  However many
+they are, that is one coincidence.  With the information A about the point's place, and d its
+distance from the feature in standard deviations,
+
+    met together:   − d²/2 + ½ ln det(A / 2π) − ln ρ₃,
+
+and cameras that miss the feature miss such a point as well.  The density ρ₃ of points in space is
+that of the camera with the fewest detections, over a depth of the body's size.  The explanation
+that makes clutter likelier counts, feature by feature.
+
+A pose is chosen to fit, and pays for that freedom in one of two ways; the cheaper counts.
 
 * By volume: the odds are integrated over the pose by Laplace's method, + ½ ln det(2π Cov)
   + ln p(pose).  The prior p is flat over everything that can be seen, or Gaussian around what a
@@ -23,10 +33,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -50,6 +61,9 @@ class DetectionModel:
         True,
         "whether a pose may pay for its freedom by the features that fix it: cheaper than by "
         "volume where priors are wide",
+    )
+    in_space: bool = constant(
+        True, "whether clutter may be a point in space that all cameras see: then it counts once"
     )
     room: float = constant(
         10.0, "radii of the body: how far a position may be where nothing is known before"
@@ -78,6 +92,52 @@ class Prior:
     spread: Floats
 
 
+@dataclass(frozen=True)
+class Sighting:
+    """What one sensor has at the N features of a body at H poses.
+
+    Attributes
+    ----------
+    weights : (H, N) float64
+        Of the features in view; 0 of the others.
+    shares : (H, N) float64
+        How far each was met, 0 to its weight.
+    offsets : (H, N, m) float64
+        Observed minus predicted places, in units of its noise; 0 where not met.
+    by_world : (H, N, m, 3) float64
+        How predicted places change as the feature moves in the world, noises per length.
+    crowd : (H,) float64
+        Observed features per unit of noise^m.
+    count : float
+        Number of observed features.
+    """
+
+    weights: Floats
+    shares: Floats
+    offsets: Floats
+    by_world: Floats
+    crowd: Floats
+    count: float
+
+
+class Odds(NamedTuple):
+    """Evidence of H poses before they pay for having been chosen, each (H,).
+
+    Attributes
+    ----------
+    gained : (H,) float64
+        Of the features that are met.
+    missed : (H,) float64
+        Of those that are not; negative.
+    coordinates : (H,) float64
+        Number of coordinates that tell anything: three for a point in space.
+    """
+
+    gained: Floats
+    missed: Floats
+    coordinates: Floats
+
+
 def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -> Prior:
     """Nothing is known: anywhere within ten radii of the body, turned in any way."""
     room = detection.room * body.radius
@@ -92,6 +152,7 @@ def log_evidence(
     variances: Floats,
     free: NDArray[np.bool_],
     prior: Prior,
+    size: float,
     detection: DetectionModel,
 ) -> float:
     """Logarithm of the odds for the body at a pose against mere clutter.
@@ -104,24 +165,128 @@ def log_evidence(
         Of the noise of each, in σ_ε².
     free : (6,) bool
     prior : Prior
+    size : float
+        Of the body, length units.
     detection : DetectionModel
     """
     if not any(one.met for one in associations):
         return -np.inf
-    gained, missed = 0.0, 0.0
-    for one, variance in zip(associations, variances.tolist(), strict=True):
-        gained += float(one.shares @ _gains(one, variance, detection.probability))
-        missed += one.missed * detection.log_missed
-        missed += one.unseen * detection.log_unseen
+    sightings = _sightings(associations, variances)
+    odds = odds_of(sightings, size, detection)
+    unseen = sum(one.unseen for one in associations) * detection.log_unseen
+    odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
     information = information_of(associations, variances)[np.ix_(free, free)]
     inner = information + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
-    by_volume = gained + missed + laplace + prior.log_density
+    by_volume = float(odds.gained[0] + odds.missed[0]) + laplace + prior.log_density
     if not detection.by_count:
         return by_volume
-    by_count = gained * _redundant(associations, free) + missed - _log_choices(associations, free)
-    return max(by_volume, by_count)
+    return max(by_volume, float(paid_by_count(odds, sightings, free)[0]))
+
+
+def odds_of(sightings: Sequence[Sighting], size: float, detection: DetectionModel) -> Odds:
+    """Odds of H poses against clutter, as if they had not been chosen to fit.
+
+    Parameters
+    ----------
+    sightings : sequence of Sighting
+        One per sensor.
+    size : float
+        Of the body, length units.
+    detection : DetectionModel
+    """
+    shape = sightings[0].weights.shape
+    gained, missed, coordinates = np.zeros((3, *shape))
+    near: list[NDArray[np.bool_]] = []
+    for one in sightings:
+        m = one.offsets.shape[2]
+        squares = (one.offsets**2).sum(axis=2)
+        density = one.crowd * (2 * np.pi) ** (m / 2)
+        gain = np.log(detection.probability / np.maximum(density, 1e-300))
+        gain = one.shares * np.maximum(gain[:, None] - squares / 2, 0.0)
+        gained += gain
+        missed += (one.weights - one.shares) * detection.log_missed
+        coordinates += m * one.shares
+        # a detection that chance puts as near is not the feature's
+        near.append((gain > 0) & (m == 2))
+    together = np.nonzero(np.sum(near, axis=0) > 1)
+    if detection.in_space and len(together[0]):
+        space, share = _in_space(sightings, near, together, size)
+        likelier = space < (gained + missed)[together]
+        pose, feature = (index[likelier] for index in together)
+        gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
+        most = 3 * share[likelier]
+        coordinates[pose, feature] = np.minimum(coordinates[pose, feature], most)
+    return Odds(gained.sum(axis=1), missed.sum(axis=1), coordinates.sum(axis=1))
+
+
+def _in_space(
+    sightings: Sequence[Sighting],
+    near: Sequence[NDArray[np.bool_]],
+    chosen: tuple[NDArray[np.intp], ...],
+    size: float,
+) -> tuple[Floats, Floats]:
+    """What features met by several cameras say if clutter are points in space (K,), and shares.
+
+    A clutter point lies where the cameras see it; only that it lies at the feature tells.
+    """
+    A = np.tile(np.eye(3) / size**2, (len(chosen[0]), 1, 1))
+    b, share = np.zeros((len(A), 3)), np.zeros(len(A))
+    log_rarity = np.full(len(A), -np.inf)
+    for one, is_near in zip(sightings, near, strict=True):
+        if one.offsets.shape[2] != 2:
+            continue
+        J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
+        weighted = J * met[:, None, None]
+        A += weighted.swapaxes(1, 2) @ J
+        b += (weighted.swapaxes(1, 2) @ r[..., None])[..., 0]
+        share = np.maximum(share, met * one.shares[chosen])
+        # detections per area, of which each has a depth
+        across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(1, 2)), 1e-300))
+        rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + math.log(size)
+        log_rarity = np.maximum(log_rarity, np.where(met, rarity, -np.inf))
+    away = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1)
+    tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
+    return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
+
+
+def paid_by_count(odds: Odds, sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floats:
+    """Evidence (H,) of poses that pay for their freedom by the features that fix them."""
+    spare = 1.0 - int(free.sum()) / np.maximum(odds.coordinates, 1.0)
+    return np.asarray(
+        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(sightings, free)
+    )
+
+
+def _log_choices(sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floats:
+    """Logarithm (H,) of the number of ways to fix a pose by observed features."""
+    expected = np.array([one.weights.sum(axis=1) for one in sightings])
+    counts = np.array([[one.count] for one in sightings])
+    pins = -(-int(free.sum()) // max(one.offsets.shape[2] for one in sightings))
+    observed = np.maximum((counts * (expected > 0)).sum(axis=0), pins)
+    features = np.maximum(expected.max(axis=0), pins)
+    ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
+    assigned = gammaln(features + 1) - gammaln(features - pins + 1)
+    return np.asarray(ways + assigned + math.log(2))
+
+
+def _sightings(associations: Sequence[Association], variances: Floats) -> list[Sighting]:
+    """Associations of one pose, in units of their noise, each feature in a column of its own."""
+    columns = 1 + max(int(one.features.max(initial=0)) for one in associations)
+    found = []
+    units = np.sqrt(variances) * [one.sigma for one in associations]
+    for one, unit in zip(associations, units.tolist(), strict=True):
+        n, m = one.offsets.shape
+        weights, shares = np.zeros((2, 1, columns))
+        offsets, by_world = np.zeros((1, columns, m)), np.zeros((1, columns, m, 3))
+        weights[0, one.features] = one.expected / max(n, 1)
+        shares[0, one.features] = one.shares
+        offsets[0, one.features] = one.offsets / unit
+        by_world[0, one.features] = one.J[..., :3] / unit
+        crowd = np.array([one.crowd * unit**m])
+        found.append(Sighting(weights, shares, offsets, by_world, crowd, one.count))
+    return found
 
 
 def _log_det(A: Floats) -> float:
@@ -129,29 +294,3 @@ def _log_det(A: Floats) -> float:
     scale = np.sqrt(A.diagonal())
     values = np.linalg.eigvalsh(A / scale / scale[:, None])
     return float(np.log(np.maximum(values, 1e-12)).sum() + 2 * np.log(scale).sum())
-
-
-def _gains(one: Association, variance: float, detection: float) -> Floats:
-    """What each met feature adds to the odds (n,); at least nothing."""
-    m = one.J.shape[1]
-    density = one.sigma**m * one.crowd * (2 * np.pi * variance) ** (m / 2)
-    gain = math.log(detection / max(density, 1e-300))
-    return np.asarray(np.maximum(gain - one.squared / (2 * variance), 0.0))
-
-
-def _redundant(associations: Sequence[Association], free: NDArray[np.bool_]) -> float:
-    """Share of the met coordinates that do not go into fixing the pose."""
-    measurements = sum(one.measurements for one in associations)
-    return max(1.0 - int(free.sum()) / max(measurements, 1.0), 0.0)
-
-
-def _log_choices(associations: Sequence[Association], free: NDArray[np.bool_]) -> float:
-    """Logarithm of the number of ways to fix a pose by observed features."""
-    associations = [one for one in associations if one.expected > 0]
-    dimension = max(one.J.shape[1] for one in associations)
-    pins = -(-int(free.sum()) // dimension)
-    observed = max(sum(one.count for one in associations), pins)
-    features = max(*(one.expected for one in associations), pins)
-    ways = math.lgamma(observed + 1) - math.lgamma(observed - pins + 1) - math.lgamma(pins + 1)
-    assigned = math.lgamma(features + 1) - math.lgamma(features - pins + 1)
-    return ways + assigned + math.log(2)

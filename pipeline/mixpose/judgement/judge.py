@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -85,6 +85,7 @@ def judge(
     *,
     before: Residuals = Residuals(),
     prior: Prior | None = None,
+    unmet: Sequence[Association] = (),
     rules: JudgementRules = JudgementRules(),
 ) -> Judged:
     """Judge a pose by the matched densities at the finest blur.
@@ -100,12 +101,18 @@ def judge(
         Of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
+    unmet : sequence of Association
+        Other sensors, which count as if they had met nothing.
     rules : JudgementRules
     """
     narrowest = rules.noise.errors.narrowest
     found, value = associate(objective, T_world_object, rules.association, narrowest)
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
     noise = noise_of(found, free, before, rules.noise)
+    blind = [replace(one, shares=np.zeros(len(one.features))) for one in unmet]
+    variances = np.append(noise.variances, np.ones(len(blind)))
+    size = 2 * objective.projection.body.radius
+    evidence = log_evidence([*found, *blind], variances, free, prior, size, rules.detection)
     count = len(found)
     return Judged(
         T_world_object=T_world_object,
@@ -114,7 +121,7 @@ def judge(
         coverage=sum(one.coverage for one in found) / count,
         measurements=sum(one.measurements for one in found),
         covariance=noise.covariance,
-        log_evidence=log_evidence(found, noise.variances, free, prior, rules.detection),
+        log_evidence=evidence,
         residuals=noise.remembered,
         associations=tuple(found),
         value=value,

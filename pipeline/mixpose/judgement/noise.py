@@ -71,10 +71,10 @@ class NoiseModel:
         "action cameras 0.25-0.4)",
     )
 
-    def unseen(self, associations: Sequence[Association]) -> Moments:
-        """What is believed of lasting errors, as moments: those of one field of a sensor."""
-        weight = self.lasting_fields * np.mean([one.met for one in associations]) ** 2
-        return Moments(fields=float(weight) * self.lasting**2, twice=float(weight))
+    def unseen(self, met: float) -> Moments:
+        """What is believed of lasting errors, as moments; a sensor meets so many features."""
+        weight = self.lasting_fields * met**2
+        return Moments(fields=weight * self.lasting**2, twice=weight)
 
     def enlargement(self, directions: int, degrees: float) -> float:
         """Factor that makes the Gaussian ellipsoid as large as that of the F distribution.
@@ -175,24 +175,26 @@ def noise_of(
     known = [before.noise.get(one.name, Noise()) for one in associations]
     past = np.array([(one.squares, one.degrees) for one in known]).T
     sums, rest = model.memory * past, None
-    seen = errors_seen(offsets, count, *sums, model.errors)
+    seen = errors_seen(offsets, count, sums, model.errors)
     if _is_outdone(past, seen, model):
         sums, rest = np.zeros_like(past), model.forgetting * past
-        seen = errors_seen(offsets, count, *sums, model.errors)
-    sums = sums + np.array([seen.squares, seen.degrees])
+        seen = errors_seen(offsets, count, sums, model.errors)
+    sums = sums + seen.own
     degrees = float(sums[1].sum())
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
-    variances = np.maximum(pooled(*sums, model.errors, typical), model.smallest**2)
+    variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
     own, independent, lasting = _moments(associations, offsets, variances, free, model)
     moments = before.moments.joined(own, model.memory)
-    believed = model.unseen(associations)
+    met = float(np.mean([one.met for one in associations]))
+    believed = model.unseen(met)
     s2, t2 = moments.joined(believed, 1.0).variances()
     # fields last: no further frame shows more of them
-    fields = (own.once + np.sqrt(model.lasting_fields*believed.twice)) ** 2 / max(own.twice + believed.twice, 1e-12)
-    t2 *= model.enlargement(count, float(fields))
-    s2 *= model.enlargement(count, degrees)
+    fields = (own.once + model.lasting_fields * met) ** 2 / max(own.twice + believed.twice, 1e-12)
     covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = s2 * independent + t2 * lasting
+    covariance[np.ix_(free, free)] = (
+        model.enlargement(count, degrees) * s2 * independent
+        + model.enlargement(count, fields) * t2 * lasting
+    )
     told = sums if rest is None else rest
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
     return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
@@ -211,10 +213,11 @@ def _offsets(associations: Sequence[Association]) -> Offsets:
 
 def _is_outdone(past: Floats, seen: Seen, model: NoiseModel) -> bool:
     """Whether a frame's residuals are larger than chance makes them."""
-    known, degrees = float(past[1].sum()), float(seen.degrees.sum())
+    known, degrees = float(past[1].sum()), float(seen.own[1].sum())
     if known < model.known or degrees < 1:
         return False
-    ratio = seen.squares @ (1 / np.maximum(pooled(*past, model.errors, 0.0), 1e-12)) / degrees
+    before = np.maximum(pooled(past, model.errors, 0.0), model.smallest**2)
+    ratio = float((seen.own[0] / before).sum()) / degrees
     return bool(ratio > fdtri(degrees, known, model.by_chance))
 
 

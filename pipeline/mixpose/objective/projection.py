@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.objective.markers import MarkerBatch
 from mixpose.sensors import Sensor, facing, side_by_side
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -62,13 +63,18 @@ class BodyProjection:
         self._weights = body.nodes.weights
         self._normals = body.node_normals
         self._batch = side_by_side(self.sensors)
+        sized = body.node_radii is not None and bool(body.node_radii.any())
+        self._markers = MarkerBatch(self.sensors, body, self._batch) if sized else None
 
     def project(self, poses: Floats) -> Projected:
         """Where the sensors see the body at poses (H, 4, 4)."""
         H, n, L = len(poses), len(self._points), len(self.sensors)
         arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
         world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
-        y, by_world, visible = self._batch.linearise(world)
+        if self._markers is None:
+            y, by_world, visible = self._batch.linearise(world)
+        else:
+            y, by_world, visible = self._markers.linearise(poses, world)
         J = pose_jacobian(by_world, arms.reshape(-1, 3)).reshape(L, H, n, 2, 6)
         seen = visible.reshape(L, H, n)
         if self._normals is None:

@@ -17,6 +17,7 @@ from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours, refuse_foreign, sign_video, write_png
 from mixpose.records import Estimate, FrameSet
 from mixpose.session import Session
+from mixpose.whole_files import partial_of
 
 CODECS = {".mp4": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 """Codecs by extension, of those that OpenCV's wheels bring along."""
@@ -56,6 +57,7 @@ class Overlay:
     def __init__(self, session: Session, path: Path, *, resume: bool = False) -> None:
         self._session = session
         self._sink = _sink(path, resume)
+        self._estimates: list[Estimate] = []
 
     def __enter__(self) -> Overlay:
         return self
@@ -69,9 +71,12 @@ class Overlay:
         self._sink.close()
 
     def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        """Draw one frame."""
-        picture = draw_scene(self._session, frame_set, estimate)
-        self._sink.add(picture, estimate.frame, estimate.time_s)
+        """Draw one frame, with the last of its bodies."""
+        self._estimates.append(estimate)
+        if len(self._estimates) == len(self._session.labels):
+            picture = draw_scene(self._session, frame_set, *self._estimates)
+            self._sink.add(picture, estimate.frame, estimate.time_s)
+            self._estimates = []
 
 
 def _sink(path: Path, resume: bool) -> Sink:
@@ -133,10 +138,11 @@ class VideoSink:
 
     def __init__(self, path: Path) -> None:
         refuse_foreign(path, "--overlay")
-        self._path = path
+        self._path, self._part = path, partial_of(path)
         self._first: tuple[Picture, float | None] | None = None
         self._writer: cv2.VideoWriter | None = None
         self._size = (0, 0)
+        self._count = 0
 
     def add(self, picture: Picture, frame: int, time_s: float | None) -> None:
         """Write the picture of a frame; the first waits for the second, which tells the rate."""
@@ -148,12 +154,34 @@ class VideoSink:
         self._write(picture)
 
     def close(self) -> None:
-        """Finish the file and sign it."""
+        """Finish the file, sign it and put it in its place: until then it has another name."""
         if self._first is not None:
             self._open(_DEFAULT_FPS)
-        if self._writer is not None:
-            self._writer.release()
-            sign_video(self._path)
+        if self._writer is None:
+            return
+        self._writer.release()
+        self._writer = None
+        try:
+            sign_video(self._part)
+            self._see_that_it_is_whole()
+            self._part.replace(self._path)
+        except OSError as error:
+            raise SessionError(
+                f"--overlay {self._path}: cannot be written: {error.strerror}"
+            ) from error
+        finally:
+            self._part.unlink(missing_ok=True)
+
+    def _see_that_it_is_whole(self) -> None:
+        """FFmpeg does not tell when a disk is full."""
+        written = cv2.VideoCapture(str(self._part))
+        count = int(written.get(cv2.CAP_PROP_FRAME_COUNT)) if written.isOpened() else 0
+        written.release()
+        if count < self._count - 1:  # containers that only estimate it may be one off
+            raise SessionError(
+                f"--overlay {self._path}: {count} of {self._count} frames could be written: is "
+                "the disk full?"
+            )
 
     def _open(self, fps: float) -> None:
         if self._first is None:
@@ -162,7 +190,7 @@ class VideoSink:
         # codecs want even sides
         self._size = picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2
         codec = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.casefold()])
-        self._writer = cv2.VideoWriter(str(self._path), codec, fps, self._size)
+        self._writer = cv2.VideoWriter(str(self._part), codec, fps, self._size)
         if not self._writer.isOpened():
             self._writer = None
             raise SessionError(
@@ -173,6 +201,7 @@ class VideoSink:
     def _write(self, picture: Picture) -> None:
         if self._writer is not None:
             self._writer.write(fit_into(picture, self._size))
+            self._count += 1
 
 
 def _rate(first: float | None, second: float | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -39,6 +40,12 @@ AXES: tuple[tuple[str, Colour], ...] = (
     ("y", (90, 230, 70)),
     ("z", (255, 150, 60)),
 )
+
+BODY_COLOURS: tuple[Colour, ...] = (
+    *((90, 230, 70), (255, 150, 60), (200, 90, 255), (60, 220, 255)),
+    *((230, 230, 90), (150, 120, 255), (120, 200, 140), (255, 120, 190)),
+)
+"""Of several bodies, in turn."""
 
 CHI2_95 = {1: 3.841, 2: 5.991}
 """Squared standard deviations that hold 95 % of a Gaussian of one or two coordinates."""
@@ -86,6 +93,7 @@ def draw_pose(
     part: Part = WHOLE,
     found: Floats | None = None,
     magnified: float = 1.0,
+    colour: Colour | None = None,
 ) -> Picture:
     """Draw a pose on a camera's frame.
 
@@ -111,6 +119,8 @@ def draw_pose(
         Features found in the frame, in pixels of the sensor; marked too.
     magnified : float
         Factor by which ellipses are drawn larger than they are.
+    colour : Colour or None
+        Of the features, where the status does not give it.
 
     Returns
     -------
@@ -124,7 +134,7 @@ def draw_pose(
     for place in part.places(found) if found is not None else ():
         cross(picture, place, 1.4 * radius, 2.2 * radius, FOUND)
     if T_world_object is not None:
-        colour = STATUS_COLOURS[status] if status is not None else STATUS_COLOURS["ok"]
+        colour = colour or STATUS_COLOURS[status or "ok"]
         _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
         _draw_features(picture, sensor, body, T_world_object, part, colour)
         _draw_axes(picture, sensor, body, T_world_object, part)
@@ -258,3 +268,12 @@ def caption(picture: Picture, status: Status | None, frame: int | None) -> None:
         u = words(picture, f"frame {frame}  ", (u, v), WHITE) + 0.3 * line_height(picture)
     if status is not None:
         words(picture, status, (u, v), STATUS_COLOURS[status])
+
+
+def legend(picture: Picture, bodies: Sequence[tuple[str, Status]], frame: int) -> None:
+    """Write the number of a frame, and each body with its status in its colour, in place."""
+    u, v = 0.5 * line_height(picture), 1.1 * line_height(picture)
+    words(picture, f"frame {frame}", (u, v), WHITE)
+    for k, (label, status) in enumerate(bodies):
+        colour = BODY_COLOURS[k % len(BODY_COLOURS)] if status != "lost" else GREY
+        words(picture, f"{label} {status}", (u, v + (k + 2) * line_height(picture)), colour)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import cv2
@@ -12,7 +13,7 @@ from mixpose.body import Body
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, line_height, ring, stroke, words
 from mixpose.pictures.display import displayable
 from mixpose.pictures.layout import columns_for, in_grid, stacked
-from mixpose.pictures.overlay import FOUND, Part, caption, draw_pose
+from mixpose.pictures.overlay import BODY_COLOURS, FOUND, Part, caption, draw_pose, legend
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
 from mixpose.records import Estimate, FrameSet, GridPattern, PointPattern, RawFrame
 from mixpose.session import SensorSetup, Session
@@ -25,8 +26,8 @@ _BLANK_SIZE = (640, 480)
 _DETECTION_PX = 2.5
 
 
-def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Picture:
-    """Draw the frames of all sensors with the pose that was estimated from them.
+def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> Picture:
+    """Draw the frames of all sensors with the poses that were estimated from them.
 
     Cameras stand side by side, range sensors are strips below them.
 
@@ -34,21 +35,23 @@ def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Pic
     ----------
     session : Session
     frame_set : FrameSet
-    estimate : Estimate
-        Of these frames.
+    *estimates : Estimate
+        Of these frames, one per body; each of several has a colour of its own.
 
     Returns
     -------
     (H, W, 3) uint8
         The same size for every frame, as long as the frames are.
     """
+    bodies = {one.body.name: one.body for one in session.objects}
+    posed = [(bodies.get(one.object, session.body), one) for one in estimates]
     cameras = [setup for setup in session.sensors if setup.sensor.dimension == 2]
     strips = [setup for setup in session.sensors if setup.sensor.dimension == 1]
     rows: list[Picture] = []
     if cameras:
         columns = columns_for(len(cameras))
         room = LARGEST[0] // columns, LARGEST[1] // -(-len(cameras) // columns)
-        panels = [_camera(session.body, one, frame_set, estimate, room) for one in cameras]
+        panels = [_camera(posed, one, frame_set, room) for one in cameras]
         for panel, setup in zip(panels, cameras, strict=True):
             if setup.name not in frame_set.frames:
                 _name(panel, f"{setup.name}: no frame", GREY)
@@ -57,9 +60,15 @@ def draw_scene(session: Session, frame_set: FrameSet, estimate: Estimate) -> Pic
         rows.append(in_grid(panels, columns))
     else:
         head = np.full((36, STRIP_SIZE[0], 3), BACKGROUND, np.uint8)
-        caption(head, estimate.status, estimate.frame)
+        caption(head, estimates[0].status if len(estimates) == 1 else None, estimates[0].frame)
         rows.append(head)
-    rows += [_strip(session.body, setup, frame_set, estimate) for setup in strips]
+    rows += [
+        _strip(body, setup, frame_set, estimate, f"{setup.name}, {estimate.label}")
+        if len(posed) > 1
+        else _strip(body, setup, frame_set, estimate, setup.name)
+        for setup in strips
+        for body, estimate in posed
+    ]
     return stacked(rows)
 
 
@@ -108,27 +117,33 @@ def _size_of(data: PointPattern | GridPattern | None) -> tuple[int, int]:
 
 
 def _camera(
-    body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate, room: tuple[int, int]
+    posed: Sequence[tuple[Body, Estimate]],
+    setup: SensorSetup,
+    frame_set: FrameSet,
+    room: tuple[int, int],
 ) -> Picture:
-    frame = frame_set.frames.get(setup.name)
-    picture, part = backdrop(setup, frame, room)
-    return draw_pose(
-        picture,
-        setup.sensor,
-        body,
-        estimate.T_world_object,
-        estimate.covariance,
-        estimate.status,
-        estimate.frame,
-        part=part,
-    )
+    picture, part = backdrop(setup, frame_set.frames.get(setup.name), room)
+    if len(posed) == 1:
+        body, one = posed[0]
+        T, covariance = one.T_world_object, one.covariance
+        return draw_pose(
+            picture, setup.sensor, body, T, covariance, one.status, one.frame, part=part
+        )
+    for k, (body, one) in enumerate(posed):
+        colour = BODY_COLOURS[k % len(BODY_COLOURS)]
+        T, covariance = one.T_world_object, one.covariance
+        picture = draw_pose(picture, setup.sensor, body, T, covariance, part=part, colour=colour)
+    legend(picture, [(one.label, one.status) for _, one in posed], posed[0][1].frame)
+    return picture
 
 
-def _strip(body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate) -> Picture:
+def _strip(
+    body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate, name: str
+) -> Picture:
     frame = frame_set.frames.get(setup.name)
     data = None if frame is None else frame.data
     return draw_ranges(
-        setup.name,
+        name,
         data if isinstance(data, PointPattern | GridPattern) else None,
         setup.sensor,
         body,

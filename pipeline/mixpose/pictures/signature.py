@@ -11,6 +11,7 @@ import numpy as np
 
 from mixpose.errors import SessionError
 from mixpose.pictures.canvas import Picture
+from mixpose.whole_files import appearing_whole
 
 SIGNATURE = b"mixpose picture"
 _PNG_HEAD = 33  # bytes of a PNG's signature and its first chunk
@@ -42,7 +43,8 @@ def write_signed(path: Path, png: bytes) -> None:
     body = b"tEXt" + b"Software\0" + SIGNATURE
     chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     try:
-        path.write_bytes(png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:])
+        with appearing_whole(path) as part:
+            part.write_bytes(png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:])
     except OSError as error:
         raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
 

@@ -29,10 +29,10 @@ SENSOR_COLUMNS = ("used", "explained", "rms")
 class CsvWriter:
     """Writes one row per frame; what a frame does not have is an empty cell.
 
-    Columns: frame, time_s, object, status, unit; the pose as position, quaternion and rotation
-    vector; the upper triangle of its covariance, row by row, ``cov_<a>_<b>`` in the axes of
-    `mixpose.rigid`; score; ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each
-    sensor; latency_ms.
+    Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
+    behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
+    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; score;
+    ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor; latency_ms.
 
     Parameters
     ----------
@@ -46,6 +46,7 @@ class CsvWriter:
         self._stream = stream
         self._rows = csv.writer(stream, lineterminator="\n")
         self._unit = header.unit
+        self._numbered = any(count > 1 for count in header.objects.values())
         self._sensors: tuple[str, ...] | None = None
         if header.sensors:
             self._write_columns(header.sensors)
@@ -68,6 +69,7 @@ class CsvWriter:
             estimate.frame,
             plain_or_none(estimate.time_s),
             estimate.object,
+            *([estimate.instance] if self._numbered else []),
             estimate.status,
             self._unit,
             *_pose_cells(estimate),
@@ -89,7 +91,9 @@ class CsvWriter:
         of_sensors = [f"{name}_{column}" for name in sensors for column in SENSOR_COLUMNS]
         self._rows.writerow(
             [
-                *FRAME_COLUMNS,
+                *FRAME_COLUMNS[:3],
+                *(["instance"] if self._numbered else []),
+                *FRAME_COLUMNS[3:],
                 *POSE_COLUMNS,
                 *COVARIANCE_COLUMNS,
                 "score",

@@ -25,6 +25,7 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         seed=found.get("seed", 0),
         symmetries=poses.symmetries,
         sensors=tuple(names),
+        objects=objects_of(poses.poses),
     )
 
 
@@ -41,7 +42,16 @@ def estimate_of(line: PoseLine) -> Estimate:
         sensors=line.sensors,
         hypotheses=line.hypotheses,
         latency_ms=0.0 if line.latency_ms is None else line.latency_ms,
+        instance=line.instance,
     )
+
+
+def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:
+    """Names of the bodies with how many there are of each, in the order of the lines."""
+    counts: dict[str, int] = {}
+    for line in lines:
+        counts[line.object] = max(counts.get(line.object, 1), (line.instance or 0) + 1)
+    return counts
 
 
 def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
@@ -64,8 +74,8 @@ def relative_to(T_sensor_world: Floats, estimate: Estimate) -> Estimate:
 
 
 def first_answers(lines: Iterable[PoseLine]) -> list[PoseLine]:
-    """The first line of each frame and object; in a truth file others may be equally right."""
+    """The first line of each frame and body; in a truth file others may be equally right."""
     first: dict[tuple[int, str], PoseLine] = {}
     for line in lines:
-        first.setdefault((line.frame, line.object), line)
+        first.setdefault((line.frame, line.label), line)
     return list(first.values())

@@ -20,7 +20,7 @@ position error is that of the object's origin.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -29,10 +29,11 @@ from scipy.special import chdtri
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.header import length_ratio
+from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Floats, Hypothesis, Status
+from mixpose.poses.units import in_unit
+from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5
 CONFIDENCE = 0.95
@@ -42,7 +43,7 @@ FrameKey: TypeAlias = tuple[int, str]
 
 @dataclass(frozen=True)
 class FrameError:
-    """What one frame's pose is worth.
+    """What one frame's pose of one body is worth; `object` numbers identical ones.
 
     Attributes
     ----------
@@ -122,6 +123,10 @@ class Evaluation:
         Over ambiguous frames: the error of the best hypothesis.
     nees : Consistency or None
         None where no "ok" frame has a covariance.
+    bodies : mapping of str to Evaluation
+        Each body by itself, where there are several.
+    swaps : Swaps or None
+        None where no bodies are identical.
     """
 
     unit: str | None
@@ -139,6 +144,8 @@ class Evaluation:
     best_rotation_deg: Spread | None
     best_translation: Spread | None
     nees: Consistency | None
+    bodies: Mapping[str, Evaluation] = field(default_factory=dict)
+    swaps: Swaps | None = None
 
 
 def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
@@ -146,8 +153,10 @@ def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
     return evaluate(read_poses(poses), read_poses(truth))
 
 
-def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
+def evaluate(poses: PoseFile, truth: PoseFile, *, numbered: bool = False) -> Evaluation:
     """Compare poses with the truth.
+
+    `numbered` says that identical bodies have the numbers of the truth already.
 
     Errors are given in the unit of the poses; a file that states no unit is taken to be in
     that of the other.
@@ -158,7 +167,33 @@ def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
         If the truth holds no pose, the files have no object in common, or a frame stands twice
         in the poses.
     """
+    swaps = None
+    if not numbered:
+        poses, swaps = as_numbered(poses, truth)
     errors = errors_to_truth(poses, truth)
+    labels = list(dict.fromkeys(error.object for error in errors))
+    whole = _evaluation(poses, truth, errors)
+    if len(labels) == 1:
+        return replace(whole, swaps=swaps)
+    bodies = {}
+    for label in labels:
+        own = replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
+        some = [error for error in errors if error.object == label]
+        bodies[label] = _evaluation(own, truth, some)
+    return replace(whole, bodies=bodies, swaps=swaps)
+
+
+def as_numbered(poses: PoseFile, truth: PoseFile) -> tuple[PoseFile, Swaps | None]:
+    """Poses whose identical bodies have the numbers that they have in the truth."""
+    if all(line.instance is None for line in truth.poses):
+        return poses, None
+    unit = poses.unit or truth.unit
+    symmetries = {**poses.symmetries, **truth.symmetries}
+    lines, swaps = renumbered(poses.poses, in_unit(truth, unit).poses, symmetries)
+    return replace(poses, poses=lines), swaps
+
+
+def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) -> Evaluation:
     compared = {(error.frame, error.object) for error in errors}
     with_pose = [error for error in errors if error.twist is not None]
     twists = [(error.frame, error.twist) for error in with_pose if error.twist is not None]
@@ -175,8 +210,11 @@ def evaluate(poses: PoseFile, truth: PoseFile) -> Evaluation:
     return Evaluation(
         unit=poses.unit or truth.unit,
         frames=len(errors),
-        **counts,
-        without_truth=sum((line.frame, line.object) not in compared for line in poses.poses),
+        ok=counts["ok"],
+        ambiguous=counts["ambiguous"],
+        lost=counts["lost"],
+        missing=counts["missing"],
+        without_truth=sum((line.frame, line.label) not in compared for line in poses.poses),
         rotation_deg=rotation_deg,
         translation=translation,
         per_axis_rms=_per_axis_rms([twist for _, twist in twists]),
@@ -197,7 +235,8 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
     Returns
     -------
     tuple of FrameError
-        One per frame and object of the truth, in its order, in the unit of the poses.
+        One per frame and body of the truth, in its order, in the unit of the poses.  Identical
+        bodies are taken by their numbers.
 
     Raises
     ------
@@ -205,16 +244,17 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
         As `evaluate`.
     """
     unit = poses.unit or truth.unit
-    truth = _in_unit(truth, unit)
+    truth = in_unit(truth, unit)
     symmetries = {**poses.symmetries, **truth.symmetries}
     answers: dict[FrameKey, list[Floats]] = {}
     for line in truth.poses:
         if line.T_world_object is not None:
-            answers.setdefault((line.frame, line.object), []).append(line.T_world_object)
+            answers.setdefault((line.frame, line.label), []).append(line.T_world_object)
+    names = {line.label: line.object for line in truth.poses}
     lines = _by_frame(poses)
     _check_comparable(poses, truth, {name for _, name in answers})
     return tuple(
-        _frame_error(key, lines.get(key), _right_answers(found, symmetries.get(key[1])))
+        _frame_error(key, lines.get(key), _right_answers(found, symmetries.get(names[key[1]])))
         for key, found in answers.items()
     )
 
@@ -222,10 +262,10 @@ def errors_to_truth(poses: PoseFile, truth: PoseFile) -> tuple[FrameError, ...]:
 def _by_frame(poses: PoseFile) -> dict[FrameKey, PoseLine]:
     lines: dict[FrameKey, PoseLine] = {}
     for line in poses.poses:
-        earlier = lines.setdefault((line.frame, line.object), line)
+        earlier = lines.setdefault((line.frame, line.label), line)
         if earlier is not line:
             raise RecordingError(
-                f"{poses.path}:{line.line}: frame {line.frame} of {line.object!r} stands in line "
+                f"{poses.path}:{line.line}: frame {line.frame} of {line.label!r} stands in line "
                 f"{earlier.line} already; poses have one line per frame (only truth has several)"
             )
     return lines
@@ -234,7 +274,7 @@ def _by_frame(poses: PoseFile) -> dict[FrameKey, PoseLine]:
 def _check_comparable(poses: PoseFile, truth: PoseFile, true_objects: set[str]) -> None:
     if not true_objects:
         raise RecordingError(f"{truth.path}: holds no pose, so there is nothing to compare with")
-    objects = {line.object for line in poses.poses}
+    objects = {line.label for line in poses.poses}
     if objects and not objects & true_objects:
         raise RecordingError(
             f"{poses.path}: holds poses of {_names(objects)}, but {truth.path} of "
@@ -244,35 +284,6 @@ def _check_comparable(poses: PoseFile, truth: PoseFile, true_objects: set[str]) 
 
 def _names(objects: set[str]) -> str:
     return ", ".join(repr(name) for name in sorted(objects))
-
-
-def _in_unit(file: PoseFile, unit: str | None) -> PoseFile:
-    """The same motions with their lengths in another unit, if the file states its own."""
-    if unit is None or file.unit is None or file.unit == unit:
-        return file
-    ratio = length_ratio(file.unit, unit)
-
-    def scaled(T: Floats) -> Floats:
-        return rigid.from_parts(T[..., :3, :3], T[..., :3, 3] * ratio)
-
-    twist_scale = np.array([ratio] * 3 + [1.0] * 3)
-    lines = tuple(
-        replace(
-            line,
-            T_world_object=None if line.T_world_object is None else scaled(line.T_world_object),
-            covariance=(
-                None
-                if line.covariance is None
-                else line.covariance * twist_scale[:, None] * twist_scale
-            ),
-            hypotheses=tuple(
-                Hypothesis(scaled(rival.T_world_object), rival.weight) for rival in line.hypotheses
-            ),
-        )
-        for line in file.poses
-    )
-    symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}
-    return replace(file, poses=lines, unit=unit, symmetries=symmetries)
 
 
 def _right_answers(truths: Sequence[Floats], symmetries: Floats | None) -> Floats:

@@ -23,6 +23,9 @@ class PoseWriter(Protocol):
         """Write what is still due and flush; the stream stays open."""
 
 
+ONE_TRAJECTORY = ("tum", "ros")
+"""Formats whose files hold one body each."""
+
 # each is called with a text stream and a `Header`; BOP and ROS have options of their own
 FORMATS: Mapping[str, Callable[..., PoseWriter]] = {
     "jsonl": JsonlWriter,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from mixpose.records import Floats
+from mixpose.records import Floats, label_of
 
 FORMAT = "mixpose-poses"
 VERSION = 1
@@ -35,6 +35,9 @@ class Header:
     sources : mapping of str to str
         Recordings given in place of the session's, by sensor name; the line has them only where
         there are any.
+    objects : mapping of str to int
+        Names of all bodies with how many there are of each, in the order of their pose lines;
+        the line has them only where there are several.  Empty: not known.
     sensors : tuple of str
         Names of all sensors of the session, in its order.  Only the CSV table needs them, for
         its columns; they are not written into JSON lines.
@@ -48,6 +51,16 @@ class Header:
     symmetries: Mapping[str, Floats] = field(default_factory=dict, compare=False)
     sources: Mapping[str, str] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
+    objects: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all bodies, identical ones numbered."""
+        return tuple(
+            label_of(name, instance)
+            for name, count in self.objects.items()
+            for instance in (range(count) if count > 1 else (None,))
+        )
 
 
 def length_ratio(from_unit: str, to_unit: str) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,6 +70,8 @@ def _header_line(header: Header) -> dict[str, Any]:
         "seed": header.seed,
         "symmetries": {name: plain(motions) for name, motions in header.symmetries.items()},
     }
+    if len(header.labels) > 1:
+        line["objects"] = dict(header.objects)
     if header.sources:
         line["sources"] = dict(header.sources)
     return line
@@ -83,6 +86,7 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
         "frame": int(estimate.frame),  # NumPy integers are no JSON
         "time_s": plain_or_none(estimate.time_s),
         "object": estimate.object,
+        **({} if estimate.instance is None else {"instance": int(estimate.instance)}),
         "status": estimate.status,
         "T_world_object": plain_or_none(T),
         "quaternion_xyzw": plain_or_none(turn),
@@ -178,28 +182,48 @@ def _is_json(line: bytes) -> bool:
     return True
 
 
-def resume_point(path: str | Path, header: Header) -> int | None:
-    """Find the frame that an interrupted run wrote last, and drop a half-written line after it.
+@dataclass(frozen=True)
+class ResumePoint:
+    """The last whole line of an interrupted run.
+
+    Attributes
+    ----------
+    frame : int
+        Its frame.
+    lines : int
+        Lines of this frame.
+    size, checksum : int
+        Of the file up to its end: bytes and CRC-32.
+    """
+
+    frame: int
+    lines: int
+    size: int
+    checksum: int
+
+
+def resume_point(path: str | Path, header: Header) -> ResumePoint | None:
+    """Find the frame that an interrupted run wrote last.
 
     Parameters
     ----------
     path : path
-        What the interrupted run wrote.
+        What the interrupted run wrote; it is left as it is.
     header : Header
         Header of the run that is to go on.
 
     Returns
     -------
-    int or None
-        Number of the last whole frame; the caller appends with ``JsonlWriter(..., resume=True)``.
-        None where no frame is whole or no file is there: the caller writes the file afresh.
+    ResumePoint or None
+        What follows it is a half-written line, to be cut off.  None where no frame is whole or no
+        file is there: the caller writes the file afresh.
 
     Raises
     ------
     SessionError
         If the file is of another session, seed, unit, recording or version of mixpose.
     RecordingError
-        If the file is not a poses file; it is left as it is.
+        If the file is not a poses file.
     """
     path = Path(path)
     if not path.exists():
@@ -214,13 +238,22 @@ def resume_point(path: str | Path, header: Header) -> int | None:
         _check_same_run(path, so_far.header, header)
     if not so_far.poses:
         return None
-    if whole < len(data):
-        try:
-            with path.open("r+b") as stream:
-                stream.truncate(whole)
-        except OSError as error:
-            raise RecordingError(f"{path}: {error.strerror}, so no run can go on in it") from error
-    return so_far.poses[-1].frame
+    frame, whole = _last_whole_frame(so_far, data[:whole], len(header.labels))
+    if frame is None:
+        return None
+    lines = sum(line.frame == frame for line in so_far.poses)
+    return ResumePoint(frame, lines, whole, zlib.crc32(data[:whole]))
+
+
+def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | None, int]:
+    """The last frame that has a line for each body, and the length of the file up to there."""
+    poses, whole = file.poses, len(data)
+    last = [pose for pose in poses if pose.frame == poses[-1].frame]
+    if len(last) >= bodies:
+        return poses[-1].frame, whole
+    lines = data.split(b"\n")
+    before = poses[-len(last) - 1].frame if len(poses) > len(last) else None
+    return before, sum(len(line) + 1 for line in lines[: last[0].line - 1])
 
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import FORMAT, UNITS_PER_METRE, VERSION
-from mixpose.records import Floats, Hypothesis, SensorReport, Status
+from mixpose.records import Floats, Hypothesis, SensorReport, Status, label_of
 
 # Files by other people round their rotations to a few digits.
 RIGID_TOLERANCE = 1e-3
@@ -42,6 +42,12 @@ class PoseLine:
     sensors: Mapping[str, SensorReport]
     hypotheses: tuple[Hypothesis, ...]
     latency_ms: float | None
+    instance: int | None = None
+
+    @property
+    def label(self) -> str:
+        """The body in one word."""
+        return label_of(self.object, self.instance)
 
 
 _Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -69,6 +75,7 @@ class _Sensor(_Line):
 class _Pose(_Line):
     frame: int
     object: str
+    instance: Annotated[int, Field(ge=0)] | None = None
     time_s: float | None = None
     status: Status = "ok"
     T_world_object: _Matrix4 | None = None
@@ -84,6 +91,7 @@ class _Header(_Line):
     version: int = VERSION
     unit: str | None = None
     symmetries: dict[str, list[_Matrix4]] = {}
+    objects: dict[str, Annotated[int, Field(ge=1, le=10**6)]] = {}
 
 
 _Checked = TypeVar("_Checked", bound=_Line)
@@ -131,6 +139,7 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             for rival in pose.hypotheses
         ),
         latency_ms=pose.latency_ms,
+        instance=pose.instance,
     )
 
 

@@ -51,16 +51,53 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
             "mean_per_dimension": nees.nees_per_dimension,
             "inside_95": nees.inside_95,
         },
+        **_of_several(evaluation),
     }
+
+
+def _of_several(evaluation: Evaluation) -> dict[str, Any]:
+    """What an evaluation says only where there are several bodies."""
+    found: dict[str, Any] = {}
+    if evaluation.bodies:
+        found["bodies"] = {label: as_dict(one) for label, one in evaluation.bodies.items()}
+    if evaluation.swaps is not None:
+        swaps = evaluation.swaps
+        found["swaps"] = {"count": swaps.count, "announced": swaps.announced}
+    return found
 
 
 def as_table(evaluation: Evaluation) -> str:
     """The evaluation as aligned plain text, several lines without a final newline."""
-    unit = evaluation.unit or "units"
-    lines = [
-        f"{evaluation.frames} frame{'s' * (evaluation.frames != 1)}: {evaluation.ok} ok, "
-        f"{evaluation.ambiguous} ambiguous, {evaluation.lost} lost, {evaluation.missing} missing"
+    if not evaluation.bodies:
+        return "\n".join([*_one_body(evaluation), *_swap_lines(evaluation)])
+    parts = [
+        f"{label}: " + "\n".join(_one_body(one)) + "\n" for label, one in evaluation.bodies.items()
     ]
+    everything = [f"all bodies: {_counts(evaluation, 'poses')}", *_swap_lines(evaluation)]
+    return "\n".join([*parts, *everything])
+
+
+def _counts(evaluation: Evaluation, word: str) -> str:
+    word = word if evaluation.frames != 1 else word.removesuffix("s")
+    return (
+        f"{evaluation.frames} {word}: {evaluation.ok} ok, {evaluation.ambiguous} ambiguous, "
+        f"{evaluation.lost} lost, {evaluation.missing} missing"
+    )
+
+
+def _swap_lines(evaluation: Evaluation) -> list[str]:
+    swaps = evaluation.swaps
+    if swaps is None:
+        return []
+    return [
+        f"identical bodies: {swaps.count} swap{'s' * (swaps.count != 1)}, {swaps.announced} of "
+        "them announced (not ok before or where it happened)"
+    ]
+
+
+def _one_body(evaluation: Evaluation) -> list[str]:
+    unit = evaluation.unit or "units"
+    lines = [_counts(evaluation, "frames")]
     if evaluation.without_truth:
         many = evaluation.without_truth != 1
         lines.append(
@@ -86,7 +123,7 @@ def as_table(evaluation: Evaluation) -> str:
             f"squared error per dimension {nees.nees_per_dimension:.3g} (right: 1), "
             f"inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %",
         ]
-    return "\n".join(lines)
+    return lines
 
 
 def _spread_lines(evaluation: Evaluation, unit: str) -> list[str]:

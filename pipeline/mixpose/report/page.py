@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mixpose.errors import SessionError
-from mixpose.poses.evaluate import Evaluation, evaluate
+from mixpose.poses.evaluate import Evaluation, as_numbered, evaluate
 from mixpose.poses.jsonl import PoseFile
 from mixpose.records import Floats, Status
 from mixpose.report.origin import Origin, find_session
 from mixpose.report.series import Series, errors_of, frame_ranges, series_of
 
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
 MARK = '<meta name="generator" content="mixpose report'
 """By which a page is known as one of ours."""
 
-_TEMPLATE = "page.html.j2"
+_TEMPLATE, _BODY_TEMPLATE = "page.html.j2", "body.html.j2"
 _STATUSES: tuple[Status, ...] = ("ok", "ambiguous", "lost")
 _MOST_RANGES = 40
 
@@ -80,7 +83,7 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     SessionError
         If a library is missing.
     RecordingError
-        If the poses are of several objects, or cannot be compared with the truth.
+        If the poses cannot be compared with the truth.
     """
     require_libraries()
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
@@ -93,18 +96,58 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
         lstrip_blocks=True,
     )
     return environment.get_template(_TEMPLATE).render(
-        mark=MARK, version=version, **_content(poses, truth, cut)
+        mark=MARK, version=version, **_content(poses, truth, cut, environment)
     )
 
 
-def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, Any]:
+def _content(
+    poses: PoseFile, truth: PoseFile | None, cut: bool, environment: Environment
+) -> dict[str, Any]:
+    """What is said once, and the parts of the page about each body."""
+    labels = list(dict.fromkeys(line.label for line in poses.poses))
+    origin, swaps = find_session(poses), None
+    if truth is not None and len(labels) > 1:
+        poses, swaps = as_numbered(poses, truth)
+    files = [poses]
+    if len(labels) > 1:
+        files = [
+            replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
+            for label in labels
+        ]
+    from markupsafe import Markup  # noqa: PLC0415
+
+    template = environment.get_template(_BODY_TEMPLATE)
+    parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
+    for k, content in enumerate(contents):
+        at = f"-{k + 1}" if len(files) > 1 else ""
+        parts.append(Markup(template.render(at=at, truth=truth, **content)))
+    counts = [[count for _, count in content["counts"]] for content in contents]
+    return {
+        "name": _name(poses),
+        "truth": truth,
+        "facts": _facts(poses, labels),
+        "notices": contents[0]["notices"] if len(files) == 1 else [],
+        "counts": list(zip(_STATUSES, map(sum, zip(*counts, strict=True)), strict=True)),
+        "swaps": swaps,
+        "parts": parts,
+        "origin": origin,
+    }
+
+
+def _body_content(
+    poses: PoseFile, truth: PoseFile | None, cut: bool, origin: Origin
+) -> dict[str, Any]:
+    """What the page says about one body."""
     from mixpose.report import figures  # noqa: PLC0415 - needs matplotlib
     from mixpose.report.overlays import overlay_frames  # noqa: PLC0415
 
     series = series_of(poses)
     errors = None if truth is None else errors_of(series, poses, truth)
-    evaluation = None if truth is None else evaluate(poses, truth)
-    origin = find_session(poses)
+    evaluation = None if truth is None else _own_evaluation(poses, truth, series.label)
+    if origin.session is not None and len(origin.session.labels) > 1:
+        names = [one.body.name for one in origin.session.objects]
+        own = origin.session.alone(series.object) if series.object in names else None
+        origin = replace(origin, session=own)
     overlays, overlay_notices = (
         ([], [])
         if origin.session is None
@@ -113,11 +156,7 @@ def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, An
     unit_of = _unit_of(origin, series)
     has_poses = bool(np.any(series.status != "lost"))
     return {
-        "name": _name(poses),
-        "poses": poses,
-        "truth": truth,
         "series": series,
-        "facts": _facts(poses, series),
         "notices": _notices(poses, series, cut),
         "counts": [(status, int(np.sum(series.status == status))) for status in _STATUSES],
         "ranges": [(status, _ranges_text(series, status)) for status in _STATUSES[1:]],
@@ -131,8 +170,13 @@ def _content(poses: PoseFile, truth: PoseFile | None, cut: bool) -> dict[str, An
         "latency_charts": figures.latency(series),
         "overlays": overlays,
         "overlay_notices": overlay_notices,
-        "origin": origin,
     }
+
+
+def _own_evaluation(poses: PoseFile, truth: PoseFile, label: str) -> Evaluation:
+    """The evaluation of one body, of which alone the poses are; the truth may hold others."""
+    own = tuple(line for line in truth.poses if line.label == label)
+    return evaluate(poses, replace(truth, poses=own or truth.poses), numbered=True)
 
 
 def _name(poses: PoseFile) -> str:
@@ -142,10 +186,13 @@ def _name(poses: PoseFile) -> str:
     return "/".join(path.parts[-2:])
 
 
-def _facts(poses: PoseFile, series: Series) -> list[tuple[str, str]]:
+def _facts(poses: PoseFile, labels: Sequence[str]) -> list[tuple[str, str]]:
     header = poses.header
     facts = [("Poses", str(poses.path)), ("Session", header.get("session"))]
-    facts += [("Object", series.object or None), ("Unit", poses.unit)]
+    facts += [
+        ("Objects" if len(labels) > 1 else "Object", ", ".join(labels) or None),
+        ("Unit", poses.unit),
+    ]
     facts += [("mixpose", header.get("mixpose")), ("Seed", header.get("seed"))]
     return [(name, str(value)) for name, value in facts if value is not None]
 

@@ -35,6 +35,8 @@ class Series:
     Attributes
     ----------
     object : str
+    label : str
+        The body in one word.
     unit : str
         Unit of lengths; "units" where the file does not say it.
     frames : tuple of int
@@ -58,6 +60,7 @@ class Series:
     """
 
     object: str
+    label: str
     unit: str
     frames: tuple[int, ...]
     x: Floats
@@ -102,11 +105,10 @@ def series_of(file: PoseFile) -> Series:
         If the file holds poses of several objects.
     """
     lines = sorted(file.poses, key=lambda line: line.frame)
-    names = sorted({line.object for line in lines})
+    names = sorted({line.label for line in lines})
     if len(names) > 1:
         raise RecordingError(
-            f"{file.path}: holds poses of {', '.join(map(repr, names))}; a report is about one "
-            "object, so split the file"
+            f"{file.path}: holds poses of {', '.join(map(repr, names))}; a series is of one body"
         )
     T = np.array([_matrix(line) for line in lines], dtype=np.float64).reshape(-1, 4, 4)
     status = np.array([line.status for line in lines], dtype=np.str_)
@@ -116,7 +118,8 @@ def series_of(file: PoseFile) -> Series:
     timed = len(lines) > 0 and bool(np.all(np.isfinite(times)))
     sensors = list(dict.fromkeys(name for line in lines for name in line.sensors))
     return Series(
-        object=names[0] if names else "",
+        object=lines[0].object if lines else "",
+        label=names[0] if names else "",
         unit=file.unit or "units",
         frames=frames,
         x=times if timed else np.array(frames, dtype=np.float64),
@@ -142,10 +145,11 @@ def errors_of(series: Series, poses: PoseFile, truth: PoseFile) -> Errors:
     RecordingError
         If the files cannot be compared.
     """
-    by_frame = {error.frame: error.twist for error in errors_to_truth(poses, truth)}
+    found = errors_to_truth(poses, truth)
+    by_frame = {error.frame: error.twist for error in found if error.object == series.label}
     nothing = np.full(6, np.nan)
-    found = [by_frame.get(frame) for frame in series.frames]
-    twists = np.array([nothing if twist is None else twist for twist in found]).reshape(-1, 6)
+    each = [by_frame.get(frame) for frame in series.frames]
+    twists = np.array([nothing if twist is None else twist for twist in each]).reshape(-1, 6)
     position = series.position - twists[:, :3]
     turned = np.full_like(position, np.nan)
     known = np.isfinite(twists[:, 0])

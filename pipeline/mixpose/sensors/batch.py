@@ -21,9 +21,10 @@ class SensorBatch(Protocol):
     """L sensors side by side; those of one coordinate have 0 as their second."""
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """Coordinates (L, n, 2), Jacobians (L, n, 2, 3) and visibility (L, n) of points (n, 3).
+        """Coordinates (L, n, 2), Jacobians (L, n, 2, 3) and visibility (L, n) of points.
 
-        As `Sensor.linearise` gives them one by one.
+        As `Sensor.linearise` gives them one by one.  Points are (n, 3), or (L, n, 3) where each
+        sensor looks at its own.
         """
         ...
 
@@ -47,12 +48,13 @@ class MixedBatch:
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
-        L, n = len(self._sensors), len(points_world)
+        L, n = len(self._sensors), points_world.shape[-2]
+        each = np.broadcast_to(points_world, (L, n, 3))
         y, J = np.zeros((L, n, 2)), np.zeros((L, n, 2, 3))
         visible = np.empty((L, n), dtype=np.bool_)
         for k, sensor in enumerate(self._sensors):
             m = sensor.dimension
-            y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(points_world)
+            y[k, :, :m], J[k, :, :m], visible[k] = sensor.linearise(each[k])
         return y, J, visible
 
 
@@ -84,7 +86,7 @@ class PinholeBatch:
         self._count = len(cameras)
         self._rows = T[:, :3, :3].reshape(-1, 3)
         self._upper_rows, self._last_row = T[:, None, :2, :3], T[:, None, 2:3, :3]
-        self._t = T[:, :3, 3].reshape(-1, 1)
+        self._t = T[:, :3, 3, None]
         K = np.array([camera.camera_matrix for camera in cameras])
         self._K = K[:, None, :2, :2]
         self._K_transposed = K[:, :2, :2].swapaxes(1, 2).copy()
@@ -94,9 +96,11 @@ class PinholeBatch:
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
-        points = self._rows @ points_world.T
+        if points_world.ndim == 2:
+            points = (self._rows @ points_world.T).reshape(self._count, 3, -1)
+        else:
+            points = self._rows.reshape(self._count, 3, 3) @ points_world.swapaxes(1, 2)
         points += self._t
-        points = points.reshape(self._count, 3, -1)
         depth = points[:, 2]
         in_front = depth > NEAREST
         everything = np.count_nonzero(in_front) == in_front.size

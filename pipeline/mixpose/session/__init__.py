@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from mixpose.session.reader import load_session
-from mixpose.session.setup import SensorSetup, Session, Start
+from mixpose.session.setup import ObjectSetup, SensorSetup, Session, Start
 
-__all__ = ["SensorSetup", "Session", "Start", "load_session"]
+__all__ = ["ObjectSetup", "SensorSetup", "Session", "Start", "load_session"]

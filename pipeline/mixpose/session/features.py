@@ -10,17 +10,19 @@ import numpy as np
 from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import Floats
 from mixpose.session.arrays import is_number, numbers
-from mixpose.session.markers import Markers, read_markers
+from mixpose.session.marker_files import read_marker_file
+from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError, found, in_file, show, under
 from mixpose.session.schema import ObjectTable
-from mixpose.session.values import SIGMA_ALLOWED
+from mixpose.session.setup import Unit
+from mixpose.session.values import RADIUS_ALLOWED, SIGMA_ALLOWED
 
 FEWEST_FEATURES = 3
 
 _SYMMETRY = 1e-6  # rounding of a covariance, relative to its largest entry
 
 
-def build_body(table: ObjectTable, folder: Path) -> Body:
+def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     """Build the object model; points come first, then segments.
 
     Parameters
@@ -28,13 +30,15 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     table : ObjectTable
     folder : Path
         What the marker file's path is relative to.
+    unit : {"m", "cm", "mm", "um"}
+        Of the session, into which lengths of other programs' files are converted.
 
     Raises
     ------
     BadKeyError
         If there are fewer than three features, or spread or normals do not fit them.
     """
-    markers = _markers(table, folder)
+    markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
@@ -64,8 +68,32 @@ def build_body(table: ObjectTable, folder: Path) -> Body:
     features: list[Feature] = [PointFeature(z, C, kind) for z, C in zip(points, spreads)]
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
-    normals = _normals(table.normals, count)
-    return Body(table.name, tuple(features), normals, _gravity(table))
+    normals = _normals(_stated_normals(table, markers, count), count)
+    radii = _radii(table, normals, len(points), count)
+    return Body(table.name, tuple(features), normals, _gravity(table), table.shape, radii)
+
+
+def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) -> Floats | None:
+    """Radii (N,) of spheres or disks, 0 for segments; None for points."""
+    if table.shape == "point":
+        if table.radius is not None:
+            raise BadKeyError(
+                'stands beside shape = "point"; allowed: a shape that has one', "radius"
+            )
+        return None
+    if table.radius is None:
+        raise BadKeyError(f'missing; shape = "{table.shape}" needs {RADIUS_ALLOWED}', "radius")
+    if table.shape == "disk" and normals is None:
+        raise BadKeyError('missing; shape = "disk" needs the normal of each disk', "normals")
+    with under("radius"):
+        given = table.radius if isinstance(table.radius, list) else [table.radius] * points
+        own = numbers(given, (None,), RADIUS_ALLOWED)
+        if len(own) != points:
+            text = f"found {len(own)} radii for {points} points"
+            raise BadKeyError(f"{text}; allowed: {RADIUS_ALLOWED}")
+        if (own <= 0).any():
+            raise BadKeyError(f"found {own.min():g}; allowed: {RADIUS_ALLOWED}, greater than 0")
+    return np.concatenate([own, np.zeros(count - points)])
 
 
 def _gravity(table: ObjectTable) -> Gravity | None:
@@ -80,12 +108,12 @@ def _gravity(table: ObjectTable) -> Gravity | None:
     return Gravity(table.gravity.direction, table.gravity.sigma)
 
 
-def _markers(table: ObjectTable, folder: Path) -> Markers | None:
+def _markers(table: ObjectTable, folder: Path, unit: Unit) -> Markers | None:
     if table.file is not None:
         if table.points is not None:
             raise BadKeyError("stands beside points; allowed: one of the two", "file")
         with under("file"):
-            return read_markers(folder / table.file)
+            return read_marker_file(folder / table.file, unit)
     if table.points is not None:
         return Markers(table.points, None)
     if table.segments is None:
@@ -197,6 +225,13 @@ def _positive(covariance: Floats) -> Floats:
             "whose eigenvalues is negative"
         )
     return covariance
+
+
+def _stated_normals(table: ObjectTable, markers: Markers | None, count: int) -> Floats | None:
+    """Those of the session, else those of the marker file where it has all features."""
+    if table.normals is not None or markers is None or markers.normals is None:
+        return table.normals
+    return markers.normals if len(markers.normals) == count else None
 
 
 def _normals(normals: Floats | None, count: int) -> Floats | None:

@@ -29,10 +29,16 @@ class Markers:
     sigma : list or None
         Per marker a number, [sx, sy, sz] or a 3x3 covariance, as the key ``sigma`` has them;
         None where the table has no such columns.
+    names : tuple of str
+        Of the markers, where the file has names.
+    normals : (N, 3) float64 or None
+        Outward directions of flat markers, where the file has them.
     """
 
     points: Floats
     sigma: list[Any] | None
+    names: tuple[str, ...] = ()
+    normals: Floats | None = None
 
 
 def read_markers(path: Path) -> Markers:
@@ -63,7 +69,8 @@ def read_markers(path: Path) -> Markers:
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
     if not len(values):
         raise BadKeyError(f"{path.name}: found no markers below the header")
-    return Markers(values[:, :3], _sigma_of(values[:, 3:]))
+    names = tuple(row[0].strip() for _, row in rows[1:])
+    return Markers(values[:, :3], _sigma_of(values[:, 3:]), names)
 
 
 def _check_header(header: list[str]) -> None:

@@ -80,24 +80,24 @@ def _toml(value: object) -> str:
     return str(value)
 
 
-def dotted(key: Key, sensor_names: Iterable[object] = ()) -> str:
+def dotted(key: Key, named: Iterable[object] = ()) -> str:
     """Write a key as ``sensor["left"].T_sensor_world[2]``.
 
     Parameters
     ----------
     key : tuple
         Path to the value.
-    sensor_names : iterable
-        What the session gives as names of its sensors; one that is unique text stands in place
-        of the sensor's number.
+    named : iterable
+        What the session gives as names of its sensors, or of its bodies, whichever the key is of;
+        one that is unique text stands in place of the number.
     """
-    names = list(sensor_names)
+    names = list(named)
     parts: list[str] = []
     for i, part in enumerate(key):
         if isinstance(part, str):
             parts.append(f".{part}" if parts else part)
             continue
-        name = names[part] if i == 1 and key[0] == "sensor" and part < len(names) else None
+        name = names[part] if i == 1 and part < len(names) else None
         if isinstance(name, str) and name and names.count(name) == 1:
             parts.append(f"[{json.dumps(name, ensure_ascii=False)}]")
         else:
@@ -135,10 +135,13 @@ def one_line(file: object, key: Key, text: str, session: Any = None) -> str:
     text : str
         What was found and what is allowed.
     session : dict, optional
-        The file as parsed, to call sensors by their names.
+        The file as parsed, to call sensors and bodies by their names.
     """
-    sensors = session.get("sensor") if isinstance(session, dict) else None
-    tables = sensors if isinstance(sensors, list) else []
+    first = key[0] if key else None
+    found = session.get(first) if isinstance(session, dict) else None
+    if first == "object" and not isinstance(found, list):
+        key = (first, *key[2:])  # the only one has no number
+    tables = found if isinstance(found, list) and first in ("sensor", "object") else []
     names = [table.get("name") if isinstance(table, dict) else None for table in tables]
     where = f"{dotted(key, names)}: " if key else ""
     return " ".join(f"{file}: {where}{text}".split())

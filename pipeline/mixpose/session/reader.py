@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import tomllib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from mixpose.session.messages import BadKeyError, one_line, one_of, under
 from mixpose.session.motion import read_motion
 from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
-from mixpose.session.setup import Session, Start
+from mixpose.session.setup import ObjectSetup, Session, Start
 from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.validation import validate
 
@@ -64,21 +66,52 @@ def _parse(text: str) -> dict[str, Any]:
 
 def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
     table: SessionTable = validate(SessionTable, data)
-    with under("object"):
-        body = build_body(table.object, path.parent)
-    with under("start"):
-        start = _start(table.start)
+    objects = _objects(table, path.parent)
     with under("estimator"):
-        estimator = _estimator(table.estimator, start)
+        estimator = _estimator(table.estimator, objects)
     return Session(
         path=path,
         sha256=sha256,
         unit=table.unit,
-        body=body,
-        start=start,
+        body=objects[0].body,
+        start=objects[0].start,
         estimator=estimator,
-        sensors=build_sensors(table.sensor, table.extract, path.parent),
+        sensors=build_sensors(table.sensor, table.extract, path.parent, table.unit),
+        count=objects[0].count,
+        others=objects[1:],
     )
+
+
+def _objects(table: SessionTable, folder: Path) -> tuple[ObjectSetup, ...]:
+    """All bodies, no two of a name."""
+    if table.start is not None and len(table.object) > 1:
+        raise BadKeyError(
+            f"found one for {len(table.object)} bodies; allowed: [object.start] below each "
+            "[[object]] whose place is known",
+            "start",
+        )
+    objects: list[ObjectSetup] = []
+    for k, each in enumerate(table.object):
+        with under("object", k):
+            if table.start is not None and each.start is not None:
+                raise BadKeyError("stands beside [start]; allowed: one of the two", "start")
+            body = build_body(each, folder, table.unit)
+            with under("start"):
+                start = _start(each.start)
+            new = ObjectSetup(body, start, each.count)
+            known = {label for one in objects for label in (one.body.name, *one.labels)}
+            twins = known & {body.name, *new.labels}
+            if twins:
+                raise BadKeyError(
+                    f'found "{body.name}", and {sorted(twins)[0]!r} is the name of another one; '
+                    "allowed: a name of its own for each body, and count for identical ones",
+                    "name",
+                )
+            objects.append(new)
+    if table.start is not None:
+        with under("start"):
+            objects[0] = replace(objects[0], start=_start(table.start))
+    return tuple(objects)
 
 
 def _start(table: StartTable | None) -> Start | None:
@@ -94,9 +127,9 @@ def _start(table: StartTable | None) -> Start | None:
     return Start(T_world_object, table.rotation_deg, table.distance)
 
 
-def _estimator(table: EstimatorTable, start: Start | None) -> EstimatorOptions:
+def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> EstimatorOptions:
     held = [name for name in TWIST_NAMES if name not in table.free]
-    if held and start is None:
+    if held and any(one.start is None for one in objects):
         raise BadKeyError(
             f"leaves out {one_of(held)}, which are held where [start] has them, and there is no "
             "[start]; add one with the pose they are held at, or leave free out to estimate all",

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, get_args
 
-from pydantic import Field, PlainValidator
+from pydantic import BeforeValidator, Field, PlainValidator
 
-from mixpose.body import Spread
+from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
 from mixpose.rigid import TWIST_NAMES, Floats
@@ -19,7 +19,15 @@ from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable
 from mixpose.session.setup import Unit
-from mixpose.session.values import FREE_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+from mixpose.session.values import FREE_ALLOWED, RADIUS_ALLOWED, SIGMA_ALLOWED, ArrayOf, read_free
+
+MOST_ALIKE = 1000
+"""Identical bodies that a session may have."""
+
+
+def as_list(value: Any) -> Any:
+    """One table as a list of tables."""
+    return [value] if isinstance(value, dict) else value
 
 
 class GravityTable(Table):
@@ -34,64 +42,6 @@ class GravityTable(Table):
     """Standard deviation of the displacement along it, in `unit`.
 
     Example: `sigma = 2.0`
-    """
-
-
-class ObjectTable(Table):
-    """The rigid body: where its features are. It needs `points`, `file` or `segments`, of points
-    and segments together at least three.
-    """
-
-    name: Text
-    """Name of the body, written into every pose.
-
-    Example: `name = "tracker"`
-    """
-    points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
-    """Features in the body's own coordinates, in `unit`, in any order.
-
-    Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`
-    """
-    file: Annotated[
-        str | None, Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]")
-    ] = None
-    """A table of points in place of `points`: a row per point under the header `name,x,y,z`, with
-    one, three or nine more columns for the spread of each.
-
-    Example: `file = "markers.csv"`
-    """
-    sigma: Annotated[Any, Field(description=SIGMA_ALLOWED)] = None
-    """How far features may be off their places: standard deviation in `unit`, or covariance in
-    `unit`². Left out, or 0: exact.
-
-    Example: `sigma = 0.5`
-    """
-    segments: Annotated[
-        Floats | None, ArrayOf((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
-    ] = None
-    """Straight lines as features, from end to end in `unit`; they may stand beside points.
-
-    Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`
-    """
-    normals: Annotated[
-        Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
-    ] = None
-    """Outward directions, one per feature (points first, then segments): a feature is seen only
-    by sensors that it faces.
-
-    Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`
-    """
-    spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
-    """Density of the displacements that `sigma` states.
-
-    Example: `spread = "uniform"`
-    """
-    gravity: Annotated[
-        GravityTable | None, Field(description="a table with direction and sigma")
-    ] = None
-    """See `[object.gravity]`.
-
-    Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`
     """
 
 
@@ -129,6 +79,92 @@ class StartTable(Placement):
     radius.
 
     Example: `distance = 10`
+    """
+
+
+class ObjectTable(Table):
+    """The rigid body: where its features are. It needs `points`, `file` or `segments`, of points
+    and segments together at least three. Several bodies in one scene are tables `[[object]]`, in
+    double brackets, one for each; see `docs/several-bodies.md`.
+    """
+
+    name: Text
+    """Name of the body, written into every pose.
+
+    Example: `name = "tracker"`
+    """
+    points: Annotated[Floats | None, ArrayOf((None, 3), "a list of points [x, y, z]")] = None
+    """Features in the body's own coordinates, in `unit`, in any order.
+
+    Example: `points = [[0, -25, -43.3], [100, -25, -43.3], [0, 61.6, -93.3]]`
+    """
+    file: Annotated[
+        str | None,
+        Field(min_length=1, description="a CSV file: name,x,y,z[,sigma...]; .rom, .vsk or .obj"),
+    ] = None
+    """A table of points in place of `points`: a row per point under the header `name,x,y,z`, with
+    one, three or nine more columns for the spread of each. Or a body of another program: NDI's
+    `.rom` and Vicon's `.vsk` (both in mm), AsterTrack's `.obj` (in m), converted to `unit`.
+
+    Example: `file = "markers.csv"`
+    """
+    sigma: Annotated[Any, Field(description=SIGMA_ALLOWED)] = None
+    """How far features may be off their places: standard deviation in `unit`, or covariance in
+    `unit`². Left out, or 0: exact.
+
+    Example: `sigma = 0.5`
+    """
+    segments: Annotated[
+        Floats | None, ArrayOf((None, 2, 3), "a list of segments [[x, y, z], [x, y, z]]")
+    ] = None
+    """Straight lines as features, from end to end in `unit`; they may stand beside points.
+
+    Example: `segments = [[[0, 0, 0], [50, 0, 0]]]`
+    """
+    normals: Annotated[
+        Floats | None, ArrayOf((None, 3), "a list of normals [x, y, z], one per point")
+    ] = None
+    """Outward directions, one per feature (points first, then segments): a feature is seen only
+    by sensors that it faces.
+
+    Example: `normals = [[0, 0, 1], [0, 0, 1], [1, 0, 0]]`
+    """
+    shape: Annotated[Shape, Field(description=one_of(get_args(Shape)))] = "point"
+    """What the markers are: points, or spheres or flat disks of a `radius`, the centres of whose
+    images are not where their own centres are seen. Disks lie across their `normals`.
+
+    Example: `shape = "sphere"`
+    """
+    radius: Annotated[Any, Field(description=RADIUS_ALLOWED)] = None
+    """Radius of the spheres or disks, in `unit`; what shines or is dark counts, to its edge.
+
+    Example: `radius = 7.0`
+    """
+    spread: Annotated[Spread, Field(description=one_of(get_args(Spread)))] = "gaussian"
+    """Density of the displacements that `sigma` states.
+
+    Example: `spread = "uniform"`
+    """
+    gravity: Annotated[
+        GravityTable | None, Field(description="a table with direction and sigma")
+    ] = None
+    """See `[object.gravity]`.
+
+    Example: `gravity = { direction = [0, 0, -1], sigma = 2.0 }`
+    """
+    count: Annotated[
+        int, Field(ge=1, le=MOST_ALIKE, description=f"an integer from 1 to {MOST_ALIKE}")
+    ] = 1
+    """How many identical ones there are. Their poses carry the key `instance`, from 0; which one
+    is which is kept while they are tracked.
+
+    Example: `count = 4`
+    """
+    start: Annotated[StartTable | None, Field(description="a table [object.start]")] = None
+    """See `[start]`, which this replaces where there are several bodies; of identical ones the
+    first is there.
+
+    Example: `start = { rotation_vector = [0, 0, 1], translation = [20, 10, 900] }`
     """
 
 
@@ -185,8 +221,12 @@ class SessionTable(Table):
 
     Example: `unit = "mm"`
     """
-    object: Annotated[ObjectTable, Field(description="a table [object]")]
-    """See `[object]`."""
+    object: Annotated[
+        list[ObjectTable],
+        BeforeValidator(as_list),
+        Field(min_length=1, description="a table [object], or [[object]] for each of several"),
+    ]
+    """See `[object]`; of several bodies `[[object]]`, one for each."""
     start: Annotated[StartTable | None, Field(description="a table [start]")] = None
     """See `[start]`."""
     estimator: Annotated[EstimatorTable, Field(description="a table [estimator]")] = (

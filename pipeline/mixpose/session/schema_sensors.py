@@ -5,7 +5,7 @@ How keys are described is said in `schema`.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
@@ -13,14 +13,20 @@ from mixpose.rigid import Floats
 from mixpose.session.arrays import RESOLUTION_FORM
 from mixpose.session.arrays import resolution as resolution_of
 from mixpose.session.intrinsics import MATRIX_FORM
+from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Number, Placement, Positive, Table, Text
+from mixpose.session.setup import Unit
 from mixpose.session.values import (
+    DELAY_ALLOWED,
     SOURCE_ALLOWED,
     ArrayOf,
     read_calibration_key,
+    read_delay,
     read_sensor_name,
     read_source,
 )
+
+SPAN_ALLOWED = "seconds, from 0 to 1"
 
 
 class CalibrationTable(Table):
@@ -29,8 +35,9 @@ class CalibrationTable(Table):
     """
 
     file: Text
-    """An OpenCV file (YAML or XML), a Kalibr camchain or a ROS camera_info, told apart by
-    content.
+    """A file of OpenCV (YAML, XML or JSON), Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP,
+    told apart by content. Where it says how cameras stand to each other, and `T_sensor_world` is
+    left out, that is taken over; the world is then the one of the file.
 
     Example: `file = "stereo.yml"`
     """
@@ -49,11 +56,17 @@ class CalibrationTable(Table):
     Example: `distortion = "D2"`
     """
     camera: Annotated[
-        str | None, Field(min_length=1, description='a camera of a Kalibr file, like "cam0"')
+        str | None, Field(min_length=1, description='a camera of the file, like "cam0"')
     ] = None
-    """Camera to take where a Kalibr file holds several.
+    """Camera to take where a file holds several.
 
     Example: `camera = "cam1"`
+    """
+    unit: Annotated[Unit | None, Field(description=one_of(get_args(Unit)))] = None
+    """Unit of the file's translations, where its format does not fix it (Kalibr and caliscope work
+    in metres).
+
+    Example: `unit = "mm"`
     """
 
 
@@ -88,6 +101,15 @@ class SensorTable(Table):
 
     Example: `fps = 25`
     """
+    delay: Annotated[
+        float | Literal["estimate"], PlainValidator(read_delay), Field(description=DELAY_ALLOWED)
+    ] = 0.0
+    """Seconds by which this sensor's frames are taken later than their times say; negative where
+    they are earlier. `"estimate"`: found from how a moving body is seen, relative to sensors whose
+    delay is known (`docs/sensors-in-time.md`).
+
+    Example: `delay = 0.006`
+    """
     extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
     """Keys of `[extract]` that differ for this sensor.
 
@@ -113,6 +135,18 @@ class PlacedTable(SensorTable, Placement):
     """Size of the images in px. Left out: that of the calibration file, else of the first image.
 
     Example: `resolution = [640, 512]`
+    """
+    readout: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    """Rolling shutter: seconds from when the first row of an image is read to when the last is. A
+    frame's time is when its middle row is read. Left out: all rows at once.
+
+    Example: `readout = 0.020`
+    """
+    exposure: Annotated[Number, Field(ge=0, le=1, description=SPAN_ALLOWED)] = 0.0
+    """Seconds for which a row collects light. A frame's time is the middle of it, where a moving
+    marker's streak has its middle; it matters to `check` and `simulate`, not to poses.
+
+    Example: `exposure = 0.004`
     """
 
 

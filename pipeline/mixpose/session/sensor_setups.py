@@ -10,21 +10,22 @@ import numpy as np
 
 from mixpose.errors import SessionError
 from mixpose.extraction import ExtractOptions, check_options
-from mixpose.rigid import Floats
+from mixpose.rigid import Floats, from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
-from mixpose.session.calibration import read_calibration
+from mixpose.session.calibration import CalibratedCamera, read_calibration
 from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
 from mixpose.session.motion import read_motion
 from mixpose.session.schema_common import ExtractTable
 from mixpose.session.schema_sensors import (
     AnySensorTable,
+    CalibrationTable,
     CameraTable,
     LaterationTable,
     ParallelTable,
     PlacedTable,
 )
-from mixpose.session.setup import SensorSetup
+from mixpose.session.setup import SensorSetup, Unit, scale_between
 
 _WIDEST_PX = 1000
 _WIDEST_BINS = 100_000
@@ -32,7 +33,7 @@ _NARROWEST = 1000  # of a bin
 
 
 def build_sensors(
-    tables: list[AnySensorTable], defaults: ExtractTable, folder: Path
+    tables: list[AnySensorTable], defaults: ExtractTable, folder: Path, unit: Unit
 ) -> tuple[SensorSetup, ...]:
     """Build all sensors of a session.
 
@@ -43,6 +44,8 @@ def build_sensors(
         ``[extract]``.
     folder : Path
         What paths are relative to.
+    unit : {"m", "cm", "mm", "um"}
+        Of the session, into which lengths of calibration files are converted.
 
     Raises
     ------
@@ -60,7 +63,7 @@ def build_sensors(
                     "of its own for each sensor",
                     "name",
                 )
-            setups.append(_build_sensor(table, defaults, folder))
+            setups.append(_build_sensor(table, defaults, folder, unit))
     return tuple(setups)
 
 
@@ -96,14 +99,16 @@ def _keys_given(table: ExtractTable) -> dict[str, Any]:
     return {key: getattr(table, key) for key in table.model_fields_set}
 
 
-def _build_sensor(table: AnySensorTable, defaults: ExtractTable, folder: Path) -> SensorSetup:
+def _build_sensor(
+    table: AnySensorTable, defaults: ExtractTable, folder: Path, unit: Unit
+) -> SensorSetup:
     if table.times is not None and table.fps is not None:
         raise BadKeyError("stands beside times; allowed: one of the two", "fps")
     resolution: tuple[int, int] | None = None
     sensor: Sensor
     match table:
         case CameraTable():
-            sensor = _camera(table, folder)
+            sensor = _camera(table, folder, unit)
             resolution = sensor.resolution
         case ParallelTable():
             resolution = table.resolution
@@ -130,11 +135,15 @@ def _build_sensor(table: AnySensorTable, defaults: ExtractTable, folder: Path) -
         range_min=getattr(table, "range_min", None),
         bin_size=getattr(table, "bin_size", None),
         resolution=resolution,
+        delay=table.delay,
+        readout=getattr(table, "readout", 0.0),
+        exposure=getattr(table, "exposure", 0.0),
     )
 
 
-def _camera(table: CameraTable, folder: Path) -> PinholeCamera | FisheyeCamera:
-    intrinsics = _intrinsics(table, folder)
+def _camera(table: CameraTable, folder: Path, unit: Unit) -> PinholeCamera | FisheyeCamera:
+    camera = _calibrated(table, folder)
+    intrinsics = camera.intrinsics
     resolution = table.resolution or intrinsics.resolution
     if resolution and intrinsics.resolution and resolution != intrinsics.resolution:
         raise BadKeyError(
@@ -143,10 +152,29 @@ def _camera(table: CameraTable, folder: Path) -> PinholeCamera | FisheyeCamera:
             "resolution",
         )
     kind = PinholeCamera if table.model == "pinhole" else FisheyeCamera
-    return kind(intrinsics.camera_matrix, intrinsics.distortion, resolution, _T_sensor_world(table))
+    T = read_motion(table, "T_sensor_world")
+    if T is None:
+        T = _pose_in_file(camera, table.calibration, unit)
+    return kind(intrinsics.camera_matrix, intrinsics.distortion, resolution, T)
 
 
-def _intrinsics(table: CameraTable, folder: Path) -> Intrinsics:
+def _pose_in_file(camera: CalibratedCamera, wanted: CalibrationTable | None, unit: Unit) -> Floats:
+    """Where the calibration says that the camera stands; the origin where it does not."""
+    T = camera.T_camera_rig
+    if T is None or wanted is None:
+        return np.eye(4)
+    stated = camera.unit or wanted.unit
+    if stated is None and T[:3, 3].any():
+        raise BadKeyError(
+            f"{wanted.file} says where the camera stands, but not in which unit; add it as "
+            'calibration = { file = "...", unit = "mm" }, or give T_sensor_world',
+            "calibration",
+            "unit",
+        )
+    return from_parts(T[:3, :3], T[:3, 3] * scale_between(stated or unit, unit))
+
+
+def _calibrated(table: CameraTable, folder: Path) -> CalibratedCamera:
     if table.calibration is not None:
         for key in ("camera_matrix", "distortion"):
             if getattr(table, key) is not None:
@@ -158,7 +186,8 @@ def _intrinsics(table: CameraTable, folder: Path) -> Intrinsics:
     with under("camera_matrix"):
         K = camera_matrix(table.camera_matrix.tolist())
     with under("distortion"):
-        return Intrinsics(K, distortion(table.distortion, table.model))
+        D = distortion(table.distortion, table.model)
+    return CalibratedCamera(table.name, Intrinsics(K, D))
 
 
 def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:

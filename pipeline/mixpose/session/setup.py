@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 from mixpose.body import Body
 from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
+from mixpose.records import label_of
 from mixpose.rigid import Floats
 from mixpose.sensors import Sensor
 
 Unit: TypeAlias = Literal["m", "cm", "mm", "um"]
 
 METRES_PER_UNIT: dict[Unit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+
+
+def scale_between(unit: Unit, other: Unit) -> float:
+    """What lengths in one unit are multiplied by to be in another; exactly 1 for the same."""
+    return float(f"{METRES_PER_UNIT[unit] / METRES_PER_UNIT[other]:.0e}")
 
 
 @dataclass(frozen=True)
@@ -33,6 +39,34 @@ class Start:
     T_world_object: Floats
     rotation_deg: float | None = None
     distance: float | None = None
+
+
+@dataclass(frozen=True)
+class ObjectSetup:
+    """One ``[[object]]``.
+
+    Attributes
+    ----------
+    body : Body
+    start : Start or None
+        Of identical ones, where the first is.
+    count : int
+        How many identical ones there are.
+    """
+
+    body: Body
+    start: Start | None = None
+    count: int = 1
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """What each of them is called where one word has to do."""
+        return tuple(label_of(self.body.name, instance) for instance in self.instances)
+
+    @property
+    def instances(self) -> tuple[int | None, ...]:
+        """The numbers of identical ones; None where there is one only."""
+        return tuple(range(self.count)) if self.count > 1 else (None,)
 
 
 @dataclass(frozen=True)
@@ -59,6 +93,10 @@ class SensorSetup:
         Range of a profile's first bin and from bin to bin, in length units; both or neither.
     resolution : (int, int) or None
         Width and height of a camera's images in px.
+    delay : float or "estimate"
+        Seconds by which frames are taken later than their times say; to be estimated.
+    readout, exposure : float
+        Seconds from a camera's first row to its last, and for which a row collects light.
     """
 
     name: str
@@ -71,6 +109,9 @@ class SensorSetup:
     range_min: float | None = None
     bin_size: float | None = None
     resolution: tuple[int, int] | None = None
+    delay: float | Literal["estimate"] = 0.0
+    readout: float = 0.0
+    exposure: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,10 +127,16 @@ class Session:
     unit : {"m", "cm", "mm", "um"}
         Of every length; nothing is converted on reading.
     body : Body
+        The first one.
     start : Start or None
+        Of the first body.
     estimator : EstimatorOptions
     sensors : tuple of SensorSetup
         In the order of the file, at least one.
+    count : int
+        How many there are of the first body.
+    others : tuple of ObjectSetup
+        The bodies after the first, in the order of the file.
     """
 
     path: Path
@@ -99,6 +146,23 @@ class Session:
     start: Start | None
     estimator: EstimatorOptions
     sensors: tuple[SensorSetup, ...]
+    count: int = 1
+    others: tuple[ObjectSetup, ...] = ()
+
+    @property
+    def objects(self) -> tuple[ObjectSetup, ...]:
+        """All bodies, in the order of the file."""
+        return (ObjectSetup(self.body, self.start, self.count), *self.others)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of all bodies, identical ones numbered, in the order of their pose lines."""
+        return tuple(label for one in self.objects for label in one.labels)
+
+    def alone(self, name: str) -> Session:
+        """The session of one of its bodies, by name, as if there were no other."""
+        one = next(each for each in self.objects if each.body.name == name)
+        return replace(self, body=one.body, start=one.start, count=1, others=())
 
     @property
     def folder(self) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import core_schema
@@ -19,10 +19,13 @@ THRESHOLDS = ("auto", "otsu", "local", "li", "triangle", "sauvola")
 _FUNCTION = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*(\.[^\W\d]\w*)*")
 METHOD_ALLOWED = f'{one_of(EXTRACT_METHODS)} or "module:function"'
 SIGMA_ALLOWED = "a number, [sx, sy, sz], a 3x3 covariance, or a list with one of these per feature"
+RADIUS_ALLOWED = "a length greater than 0, or a list with one per point"
+DELAY_ALLOWED = 'seconds from -1 to 1, or "estimate"'
 FREE_ALLOWED = f"a list of at least one of {one_of(TWIST_NAMES)}, each once"
 SOURCE_ALLOWED = (
     "a glob, a folder, a file or a stream as text, a camera's number, or a list of files"
 )
+LONGEST_DELAY_S = 1.0
 THRESHOLD_ALLOWED = f"{one_of(THRESHOLDS)} or a grey level"
 
 
@@ -76,6 +79,15 @@ def read_source(value: Any) -> str | tuple[str, ...]:
     if not texts or not all(isinstance(text, str) and text.strip() for text in texts):
         raise BadKeyError(found(value, SOURCE_ALLOWED))
     return tuple(texts) if isinstance(value, list) else str(value)
+
+
+def read_delay(value: Any) -> float | Literal["estimate"]:
+    """Seconds, or the word that asks for them."""
+    if value == "estimate":
+        return "estimate"
+    if not is_number(value) or not -LONGEST_DELAY_S <= value <= LONGEST_DELAY_S:
+        raise BadKeyError(found(value, DELAY_ALLOWED))
+    return float(value)
 
 
 def read_free(value: Any) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from mixpose.simulation.motion import Motion
 from mixpose.simulation.naming import SourceFiles
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.render import ImageFormat, ProfileFormat
+from mixpose.simulation.scenery import Scenery
+from mixpose.simulation.shutter import Shutter
 from mixpose.simulation.sighting import View, brightness_levels
 from mixpose.simulation.writers import (
     DetectionWriter,
@@ -30,6 +32,7 @@ from mixpose.simulation.writers import (
 _LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
 _TABLE_SPACING_PX = 2.0
 _SPOT_SIGMA_PX = 1.6
+_OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size themselves
 _PEAK_BINS = 1.5  # standard deviation of a peak, where nothing says it
 _PEAK_REACH = 5.0  # standard deviations of a peak that still fit into a profile
 
@@ -46,12 +49,15 @@ class Channel:
         As they hold for this sensor.
     open : callable
         Takes the recording's folder and starts to write there.
+    step_s : float
+        Seconds by which its frames are later than those of the first sensor, as its times say.
     """
 
     files: SourceFiles
     view: View
     options: SimulationOptions
     open: Callable[[Path], SensorWriter]
+    step_s: float = 0.0
 
 
 def check_setup(session: Session) -> None:
@@ -84,6 +90,8 @@ def plan_channel(
     *,
     fps: float,
     index: int,
+    scenery: Scenery = Scenery(),
+    step_s: float = 0.0,
 ) -> Channel:
     """Prepare one sensor.
 
@@ -99,28 +107,49 @@ def plan_channel(
         Frames per second.
     index : int
         The sensor's place in the session, which keys its random numbers.
+    scenery : Scenery
+        What else cameras see.
+    step_s : float
+        Seconds by which the sensor is later than the first, and says so.
 
     Raises
     ------
     SessionError
         If the sensor cannot be simulated.
     """
+    shutter = shutter_of(setup, options, step_s)
     if setup.sensor.dimension == 1:
-        return _range_channel(setup, files, body, motion, options, index)
+        channel = _range_channel(setup, files, body, motion, options, index)
+        return replace(channel, view=replace(channel.view, shutter=shutter), step_s=step_s)
     assert setup.resolution is not None, "check_setup refuses this"
-    return _camera_channel(setup, files, len(body), options, setup.resolution, fps, index)
+    channel = _camera_channel(setup, files, body, options, setup.resolution, fps, index)
+    if files.kind == "detections":  # a detection is where the middle of a streak is
+        shutter = replace(shutter, exposure_s=0.0)
+    view = replace(channel.view, shutter=shutter, scenery=scenery)
+    return replace(channel, view=view, step_s=step_s)
+
+
+def shutter_of(setup: SensorSetup, options: SimulationOptions, step_s: float) -> Shutter:
+    """When a sensor sees what: as the session states, but for what the options say."""
+    stated = setup.delay if isinstance(setup.delay, float) else 0.0
+    readout = setup.readout if options.readout is None else options.readout
+    exposure = setup.exposure if options.exposure is None else options.exposure
+    late = options.delay.get(setup.name, stated) + step_s
+    if setup.resolution is None:
+        return Shutter(late)
+    return Shutter(late, readout, exposure, setup.resolution[1])
 
 
 def _camera_channel(
     setup: SensorSetup,
     files: SourceFiles,
-    count: int,
+    body: Body,
     options: SimulationOptions,
     resolution: tuple[int, int],
     fps: float,
     index: int,
 ) -> Channel:
-    sensor = setup.sensor
+    sensor, count = setup.sensor, len(body)
     if files.kind == "detections":
         view = View(sensor, sensor.lower, sensor.upper, np.ones(count), _TABLE_SPACING_PX)
         noise, coordinates = options.pixel_noise, ("u", "v")
@@ -130,7 +159,8 @@ def _camera_channel(
             replace(options, brightness_spread=0.0),
             lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=coordinates),
         )
-    spot_sigma = options.spot_sigma or setup.extract.spot_sigma or _SPOT_SIGMA_PX
+    optics = _SPOT_SIGMA_PX if body.radii is None else _OPTICS_PX
+    spot_sigma = options.spot_sigma or setup.extract.spot_sigma or optics
     spacing = _LINE_SPACING * spot_sigma
     view = View(
         sensor,

@@ -20,6 +20,8 @@ class Purpose(IntEnum):
     FRAME = 4
     MISSING = 5
     DEFORMATION = 6
+    SCENERY = 7
+    TURNED = 8
 
 
 def generator(seed: int, purpose: Purpose, *key: int) -> np.random.Generator:

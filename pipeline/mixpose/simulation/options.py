@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import TypeAlias
 
 from mixpose.errors import SessionError
@@ -41,6 +41,16 @@ _RULES: dict[str, Rule] = {
     "range_noise": _NOT_NEGATIVE,
     "range_width": _POSITIVE,
     "range_snr": _POSITIVE,
+    "readout": _NOT_NEGATIVE,
+    "exposure": _NOT_NEGATIVE,
+    "out_of_step": _NOT_NEGATIVE,
+    "lamps": _COUNT,
+    "others": _COUNT,
+    "occluder": _COUNT,
+    "mirror": _PROBABILITY,
+    "jpeg": (lambda value: 1 <= value <= 100, "a quality from 1 to 100"),
+    "turned_camera_deg": _ANY,
+    "away_from": _COUNT,
 }
 
 
@@ -99,6 +109,28 @@ class SimulationOptions:
     range_snr : float
         Height of a peak divided by the standard deviation of the profile's noise.
 
+    readout, exposure : float or None
+        Seconds from the first row of a camera to its last, and for which a row collects light;
+        None is what the session states of each camera.
+    delay : mapping of str to float
+        Seconds that sensors are late without knowing, by name; the others are as late as the
+        session states.
+    out_of_step : float
+        Seconds by which sensors differ that have tables of times, as these say: the last is this
+        much later than the first.
+    lamps, others, occluder : int
+        Lamps behind the body; other bodies with as many markers; dark bars that swing before it.
+    mirror : float
+        Brightness of mirror images in a table below the body, as a share; 0 without one.
+    jpeg : int or None
+        Quality of the compression that images went through.
+    bayer : bool
+        Whether images come from a colour sensor, its colours interpolated.
+    turned_camera_deg : float
+        By which the last camera was turned after its calibration.
+    away_from : int or None
+        Number of frames after which the body is gone.
+
     Raises
     ------
     SessionError
@@ -126,12 +158,24 @@ class SimulationOptions:
     range_noise: float | None = None
     range_width: float | None = None
     range_snr: float = 30.0
+    readout: float | None = None
+    exposure: float | None = None
+    delay: Mapping[str, float] = field(default_factory=dict)
+    out_of_step: float = 0.0
+    lamps: int = 0
+    others: int = 0
+    occluder: int = 0
+    mirror: float = 0.0
+    jpeg: int | None = None
+    bayer: bool = False
+    turned_camera_deg: float = 0.0
+    away_from: int | None = None
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if value is None or field.name not in _RULES:
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if value is None or one.name not in _RULES:
                 continue
-            is_allowed, allowed = _RULES[field.name]
+            is_allowed, allowed = _RULES[one.name]
             if not (math.isfinite(value) and is_allowed(value)):
-                raise SessionError(f"simulate: {field.name}: found {value}; allowed: {allowed}")
+                raise SessionError(f"simulate: {one.name}: found {value}; allowed: {allowed}")

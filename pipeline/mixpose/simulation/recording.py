@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -14,14 +14,17 @@ import numpy as np
 
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.session import Session
+from mixpose.rigid import from_rotation_vector, inverse
+from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import central_pose, pivot_of
 from mixpose.simulation.channels import Channel, check_setup, plan_channel
 from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.naming import plan_files
 from mixpose.simulation.options import DEFAULT_FPS, SimulationOptions
+from mixpose.simulation.scenery import motion_pose, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
+from mixpose.simulation.shutter import PoseAfter
 from mixpose.simulation.sighting import Sighting, displacements, look
 from mixpose.simulation.writers import SensorWriter
 
@@ -97,13 +100,69 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
     try:
         numbers, files = plan_files(sources, options.frames)
         fps = _frames_per_second(session, options)
+        steps = _steps(session, [own.kind for own in files], options)
+        setups = _as_they_stand(session.sensors, options)
+        cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
+        scenery = plan_scenery(session.body, motion, cameras, options)
         channels = tuple(
-            plan_channel(setup, own, session.body, motion, options, fps=fps, index=i)
-            for i, (setup, own) in enumerate(zip(session.sensors, files))
+            plan_channel(
+                setup,
+                own,
+                session.body,
+                motion,
+                options,
+                fps=fps,
+                index=i,
+                scenery=scenery,
+                step_s=step,
+            )
+            for i, (setup, own, step) in enumerate(zip(setups, files, steps))
         )
     except SessionError as error:  # which key is known there, which file here
         raise SessionError(f"{session.path}: {error}") from error
     return _Plan(session, options, copied, numbers, fps, motion, channels)
+
+
+def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -> list[float]:
+    """Seconds by which each sensor is later than the first, where its times can say so."""
+    names = {setup.name for setup in session.sensors}
+    for name in options.delay:
+        if name not in names:
+            raise SessionError(
+                f"delay: found the sensor {name!r}; allowed: {', '.join(sorted(names))}"
+            )
+    last = max(len(session.sensors) - 1, 1)
+    steps = []
+    for i, (setup, kind) in enumerate(zip(session.sensors, kinds, strict=True)):
+        tells = setup.times is not None or kind == "detections"
+        if options.out_of_step and not tells:
+            raise SessionError(
+                f"sensor {setup.name!r}: times: missing; sensors that are out of step need a table "
+                "of times each"
+            )
+        steps.append(options.out_of_step * i / last)
+    tables = [setup.times for setup in session.sensors if setup.times is not None]
+    if options.out_of_step and len(set(tables)) < len(tables):
+        raise SessionError("times: found one table for several sensors; allowed: one for each")
+    return steps
+
+
+def _as_they_stand(
+    setups: Sequence[SensorSetup], options: SimulationOptions
+) -> Sequence[SensorSetup]:
+    """The sensors, the last camera turned away from where the session says it looks."""
+    cameras = [i for i, setup in enumerate(setups) if setup.sensor.dimension == 2]
+    if not options.turned_camera_deg or not cameras:
+        return setups
+    turned = list(setups)
+    chosen = setups[cameras[-1]]
+    axis = generator(options.seed, Purpose.TURNED).standard_normal(3)
+    turn = np.radians(options.turned_camera_deg) * axis / np.linalg.norm(axis)
+    sensor: Any = chosen.sensor
+    T = sensor.T_sensor_world
+    motion = inverse(T) @ from_rotation_vector(turn, np.zeros(3)) @ T
+    turned[cameras[-1]] = replace(chosen, sensor=chosen.sensor.moved(motion))
+    return turned
 
 
 def _frames_per_second(session: Session, options: SimulationOptions) -> float:
@@ -156,8 +215,13 @@ def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
 
 
 def _write_times(plan: _Plan, folder: Path) -> None:
-    rows = [f"{number},{_time(plan, number):.6f}\n" for number in plan.numbers]
-    for name in plan.copied.times:
+    steps = {
+        setup.name: channel.step_s
+        for setup, channel in zip(plan.session.sensors, plan.channels, strict=True)
+    }
+    for name, sensor in plan.copied.times.items():
+        times = [_time(plan, number) + steps[sensor] for number in plan.numbers]
+        rows = [f"{n},{t:.6f}\n" for n, t in zip(plan.numbers, times, strict=True)]
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("frame,time_s\n" + "".join(rows), encoding="ascii", newline="\n")
@@ -176,18 +240,24 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
             # the motion begins with the first frame, whatever its number
             moment = (number - plan.numbers[0]) / plan.fps
             T = np.round(plan.motion.poses(np.array(moment)), _DECIMALS) + 0.0
-            if _record_frame(plan, writers, number, T):
+            if _record_frame(plan, writers, number, T, moment):
                 truth.write(_line(_pose(plan, number, T)))
             if progress is not None:
                 progress(done)
 
 
 def _record_frame(
-    plan: _Plan, writers: Iterable[SensorWriter], number: int, T_world_object: Floats
+    plan: _Plan,
+    writers: Iterable[SensorWriter],
+    number: int,
+    T_world_object: Floats,
+    moment: float,
 ) -> bool:
-    """Record one frame with every sensor; False if all of them missed it."""
+    """Record one frame with every sensor; False if the body is away or all of them missed it."""
     options, body = plan.options, plan.session.body
     offsets = None
+    after = options.away_from
+    is_away = after is not None and number - plan.numbers[0] >= after
     if options.deform:
         offsets = displacements(body, generator(options.seed, Purpose.DEFORMATION, number))
     recorded = False
@@ -197,12 +267,27 @@ def _record_frame(
         if is_missing and channel.files.may_lack_frames:
             continue
         rng = generator(options.seed, Purpose.FRAME, number, i)
-        sighting = look(channel.view, body, T_world_object, channel.options, rng, offsets=offsets)
+        sighting = look(
+            channel.view,
+            body,
+            T_world_object,
+            channel.options,
+            rng,
+            offsets=offsets,
+            pose_after=None if channel.view.shutter.is_ideal else _after(plan.motion, moment),
+            time_s=moment,
+            is_away=is_away,
+        )
         if is_missing:
             sighting = _nothing(sighting)
-        writer.write(number, _time(plan, number), sighting, rng)
+        writer.write(number, _time(plan, number) + channel.step_s, sighting, rng)
         recorded = True
-    return recorded
+    return recorded and not is_away
+
+
+def _after(motion: Motion, moment: float) -> PoseAfter:
+    pose = motion_pose(motion)
+    return lambda seconds: pose(moment + seconds)
 
 
 def _nothing(sighting: Sighting) -> Sighting:

@@ -10,16 +10,19 @@ from dataclasses import dataclass
 from math import ceil
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
 from mixpose.records import Floats
 from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.outlines import coverage
 from mixpose.simulation.sighting import Sighting
 
 _REACH = 5.0  # standard deviations up to which a spot is drawn: the rest is below 1e-6 of it
 _WHITE = 255.0
+_RED, _GREEN, _BLUE = 1.0, 0.8, 0.6
 
 
 def draw_spots(image: NDArray[np.floating], points: Floats, peaks: Floats, sigma: float) -> None:
@@ -126,7 +129,10 @@ def render_image(
     """
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
-    draw_spots(image, sighting.points, options.brightness * sighting.levels, form.spot_sigma)
+    draw_light(image, sighting, options.brightness, form.spot_sigma)
+    gains = _mosaic(image.shape) if options.bayer else None
+    if gains is not None:
+        image *= gains
     if options.shot_noise:
         lit = image > 0
         spread = np.sqrt(options.shot_noise * image[lit])
@@ -138,7 +144,45 @@ def render_image(
         image += noise
     np.clip(np.rint(image, out=image), 0, _WHITE, out=image)
     grey = image.astype(np.uint8)
-    return grey if form.polarity == "bright" else np.asarray(255 - grey, dtype=np.uint8)
+    if gains is not None:
+        colours = cv2.cvtColor(grey, cv2.COLOR_BayerRGGB2BGR)
+        grey = np.asarray(cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+    if form.polarity == "dark":
+        grey = np.asarray(255 - grey, dtype=np.uint8)
+    if options.jpeg is not None:
+        packed = cv2.imencode(".jpg", grey, (cv2.IMWRITE_JPEG_QUALITY, int(options.jpeg)))[1]
+        grey = np.asarray(cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return grey
+
+
+def draw_light(
+    image: NDArray[np.float32], sighting: Sighting, brightness: float, sigma: float
+) -> None:
+    """Add all that shines to an image, and take away what something dark stands before.
+
+    Spots without a size are Gaussians of `sigma`; the others are evenly bright within their edges,
+    blurred by as much.
+    """
+    sized = sighting.outlines
+    plain = np.array([k not in sized for k in range(len(sighting))], dtype=np.bool_)
+    peaks = brightness * sighting.levels
+    draw_spots(image, sighting.points[plain], peaks[plain], sigma)
+    if sized:
+        disks = np.zeros(image.shape, dtype=np.float32)
+        for k, edge in sized.items():
+            rows, columns, shares = coverage(edge, image.shape)
+            disks[rows, columns] += np.float32(peaks[k]) * shares.astype(np.float32)
+        image += cv2.GaussianBlur(disks, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+    for cover in sighting.covers:
+        rows, columns, shares = coverage(cover, image.shape)
+        image[rows, columns] *= (1 - shares).astype(np.float32)
+
+
+def _mosaic(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """What each pixel of a colour sensor takes of warm white light, by its filter."""
+    gains = np.full(shape, _GREEN, np.float32)
+    gains[::2, ::2], gains[1::2, 1::2] = _RED, _BLUE
+    return gains
 
 
 def render_profile(

@@ -10,7 +10,7 @@ import copy
 import json
 import shutil
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any, Literal, TypeAlias
@@ -35,8 +35,8 @@ class SessionCopy:
         The session file.
     sources : tuple of (str or tuple of str)
         Sources of the sensors in `content`, in order.
-    times : tuple of str
-        Tables of frame times that it names, each once.
+    times : mapping of str to str
+        Tables of frame times that it names, with the first sensor of each.
     files : tuple of (Path, str)
         Marker and calibration files and the user's own extraction: where they are, and their
         paths in the recording.
@@ -44,7 +44,7 @@ class SessionCopy:
 
     content: bytes
     sources: tuple[str | tuple[str, ...], ...]
-    times: tuple[str, ...]
+    times: Mapping[str, str]
     files: tuple[tuple[Path, str], ...]
 
     def write(self, folder: Path) -> None:
@@ -74,14 +74,14 @@ def copy_session(session: Session) -> SessionCopy:
     moved = _moved(session, data)
     new_data = copy.deepcopy(data)
     files: dict[str, Path] = {}
-    times: list[str] = []
-    for container, key, role, _ in _places(new_data):
+    times: dict[str, str] = {}
+    for container, key, role, owner in _places(new_data):
         old = container[key]
         new = container[key] = moved.get(old, old)
         if role == "file":
             files[new] = session.folder / old
-        elif role == "times" and new not in times:
-            times.append(new)
+        elif role == "times":
+            times.setdefault(new, owner)
     files.update(_modules(session))
     if moved:
         content = _rewritten(session, content.decode("utf-8-sig"), moved, new_data)
@@ -90,7 +90,7 @@ def copy_session(session: Session) -> SessionCopy:
     return SessionCopy(
         content=content,
         sources=tuple(tuple(s) if isinstance(s, list) else s for s in sources),
-        times=tuple(times),
+        times=times,
         files=tuple((origin, name) for name, origin in files.items()),
     )
 

@@ -6,8 +6,11 @@ are put in.  Images, profiles and tables of detections are all made from this.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from math import ceil
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +21,9 @@ from mixpose.records import Floats
 from mixpose.sensors import Sensor
 from mixpose.sensors.base import Mask
 from mixpose.simulation.options import SimulationOptions
+from mixpose.simulation.outlines import centroid, outline
+from mixpose.simulation.scenery import PoseAt, Scenery
+from mixpose.simulation.shutter import PoseAfter, Shutter
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
 _PIECES = 32  # in which a line's image is measured
@@ -35,11 +41,17 @@ class Sighting:
         Their brightness; 1 for the mean feature.
     features : (M,) int
         The feature that a spot belongs to; numbers from N on are false features.
+    outlines : mapping of int to (K, 2) float64
+        Edges of those spots that have a size.
+    covers : tuple of (4, 2) float64
+        Corners of what is dark before all spots.
     """
 
     points: Floats
     levels: Floats
     features: NDArray[np.intp]
+    outlines: Mapping[int, Floats] = field(default_factory=dict)
+    covers: tuple[Floats, ...] = ()
 
     def __len__(self) -> int:
         return len(self.points)
@@ -60,6 +72,8 @@ class View:
         Distance of the spots of which a line consists, sensor units.
     ridge : float
         Brightness of each of these spots; 0 shares that of one feature among them.
+    shutter : Shutter
+    scenery : Scenery
     """
 
     sensor: Sensor
@@ -68,6 +82,14 @@ class View:
     levels: Floats
     spacing: float
     ridge: float = 0.0
+    shutter: Shutter = Shutter()
+    scenery: Scenery = Scenery()
+
+    @cached_property
+    def unbounded(self) -> Sensor:
+        """The sensor of an image without end."""
+        sensor: Any = self.sensor
+        return cast("Sensor", replace(sensor, resolution=None))
 
 
 def look(
@@ -78,6 +100,9 @@ def look(
     rng: np.random.Generator,
     *,
     offsets: Floats | None = None,
+    pose_after: PoseAfter | None = None,
+    time_s: float = 0.0,
+    is_away: bool = False,
 ) -> Sighting:
     """Decide what a sensor sees of a body.
 
@@ -86,36 +111,101 @@ def look(
     view : View
     body : Body
     T_world_object : (4, 4) array
+        At the frame's time.
     options : SimulationOptions
         Of which `hidden`, `hidden_count`, `clutter` and `brightness_spread` count here.
     rng : Generator
         For what is hidden and what is false.
     offsets : (N, 3) array, optional
         Displacements of the features in the object's frame.
+    pose_after : callable, optional
+        Poses later than the frame's time by some seconds; without it the body stands still.
+    time_s : float
+        Since the motion began, for what else moves.
+    is_away : bool
+        Whether the body is gone.
     """
     count = len(body)
     false = _false_features(options.clutter, view, rng)
-    points = [false]
-    levels = [brightness_levels(len(false), options.brightness_spread, rng)]
-    owners = [*range(count, count + len(false))]
+    spots = _Spots([false], [brightness_levels(len(false), options.brightness_spread, rng)])
+    spots.owners += range(count, count + len(false))
     seen = facing(view.sensor, body, T_world_object) & ~_hidden(count, options, rng)
+    seen &= not is_away
+    after = pose_after or (lambda _: T_world_object)
     for i in np.flatnonzero(seen).tolist():
-        T = T_world_object.copy()
-        if offsets is not None:
-            T[:3, 3] += T[:3, :3] @ offsets[i]
-        y, shares = _spots(view, body.features[i], T)
-        points.append(y)
-        levels.append(view.levels[i] * shares)
-        owners += [i] * len(y)
-    return Sighting(np.concatenate(points), np.concatenate(levels), np.array(owners, np.intp))
+        spots.add(view, body, i, i, after, view.levels[i], None if offsets is None else offsets[i])
+    for actor in view.scenery.actors:
+        if is_away and actor.is_image:
+            continue
+        later = _later(actor.pose, time_s)
+        faced = facing(view.sensor, actor.body, later(0.0), actor.mirror)
+        for i in np.flatnonzero(faced).tolist():
+            owner = count + len(false) + i
+            spots.add(view, actor.body, i, owner, later, actor.levels[i], None, actor.mirror)
+    late = time_s + view.shutter.late_s
+    covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
+    return spots.sighting(tuple(one for one in covers if len(one)))
 
 
-def facing(sensor: Sensor, body: Body, T_world_object: Floats) -> Mask:
+def _later(pose: PoseAt, time_s: float) -> PoseAfter:
+    return lambda seconds: pose(time_s + seconds)
+
+
+@dataclass
+class _Spots:
+    """Spots of one sighting, while they are put together."""
+
+    points: list[Floats]
+    levels: list[Floats]
+    owners: list[int] = field(default_factory=list)
+    outlines: dict[int, Floats] = field(default_factory=dict)
+
+    def add(
+        self,
+        view: View,
+        body: Body,
+        feature: int,
+        owner: int,
+        pose_after: PoseAfter,
+        level: float,
+        offset: Floats | None = None,
+        mirror: Floats | None = None,
+    ) -> None:
+        """Add what is seen of one feature, at each moment of its exposure."""
+        point = body.means[feature]
+        poses = view.shutter.poses(view.sensor, point, pose_after)
+        for T in poses:
+            M = T.copy() if mirror is None else mirror @ T
+            if offset is not None:
+                M[:3, 3] += M[:3, :3] @ offset
+            sized = body.radii is not None and body.radii[feature] > 0
+            edge = outline(view.unbounded, body, feature, T, mirror) if sized else None
+            if edge is not None:
+                y, shares = centroid(edge)[None], np.ones(1)
+                if (y < view.sensor.lower).any() or (y > view.sensor.upper).any():
+                    continue
+                self.outlines[len(self.owners)] = edge
+            else:
+                y, shares = _spots(view, body.features[feature], M)
+            self.points.append(y)
+            self.levels.append(level * shares / len(poses))
+            self.owners += [owner] * len(y)
+
+    def sighting(self, covers: tuple[Floats, ...]) -> Sighting:
+        """All of them."""
+        points, levels = np.concatenate(self.points), np.concatenate(self.levels)
+        return Sighting(points, levels, np.array(self.owners, np.intp), self.outlines, covers)
+
+
+def facing(
+    sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
+) -> Mask:
     """Which features (N,) turn their front to a sensor; all of a body without normals."""
     if body.normals is None:
         return np.ones(len(body), dtype=np.bool_)
-    R = T_world_object[:3, :3]
-    points = body.means @ R.T + T_world_object[:3, 3]
+    M = T_world_object if mirror is None else mirror @ T_world_object
+    R = M[:3, :3]
+    points = body.means @ R.T + M[:3, 3]
     return np.asarray(((body.normals @ R.T) * sensor.towards(points)).sum(axis=-1) > 0)
 
 

@@ -181,8 +181,9 @@ class DetectionWriter(_Closing):
         self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
     ) -> None:
         """Append the detections of one frame."""
-        points = sighting.points + self._noise * rng.standard_normal(sighting.points.shape)
-        weights = sighting.levels
+        noise = self._noise * rng.standard_normal(sighting.points.shape)
+        shown = ~np.array([_is_covered(point, sighting) for point in sighting.points], dtype=bool)
+        points, weights = (sighting.points + noise)[shown], sighting.levels[shown]
         if not len(points):
             points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
         for i in rng.permutation(len(points)):
@@ -192,6 +193,13 @@ class DetectionWriter(_Closing):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _is_covered(point: NDArray[np.float64], sighting: Sighting) -> bool:
+    """Whether something dark stands before a spot."""
+    u, v = (float(x) for x in point) if len(point) == 2 else (0.0, 0.0)
+    corners = [cover.astype(np.float32) for cover in sighting.covers]
+    return any(cv2.pointPolygonTest(one, (u, v), False) >= 0 for one in corners)
 
 
 def _row_of(profile: NDArray[np.float32]) -> bytes:

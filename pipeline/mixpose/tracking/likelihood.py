@@ -173,20 +173,19 @@ class MatchedLikelihood:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        rules, others = data.rules.judgement, []
+        if start.left_out:
+            found, _ = associate(self.data.objective_near(T), T, rules.association)
+            others = [one for one in found if one.name in start.left_out]
         judged = judge(
             data.objective_near(T),
             T,
             data.free,
             before=data.track.residuals,
             prior=data.prior(T),
-            rules=data.rules.judgement,
+            unmet=others,
+            rules=rules,
         )
-        if not start.left_out:
-            return judged
-        rules = self.data.rules.judgement
-        found, _ = associate(self.data.objective_near(T), T, rules.association)
-        others = [one for one in found if one.name in start.left_out]
-        missed = sum(one.expected for one in others) * rules.detection.log_missed
         reports = {
             one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
             for one in others
@@ -194,7 +193,6 @@ class MatchedLikelihood:
         return replace(
             judged,
             sensors=judged.sensors | reports,
-            log_evidence=judged.log_evidence + missed,
             associations=(*judged.associations, *others),
         )
 

@@ -26,6 +26,11 @@ class ProposalRules:
     flat: float = constant(
         0.15, "thickness of a body against its smaller width below which it may be tilted"
     )
+    in_plane: float = constant(
+        2.2,
+        "σ_ε by which features may be out of their plane and still meet what their mirror image "
+        "shows: as far as one is met",
+    )
     narrow: float = constant(
         0.5, "blur of a closer look in σ_ε: twice what centres of blobs err by (0.2 σ_ε)"
     )

@@ -22,6 +22,7 @@ from mixpose.records import Estimate, Hypothesis, SensorReport
 from mixpose.tracking.delays import in_step
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.reflection import is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
@@ -120,6 +121,8 @@ class Tracker:
         data = self.data(track, frame, time_s, usable)
         ranked = self.ranked(data) if usable else []
         verdict = decide(ranked, self.free, self.rules.acceptance)
+        if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
+            verdict = replace(verdict, status="ambiguous")
         told = verdict.best or (ranked[0] if ranked else None)
         estimate = self._estimate(frame, time_s, views, verdict, told)
         if verdict.best is None:

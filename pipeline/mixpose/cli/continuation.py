@@ -1,0 +1,195 @@
+"""Where an interrupted run goes on: what it knew after a frame, in a file beside its poses.
+
+The file is replaced as a whole, after the lines of the frame.  It says how long the poses were and
+their checksum, so that it is believed only where it fits them; lines written after it are
+estimated again.  Without it the frames before are estimated again, and not written.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zlib
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from mixpose.cli.lines import LineFile
+from mixpose.cli.notices import say
+from mixpose.encoding import decode, encode
+from mixpose.errors import SessionError
+from mixpose.frames import Source, pair
+from mixpose.poses.header import Header
+from mixpose.poses.jsonl import ResumePoint, resume_point
+from mixpose.runner import Memory
+from mixpose.selection import Selection
+from mixpose.whole_files import appearing_whole
+
+INTERVAL_S = 0.1
+"""Between two notes of what the run knows: so much at most is estimated again."""
+
+
+@dataclass(frozen=True)
+class Note:
+    """What a run knew after a frame.
+
+    Attributes
+    ----------
+    mixpose : str
+        Version; others may know other things.
+    frame : int
+    size, checksum : int
+        Of the poses so far: bytes and CRC-32.
+    memory : Memory
+    """
+
+    mixpose: str
+    frame: int
+    size: int
+    checksum: int
+    memory: Memory
+
+
+class Notes:
+    """Writes down every now and then what a run knows."""
+
+    def __init__(self, poses: Path, version: str) -> None:
+        self._path, self._version = note_path(poses), version
+        self._last: tuple[int, LineFile, Memory] | None = None
+        self._written_at = -INTERVAL_S
+
+    def remember(self, frame: int, file: LineFile, memory: Memory) -> None:
+        """Take what is known after a frame whose lines are written."""
+        self._last = frame, file, memory
+        if time.monotonic() - self._written_at >= INTERVAL_S:
+            self.write()
+
+    def write(self) -> None:
+        """Write down what was taken last."""
+        if self._last is None:
+            return
+        frame, file, memory = self._last
+        note = Note(self._version, frame, file.size, file.checksum, memory)
+        with appearing_whole(self._path) as part:
+            part.write_text(json.dumps(encode(note)), encoding="ascii")
+        self._last, self._written_at = None, time.monotonic()
+
+    def drop(self) -> None:
+        """Forget everything: the recording is done."""
+        self._last = None
+        with suppress(OSError):
+            self._path.unlink(missing_ok=True)
+
+
+def note_path(poses: Path) -> Path:
+    """Where the note about a poses file lies."""
+    return poses.with_name(f".{poses.name}.state")
+
+
+@dataclass(frozen=True)
+class Continuation:
+    """How a run goes on.
+
+    Attributes
+    ----------
+    file : LineFile or None
+        What it writes to, at the place where it goes on; None: a file that is opened afresh.
+    selection : Selection
+        Frames to estimate.
+    memory : Memory or None
+        What is known before the first of them.
+    there : ResumePoint or None
+        The last line that is there already, where frames are estimated again up to it.
+    is_done : bool
+        Whether nothing is left to do.
+    """
+
+    file: LineFile | None
+    selection: Selection
+    memory: Memory | None = None
+    there: ResumePoint | None = None
+    is_done: bool = False
+
+
+def continuation(
+    poses: Path, header: Header, wanted: Selection, opened: dict[str, Source]
+) -> Continuation:
+    """How a run goes on in a poses file.
+
+    Raises
+    ------
+    SessionError
+        If the file is of another run, or another run writes to it.
+    RecordingError
+        If the file holds no poses, or the recording cannot be read.
+    """
+    if not poses.is_file():
+        return Continuation(None, wanted)
+    file = LineFile(poses, afresh=False)  # from here on nobody else writes
+    try:
+        reached = resume_point(poses, header)
+        if reached is None:
+            file.close()
+            return Continuation(None, wanted)
+        return _continued(poses, header, wanted, opened, reached, file)
+    except BaseException:
+        with suppress(OSError):
+            file.close()
+        raise
+
+
+def _continued(
+    poses: Path,
+    header: Header,
+    wanted: Selection,
+    opened: dict[str, Source],
+    reached: ResumePoint,
+    file: LineFile,
+) -> Continuation:
+    file.rewind(reached.size, reached.checksum)
+    after = _after(wanted, reached.frame)
+    if not _has_frames(opened, after):
+        return Continuation(file, after, is_done=True)
+    note = _note(poses, header.mixpose)
+    if note is not None:
+        file.rewind(note.size, note.checksum)
+        return Continuation(file, _after(wanted, note.frame), note.memory)
+    say(
+        f"{poses}: what the run knew is not written beside it; its frames up to {reached.frame} "
+        "are estimated again and left as they are"
+    )
+    return Continuation(file, wanted, there=reached)
+
+
+def _after(wanted: Selection, last: int) -> Selection:
+    """What is left of a selection after a frame, on the numbers that all of it would take."""
+    begin = last + 1
+    if wanted.start is not None:
+        steps = max(-(-(begin - wanted.start) // wanted.step), 0)
+        begin = wanted.start + steps * wanted.step
+    elif wanted.step > 1:
+        begin = last + wanted.step
+    return replace(wanted, start=begin)
+
+
+def _has_frames(opened: dict[str, Source], wanted: Selection) -> bool:
+    with closing(pair(opened, wanted.start, wanted.stop, wanted.step)) as frames:
+        return next(frames, None) is not None
+
+
+def _note(poses: Path, version: str) -> Note | None:
+    """The note about a poses file, if there is one that fits it."""
+    try:
+        note = decode(Note, json.loads(note_path(poses).read_bytes()))
+    except (OSError, ValueError, RecursionError):
+        return None
+    beginning = poses.read_bytes()[: note.size]
+    fits = note.mixpose == version and len(beginning) == note.size > 0
+    return note if fits and zlib.crc32(beginning) == note.checksum else None
+
+
+def require_file(output: Path | None, format_name: str) -> Path:
+    """The file that ``--resume`` goes on writing."""
+    if output is None or format_name != "jsonl":
+        raise SessionError("--resume: needs -o FILE in the format jsonl, which it goes on writing")
+    return output

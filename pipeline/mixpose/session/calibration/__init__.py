@@ -1,0 +1,143 @@
+"""Calibration files, told apart by content: a module per format, and the list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from mixpose.session.calibration.aniposelib import ANIPOSELIB
+from mixpose.session.calibration.caliscope import CALISCOPE
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Rig
+from mixpose.session.calibration.colmap import COLMAP
+from mixpose.session.calibration.content import Content, read_content
+from mixpose.session.calibration.kalibr import KALIBR
+from mixpose.session.calibration.opencv import OPENCV, read_nodes
+from mixpose.session.calibration.pycalib import PYCALIB
+from mixpose.session.calibration.ros import ROS
+from mixpose.session.calibration.ros_ini import ROS_INI
+from mixpose.session.intrinsics import CameraModel
+from mixpose.session.messages import BadKeyError, in_file
+from mixpose.session.schema_sensors import CalibrationTable
+
+__all__ = ["FORMATS", "CalibratedCamera", "Rig", "read_calibration", "read_rigs"]
+
+FORMATS: tuple[Format, ...] = (
+    *(KALIBR, OPENCV, PYCALIB, ROS),
+    *(ROS_INI, CALISCOPE, ANIPOSELIB, COLMAP),
+)
+"""In the order in which they are tried: Kalibr's files may begin like OpenCV's."""
+
+
+def read_calibration(
+    wanted: CalibrationTable, folder: Path, model: CameraModel
+) -> CalibratedCamera:
+    """Read the camera that a session names.
+
+    Parameters
+    ----------
+    wanted : CalibrationTable
+        The file, and the nodes or the camera to read in it.
+    folder : Path
+        What the file's path is relative to.
+    model : {"pinhole", "fisheye"}
+        What the session says the camera is.
+
+    Returns
+    -------
+    CalibratedCamera
+        Of that model.
+
+    Raises
+    ------
+    BadKeyError
+        If the file is missing, is in none of the formats, lacks what was asked for, or holds a
+        camera of the other model.
+    """
+    content = read_content(folder / wanted.file, wanted.file)
+    with in_file(wanted.file):
+        camera = _read(content, wanted, model)
+        stated = camera.intrinsics.model
+        if stated not in (None, model):
+            raise BadKeyError(
+                f'found a {stated} camera; change the sensor\'s model from "{model}" '
+                f'to "{stated}" or give another file'
+            )
+    return camera
+
+
+def read_rigs(paths: Sequence[Path]) -> list[Rig]:
+    """Read all cameras of several files; files that belong together may be among them.
+
+    Raises
+    ------
+    BadKeyError
+        Naming the file.
+    """
+    formats: dict[str, tuple[Format, list[Content]]] = {}
+    for path in paths:
+        content = read_content(path, str(path))
+        with in_file(content.name):
+            format_found = format_of(content)
+        formats.setdefault(format_found.name, (format_found, []))[1].append(content)
+    rigs: list[Rig] = []
+    for each, contents in formats.values():
+        with in_file(contents[0].name):
+            groups = each.groups(contents) if each.groups else [[one] for one in contents]
+        for group in groups:
+            with in_file(group[0].name):
+                cameras = tuple(each.read(group, name, "pinhole") for name in each.names(group))
+            rigs.append(Rig(tuple(content.name for content in group), cameras))
+    return rigs
+
+
+def format_of(content: Content) -> Format:
+    """The format that a file is in.
+
+    Raises
+    ------
+    BadKeyError
+        If it is in none.
+    """
+    for each in FORMATS:
+        if each.recognises(content):
+            return each
+    known = ", ".join(each.shown for each in FORMATS)
+    keys = list(content.toml) or content.parsed()
+    shown = ", ".join(map(str, keys)) if isinstance(keys, dict | list) and keys else "no keys"
+    if isinstance(keys, list) and not content.toml:
+        shown = "no keys"
+    raise BadKeyError(f"found {shown[:80]}; allowed: {known}")
+
+
+def _read(content: Content, wanted: CalibrationTable, model: CameraModel) -> CalibratedCamera:
+    each = format_of(content)
+    nodes = {"camera_matrix": wanted.camera_matrix, "distortion": wanted.distortion}
+    if each is OPENCV and any(value is not None for value in nodes.values()):
+        return read_nodes(content, model, wanted.camera_matrix, wanted.distortion)
+    _only_for("an OpenCV file", each.name, **nodes)
+    if not each.holds_several:
+        _only_for("a file of several cameras", each.name, camera=wanted.camera)
+    names = each.names([content])
+    name = wanted.camera
+    if name is None:
+        if len(names) > 1:
+            raise BadKeyError(
+                f"holds the cameras {', '.join(names)}; choose one as "
+                f'calibration = {{ file = "...", camera = "{names[0]}" }}'
+            )
+        name = names[0]
+    if name not in names:
+        raise BadKeyError(
+            f'found no camera "{name}"; cameras in the file: {", ".join(names)}; '
+            f"this is {each.name}"
+        )
+    return each.read([content], name, model)
+
+
+def _only_for(format_with: str, format_found: str, **keys: str | None) -> None:
+    """Refuse a key that the file's format has no use for."""
+    for key, value in keys.items():
+        if value is not None:
+            raise BadKeyError(
+                f'{key} = "{value}" is for {format_with}, this is {format_found}; drop the key'
+            )

@@ -1,0 +1,212 @@
+"""COLMAP's text models: cameras.txt, with images.txt or rigs.txt for where cameras stand.
+
+COLMAP counts pixels from the corner of the first one, mixpose from its centre: principal points
+lose half a pixel.  Lengths are in no unit, as structure from motion has none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from mixpose.rigid import Floats
+from mixpose.session.arrays import LARGEST
+from mixpose.session.calibration.camera import (
+    CalibratedCamera,
+    Format,
+    Group,
+    motion_of_quaternion,
+)
+from mixpose.session.calibration.content import Content
+from mixpose.session.calibration.plain import size_of
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
+from mixpose.session.messages import BadKeyError, found, one_of, under
+
+_MOST_IMAGES = 100
+_CENTRE = 0.5  # px, of a pixel from its corner
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """Where the parameters of a model stand: one or two focal lengths, and its distortion."""
+
+    model: CameraModel
+    focal_lengths: int
+    distortion: tuple[int | None, ...]  # places in OpenCV's order; None for a zero
+
+    @property
+    def count(self) -> int:
+        return self.focal_lengths + 2 + sum(place is not None for place in self.distortion)
+
+
+_LENSES = {
+    "SIMPLE_PINHOLE": _Lens("pinhole", 1, ()),
+    "PINHOLE": _Lens("pinhole", 2, ()),
+    "SIMPLE_RADIAL": _Lens("pinhole", 1, (0, None, None, None)),
+    "RADIAL": _Lens("pinhole", 1, (0, 1, None, None)),
+    "OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3)),
+    "FULL_OPENCV": _Lens("pinhole", 2, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "SIMPLE_RADIAL_FISHEYE": _Lens("fisheye", 1, (0, None, None, None)),
+    "RADIAL_FISHEYE": _Lens("fisheye", 1, (0, 1, None, None)),
+    "OPENCV_FISHEYE": _Lens("fisheye", 2, (0, 1, 2, 3)),
+}
+
+
+def _is_integer(text: str) -> bool:
+    return text.lstrip("-").isdigit()
+
+
+def _rows(content: Content) -> list[list[str]]:
+    return [line.split() for line in content.lines if line and not line.startswith("#")]
+
+
+def _kind(content: Content) -> str:
+    """Which of COLMAP's files this is; empty where it is none."""
+    row = next(iter(_rows(content)), [])
+    match row:
+        case [number, model, width, height, *_] if model.isupper() and model.isascii():
+            if all(map(_is_integer, (number, width, height))):
+                return "cameras"
+        case [number, count, "CAMERA" | "IMU", *_] if _is_integer(number) and _is_integer(count):
+            return "rigs"
+        case [number, *pose, camera, _] if len(pose) == 7 and _is_integer(number):
+            if _is_integer(camera) and len(row) == 10:
+                return "images"
+    return ""
+
+
+def _recognises(content: Content) -> bool:
+    return bool(_kind(content))
+
+
+def _groups(contents: Group) -> list[Group]:
+    return [contents]
+
+
+def _of_kind(group: Group, kind: str) -> Content | None:
+    files = [content for content in group if _kind(content) == kind]
+    if len(files) > 1:
+        raise BadKeyError(f"found {len(files)} files of COLMAP {kind}; allowed: those of one model")
+    return files[0] if files else None
+
+
+def _names(group: Group) -> list[str]:
+    return list(_placed(group))
+
+
+def _placed(group: Group) -> dict[str, tuple[str, Floats | None]]:
+    """By name: the number of the camera, and where it stands."""
+    cameras, images, rigs = (_of_kind(group, kind) for kind in ("cameras", "images", "rigs"))
+    if cameras is None:
+        raise BadKeyError("COLMAP's cameras.txt is missing; give it beside this file")
+    placed = _from_rigs(rigs) if rigs is not None else {}
+    if len(placed) > 1:
+        return placed
+    if images is not None:
+        return _from_images(images)
+    numbers = [row[0] for row in _rows(cameras)]
+    return {f"camera{number}": (number, None) for number in numbers}
+
+
+def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
+    """A sensor for each image: a camera that was moved was at several places."""
+    lines = [line for line in content.lines if not line.startswith("#")]
+    while lines and not lines[0]:
+        lines.pop(0)
+    poses = [line.split(maxsplit=9) for line in lines[::2] if line]
+    if len(poses) > _MOST_IMAGES:
+        raise BadKeyError(
+            f"found {len(poses)} images; allowed: at most {_MOST_IMAGES}, one of each camera: "
+            "mixpose's cameras stand still"
+        )
+    placed: dict[str, tuple[str, Floats | None]] = {}
+    for row in poses:
+        if len(row) != 10:
+            raise BadKeyError(
+                f"found {' '.join(row)[:60]!r}; allowed: IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID "
+                "NAME, and a line of points after each"
+            )
+        name = str(PurePosixPath(row[9]).with_suffix("")).replace("/", "_")
+        with under("image", int(row[0])):
+            placed[name] = (row[8], _motion(row[1:8]))
+    return placed
+
+
+def _from_rigs(content: Content) -> dict[str, tuple[str, Floats | None]]:
+    """Sensors of the only rig: the reference at its origin, the others where they say."""
+    rigs = [row for row in _rows(content) if int(row[1]) > 1]
+    if len(rigs) > 1:
+        raise BadKeyError(f"found {len(rigs)} rigs of several sensors; allowed: one")
+    placed: dict[str, tuple[str, Floats | None]] = {}
+    for row in rigs:
+        kind, number, *rest = row[2:]
+        if kind == "CAMERA":
+            placed[f"camera{number}"] = (number, np.eye(4))
+        while len(rest) >= 3:
+            kind, number, has_pose, *rest = rest
+            pose, rest = (rest[:7], rest[7:]) if has_pose == "1" else (None, rest)
+            if kind == "CAMERA":
+                with under("rig", int(row[0]), f"camera{number}"):
+                    placed[f"camera{number}"] = (number, _motion(pose) if pose else None)
+    return placed
+
+
+def _motion(cells: Sequence[str]) -> Floats:
+    values = _floats(cells)
+    if len(values) != 7:
+        raise BadKeyError(found(" ".join(cells), "QW QX QY QZ TX TY TZ"))
+    return motion_of_quaternion(values[:4], values[4:])
+
+
+def _floats(cells: Sequence[str]) -> list[float]:
+    values = []
+    for cell in cells:
+        try:
+            value = float(cell)
+        except ValueError:
+            value = np.nan
+        if not abs(value) < LARGEST:
+            raise BadKeyError(found(cell, "a finite number"))
+        values.append(value)
+    return values
+
+
+def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+    placed = _placed(group)
+    number, pose = placed[name]
+    cameras = _of_kind(group, "cameras")
+    assert cameras is not None, "without it there are no names"
+    row = next((row for row in _rows(cameras) if row[0] == number), None)
+    if row is None:
+        raise BadKeyError(f"found no camera {number} in {cameras.name}, which {name} was taken by")
+    with under("camera", int(number)):
+        intrinsics = _intrinsics(row)
+    note = "" if pose is None else "COLMAP's lengths have no unit and no scale"
+    places = sum(number == other for other, _ in placed.values())
+    if places > 1:
+        note += f"; camera {number} was at {places} places, each of which is a sensor here"
+    return CalibratedCamera(name, intrinsics, pose, None, note)
+
+
+def _intrinsics(row: list[str]) -> Intrinsics:
+    if row[1] not in _LENSES:
+        raise BadKeyError(found(row[1], one_of(_LENSES)))
+    lens = _LENSES[row[1]]
+    values = _floats(row[4:])
+    if len(values) != lens.count:
+        raise BadKeyError(
+            f"found {len(values)} parameters of {row[1]}; allowed: {lens.count} of them"
+        )
+    fx, fy = values[0], values[lens.focal_lengths - 1]
+    cx, cy, *rest = values[lens.focal_lengths :]
+    K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
+    D = np.array([0.0 if place is None else rest[place] for place in lens.distortion])
+    return Intrinsics(K, D, size_of([int(row[2]), int(row[3])]), lens.model)
+
+
+COLMAP = Format(
+    "a COLMAP file", "COLMAP's text (cameras.txt ...)", _recognises, _names, _read, _groups
+)

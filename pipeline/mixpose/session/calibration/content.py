@@ -1,0 +1,94 @@
+"""A calibration file as read: its text, and what is in it where that is YAML, JSON or TOML."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from mixpose.session.calibration.yaml_text import parse_yaml
+from mixpose.session.messages import BadKeyError, in_file
+from mixpose.session.text_files import as_text, read_bytes
+
+# how a NumPy array, an archive of them, and a pickle of Python begin
+_NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
+
+
+@dataclass(frozen=True)
+class Content:
+    """A calibration file.
+
+    Attributes
+    ----------
+    name : str
+        As the user wrote it.
+    text : str
+    """
+
+    name: str
+    text: str
+
+    @property
+    def stem(self) -> str:
+        """The file's name without folder and ending."""
+        return Path(self.name).stem
+
+    @cached_property
+    def lines(self) -> list[str]:
+        """Lines of the text without blanks around them."""
+        return [line.strip() for line in self.text.splitlines()]
+
+    def parsed(self) -> Any:
+        """What the text says as JSON or YAML.
+
+        Raises
+        ------
+        BadKeyError
+            If it is neither.
+        """
+        if self.text.lstrip().startswith("{"):
+            try:
+                return json.loads(self.text)
+            except (ValueError, RecursionError):
+                pass  # YAML allows braces too, and says where it fails
+        return parse_yaml(self.text)
+
+    @cached_property
+    def mapping(self) -> dict[Any, Any]:
+        """Keys and values of JSON or YAML; empty where it is neither, or OpenCV's own dialect."""
+        if "opencv-matrix" in self.text or self.text.lstrip().startswith("<"):
+            return {}
+        try:
+            content = self.parsed()
+        except BadKeyError:
+            return {}
+        return content if isinstance(content, dict) else {}
+
+    @cached_property
+    def toml(self) -> dict[str, Any]:
+        """Tables of TOML; empty where it is none."""
+        try:
+            return tomllib.loads(self.text)
+        except (ValueError, RecursionError):
+            return {}
+
+
+def read_content(path: Path, name: str) -> Content:
+    """Read a calibration file.
+
+    Raises
+    ------
+    BadKeyError
+        If it is missing or no text.
+    """
+    content = read_bytes(path)
+    with in_file(name):
+        if content.startswith(_NO_TEXT):
+            raise BadKeyError(
+                "a NumPy or pickle file; write camera matrix and distortion with cv2.FileStorage, "
+                "or as numbers into camera_matrix and distortion in place of calibration"
+            )
+        return Content(name, as_text(content))

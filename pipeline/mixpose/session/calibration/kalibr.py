@@ -1,0 +1,109 @@
+"""Kalibr's camchain: pinhole cameras with radtan or equidistant distortion, in metres.
+
+Each camera has ``T_cn_cnm1``, from the coordinates of the one before it.  Files of visual-inertial
+programs (OpenVINS) have ``T_cam_imu`` or its inverse ``T_imu_cam`` in its place.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mixpose.rigid import Floats, inverse
+from mixpose.session.arrays import numbers
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
+from mixpose.session.calibration.content import Content
+from mixpose.session.calibration.plain import model_of_distortion, plain, present, size_of
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.messages import BadKeyError, found, under
+from mixpose.session.motion import rigid
+
+_MATRIX = "a 4x4 matrix, four rows of four numbers"
+
+
+def _cameras(content: Content) -> list[str]:
+    return [
+        name
+        for name, camera in content.mapping.items()
+        if isinstance(name, str) and isinstance(camera, dict) and "intrinsics" in camera
+    ]
+
+
+def _recognises(content: Content) -> bool:
+    return bool(_cameras(content))
+
+
+def _names(group: Group) -> list[str]:
+    return _cameras(group[0])
+
+
+def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+    camera = group[0].mapping[name]
+    with under(name):
+        if camera.get("camera_model", "pinhole") != "pinhole":
+            raise BadKeyError(found(camera["camera_model"], '"pinhole"'), "camera_model")
+        with under("distortion_model"):
+            stated = present(camera, "distortion_model")
+            model = model_of_distortion(stated) or "pinhole"
+        with under("intrinsics"):
+            K = _matrix(plain(camera["intrinsics"]))
+        with under("distortion_coeffs"):
+            coefficients = [] if stated == "none" else present(camera, "distortion_coeffs")
+            D = distortion(plain(coefficients), model)
+        with under("resolution"):
+            size = size_of(camera.get("resolution"))
+    pose = _pose(group[0].mapping, _cameras(group[0]), name)
+    return CalibratedCamera(name, Intrinsics(K, D, size, model), pose, "m")
+
+
+def _matrix(intrinsics: Any) -> Floats:
+    if not isinstance(intrinsics, list) or len(intrinsics) != 4:
+        raise BadKeyError(found(intrinsics, "[fu, fv, pu, pv]"))
+    fu, fv, pu, pv = intrinsics
+    return camera_matrix([[fu, 0.0, pu], [0.0, fv, pv], [0.0, 0.0, 1.0]])
+
+
+def _pose(chain: dict[str, Any], names: list[str], wanted: str) -> Floats | None:
+    """From the first camera's coordinates to those of another; None where a link is missing."""
+    T = np.eye(4)
+    for before, name in zip([None, *names], names):
+        if before is not None:
+            step = _step(chain, before, name)
+            if step is None:
+                return None
+            T = step @ T
+        if name == wanted:
+            break
+    # a camera alone has no place in anything
+    return T if len(names) > 1 else None
+
+
+def _step(chain: dict[str, Any], before: str, name: str) -> Floats | None:
+    own = _motion(chain, name, "T_cn_cnm1")
+    if own is not None:
+        return own
+    first, second = _from_imu(chain, before), _from_imu(chain, name)
+    return None if first is None or second is None else second @ inverse(first)
+
+
+def _from_imu(chain: dict[str, Any], name: str) -> Floats | None:
+    T_cam_imu = _motion(chain, name, "T_cam_imu")
+    if T_cam_imu is not None:
+        return T_cam_imu
+    T_imu_cam = _motion(chain, name, "T_imu_cam")
+    return None if T_imu_cam is None else inverse(T_imu_cam)
+
+
+def _motion(chain: dict[str, Any], name: str, key: str) -> Floats | None:
+    if key not in chain[name]:
+        return None
+    with under(name):
+        with under(key):
+            matrix = numbers(plain(chain[name][key]), (4, 4), _MATRIX)
+        return rigid(matrix, key)
+
+
+KALIBR = Format(
+    "a Kalibr file", "Kalibr camchain (cam0: intrinsics ...)", _recognises, _names, _read
+)

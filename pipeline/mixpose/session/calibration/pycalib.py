@@ -1,0 +1,60 @@
+"""pycalib's JSON: lists K, d, R and t with an entry per camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
+from mixpose.session.calibration.content import Content
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.messages import BadKeyError, under
+
+_DEEP = 3  # a list of matrices; one matrix alone is a camera of another format
+
+
+def _depth(value: Any) -> int:
+    depth = 0
+    while isinstance(value, list) and value:
+        value, depth = value[0], depth + 1
+    return depth
+
+
+def _recognises(content: Content) -> bool:
+    return _depth(content.mapping.get("K")) == _DEEP
+
+
+def _names(group: Group) -> list[str]:
+    count = len(group[0].mapping["K"])
+    return [f"cam{k + 1:0{len(str(count))}}" for k in range(count)]
+
+
+def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+    content = group[0].mapping
+    k = int(name.removeprefix("cam")) - 1
+    with under("K", k):
+        K = camera_matrix(content["K"][k])
+    coefficients = _entry(content, "d", k)
+    with under("d", k):
+        D = distortion(coefficients, model)
+    pose = None
+    if "R" in content or "t" in content:
+        rotation, translation = _entry(content, "R", k), _entry(content, "t", k)
+        with under(name):
+            pose = motion_of(rotation, translation, key="R")
+    return CalibratedCamera(name, Intrinsics(K, D), pose)
+
+
+def _entry(content: dict[str, Any], key: str, k: int) -> Any:
+    values = content.get(key)
+    count = len(content["K"])
+    if not isinstance(values, list) or len(values) != count:
+        raise BadKeyError(
+            f"not {count} entries; allowed: one for each camera matrix of K"
+            if values is not None
+            else "missing; allowed: a list with an entry for each camera",
+            key,
+        )
+    return values[k]
+
+
+PYCALIB = Format("a pycalib file", "pycalib (K, d, R, t, lists)", _recognises, _names, _read)

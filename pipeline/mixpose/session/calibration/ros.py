@@ -1,0 +1,83 @@
+"""ROS's camera_info: a YAML file as camera_calibration saves it, or a message as printed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
+from mixpose.session.calibration.content import Content
+from mixpose.session.calibration.plain import MODELS, model_of_distortion, plain, present, size_of
+from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix, distortion
+from mixpose.session.messages import BadKeyError, found, one_of, under
+
+
+def _recognises(content: Content) -> bool:
+    return bool({"camera_matrix", "K", "k"} & set(map(str, content.mapping)))
+
+
+def _names(group: Group) -> list[str]:
+    name = group[0].mapping.get("camera_name")
+    return [name if isinstance(name, str) and name.strip() else group[0].stem]
+
+
+def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
+    content = group[0].mapping
+    _whole_image(content)
+    with under("distortion_model"):
+        stated = model_of_distortion(content.get("distortion_model"))
+    matrix_key = _first(content, ("camera_matrix", "K", "k"))
+    with under(matrix_key):
+        K = camera_matrix(_matrix_data(content[matrix_key]))
+    distortion_key = _first(content, ("distortion_coefficients", "D", "d"))
+    with under(distortion_key):
+        D = distortion(_matrix_data(present(content, distortion_key)), stated or model)
+        if D.size and stated is None:
+            raise BadKeyError(
+                f"found {D.size} coefficients without a distortion_model; "
+                f"allowed: one of {one_of(MODELS)}"
+            )
+    width = content.get(_first(content, ("image_width", "width")))
+    height = content.get(_first(content, ("image_height", "height")))
+    with under("image_width"):
+        size = None if width is None and height is None else size_of([width, height])
+    return CalibratedCamera(name, Intrinsics(K, D, size, stated))
+
+
+def _whole_image(content: dict[str, Any]) -> None:
+    for key in ("binning_x", "binning_y"):
+        if content.get(key, 0) not in (0, 1):
+            raise BadKeyError(
+                f"{found(content[key], '0 or 1')}; for binned images give camera_matrix and "
+                "resolution in the session file",
+                key,
+            )
+    roi = content.get("roi")
+    if not isinstance(roi, dict):
+        return
+    for key in ("x_offset", "y_offset"):
+        if roi.get(key, 0) != 0:
+            raise BadKeyError(
+                f"{found(roi[key], '0')}; for cropped images give camera_matrix and resolution "
+                "in the session file",
+                "roi",
+                key,
+            )
+
+
+def _first(content: dict[str, Any], keys: tuple[str, ...]) -> str:
+    return next((key for key in keys if key in content), keys[0])
+
+
+def _matrix_data(value: Any) -> Any:
+    """The numbers of a matrix, written as rows, cols and data or as a plain list."""
+    return plain(value.get("data") if isinstance(value, dict) else value)
+
+
+ROS = Format(
+    "a ROS file",
+    "ROS camera_info (camera_matrix ...)",
+    _recognises,
+    _names,
+    _read,
+    holds_several=False,
+)

@@ -1,0 +1,221 @@
+"""What else is before the cameras: lamps, a polished table, the markers of others, an arm.
+
+Placed about the middle of the body's motion, between what the cameras look at and beyond, and drawn
+from a seed.  Sensors of ranges know nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from mixpose.body import Body, PointFeature
+from mixpose.records import Floats
+from mixpose.rigid import from_parts, rotation_matrix
+from mixpose.sensors import Sensor
+from mixpose.simulation.draws import Purpose, generator
+from mixpose.simulation.motion import Motion, plan_motion
+from mixpose.simulation.options import SimulationOptions
+
+PoseAt: TypeAlias = Callable[[float], Floats]
+
+_LAMP = 0.12  # of the body's radius
+_LAMP_LEVEL = 3.0  # of a marker: the image is white there
+_LAMPS_AWAY = (3.0, 6.0)  # radii behind the body
+_LAMPS_ASIDE = 3.0
+_TABLE_BELOW = 1.3  # radii under the middle of the motion
+_OTHERS_ASIDE = (2.2, 3.2)
+_OTHERS_MOVE = 0.3
+_ARM_BEFORE = 2.5  # radii towards the cameras
+_ARM_SWING = 1.5
+_ARM_LENGTH = 8.0
+_ARM_WIDTH = 0.22
+_ARM_PERIOD = 0.8  # of that of the body
+
+
+@dataclass(frozen=True)
+class Actor:
+    """Markers that are no part of the body.
+
+    Attributes
+    ----------
+    body : Body
+    pose : callable
+        From seconds to T_world_object (4, 4).
+    levels : (N,) float64
+        Brightness.
+    mirror : (4, 4) float64 or None
+        Reflection of the world in which they are seen.
+    is_image : bool
+        Whether they are a mirror image of the body, and gone when it is.
+    """
+
+    body: Body
+    pose: PoseAt
+    levels: Floats
+    mirror: Floats | None = None
+    is_image: bool = False
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A straight dark bar that swings before the body.
+
+    Attributes
+    ----------
+    ends : (2, 3) float64
+        At rest, in the world.
+    swing : (3,) float64
+        Farthest displacement.
+    period_s, phase : float
+    radius : float
+        Half its width.
+    """
+
+    ends: Floats
+    swing: Floats
+    period_s: float
+    phase: float
+    radius: float
+
+    def outline(self, sensor: Sensor, time_s: float) -> Floats:
+        """Corners (4, 2) of the bar in a sensor without bounds, px; none where it is not seen."""
+        ends = self.ends + self.swing * np.sin(2 * np.pi * time_s / self.period_s + self.phase)
+        along = ends[1] - ends[0]
+        across = np.cross(along, sensor.towards(ends.mean(axis=0)))
+        across *= self.radius / np.linalg.norm(across)
+        corners = [ends[0] + across, ends[1] + across, ends[1] - across, ends[0] - across]
+        y, visible = sensor.project(np.array(corners))
+        return y if visible.all() else y[:0]
+
+
+@dataclass(frozen=True)
+class Scenery:
+    """All that is before the cameras beside the body."""
+
+    actors: tuple[Actor, ...] = ()
+    arms: tuple[Arm, ...] = ()
+
+
+def plan_scenery(
+    body: Body, motion: Motion, cameras: Sequence[Sensor], options: SimulationOptions
+) -> Scenery:
+    """Place what the options ask for about a body in front of cameras."""
+    wanted = options.lamps or options.others or options.occluder or options.mirror
+    if not cameras or not wanted:
+        return Scenery()
+    rng = generator(options.seed, Purpose.SCENERY)
+    R, t = motion.T_world_object[:3, :3], motion.T_world_object[:3, 3]
+    middle = R @ motion.pivot + t
+    front = _unit(np.mean([_unit(camera.towards(middle)) for camera in cameras], axis=0))
+    down = _unit(np.mean([_down(camera, middle) for camera in cameras], axis=0))
+    side = _unit(np.cross(front, down))
+    frame = np.stack([side, down, front])
+    actors = [
+        *_lamps(body, middle, frame, options, rng),
+        *(_other(body, middle, frame, options, k, rng) for k in range(options.others)),
+    ]
+    if options.mirror:
+        plane = middle + _TABLE_BELOW * body.radius * down
+        mirror = _reflection(plane, down)
+        levels = np.full(len(body), options.mirror)
+        images = [Actor(body, motion_pose(motion), levels, mirror, is_image=True)]
+        images += [
+            Actor(one.body, one.pose, options.mirror * one.levels, mirror)
+            for one in actors[options.lamps :]
+        ]
+        actors += images
+    arms = tuple(_arm(body, middle, frame, options, rng) for _ in range(options.occluder))
+    return Scenery(tuple(actors), arms)
+
+
+def motion_pose(motion: Motion) -> PoseAt:
+    """The pose of a motion at a time."""
+    return lambda time_s: motion.poses(np.array(time_s))
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _down(camera: Sensor, middle: Floats) -> Floats:
+    """Where the image's rows go, in the world about a point: a small step that is seen below."""
+    _, J, _ = camera.linearise(middle)
+    return _unit(J[1] - J[0] * (J[0] @ J[1]) / max(float(J[0] @ J[0]), 1e-300))
+
+
+def _lamps(
+    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
+) -> list[Actor]:
+    """Lamps behind the body that stay where they are."""
+    lamps = []
+    for _ in range(options.lamps):
+        aside = rng.uniform(-_LAMPS_ASIDE, _LAMPS_ASIDE, 2)
+        place = middle + body.radius * (np.array([*aside, -rng.uniform(*_LAMPS_AWAY)]) @ frame)
+        lamp = Body(
+            "lamp", (PointFeature(place),), None, None, "sphere", np.array([_LAMP * body.radius])
+        )
+        lamps.append(Actor(lamp, lambda _: np.eye(4), np.array([_LAMP_LEVEL])))
+    return lamps
+
+
+def _other(
+    body: Body,
+    middle: Floats,
+    frame: Floats,
+    options: SimulationOptions,
+    index: int,
+    rng: np.random.Generator,
+) -> Actor:
+    """As many markers as the body has, elsewhere on another body that moves by itself."""
+    count = len(body)
+    directions = rng.standard_normal((count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    places = body.radius * directions * rng.uniform(0.3, 1.0, (count, 1))
+    normals = None if body.normals is None else np.tile(frame[2], (count, 1))
+    features = tuple(PointFeature(place) for place in places)
+    radii = None if body.radii is None else np.full(count, float(np.median(body.radii)))
+    other = Body("other", features, normals, None, body.shape, radii)
+    angle = rng.uniform(0, 2 * np.pi)
+    aside = rng.uniform(*_OTHERS_ASIDE) * np.array([np.cos(angle), np.sin(angle), 0.0])
+    T = from_parts(
+        rotation_matrix(0.3 * rng.standard_normal(3)), middle + body.radius * (aside @ frame)
+    )
+    motion = plan_motion(
+        T,
+        np.zeros(3),
+        translation=_OTHERS_MOVE * body.radius,
+        rotation_deg=options.amplitude_rotation_deg,
+        period_s=options.period_s,
+        seed=options.seed + 7919 * (index + 1),
+    )
+    return Actor(other, motion_pose(motion), np.ones(count))
+
+
+def _arm(
+    body: Body, middle: Floats, frame: Floats, options: SimulationOptions, rng: np.random.Generator
+) -> Arm:
+    """A bar across the view that swings over the body and beside it."""
+    angle = rng.uniform(0, np.pi)
+    along = np.array([np.cos(angle), np.sin(angle), 0.0]) @ frame
+    swing = np.array([-np.sin(angle), np.cos(angle), 0.0]) @ frame
+    centre = middle + _ARM_BEFORE * body.radius * frame[2]
+    reach = 0.5 * _ARM_LENGTH * body.radius * along
+    return Arm(
+        np.array([centre - reach, centre + reach]),
+        _ARM_SWING * body.radius * swing,
+        _ARM_PERIOD * options.period_s,
+        rng.uniform(0, 2 * np.pi),
+        _ARM_WIDTH * body.radius,
+    )
+
+
+def _reflection(point: Floats, normal: Floats) -> Floats:
+    """The map (4, 4) of the world onto its mirror image in a plane."""
+    M = np.eye(4)
+    M[:3, :3] -= 2 * np.outer(normal, normal)
+    M[:3, 3] = 2 * (point @ normal) * normal
+    return M

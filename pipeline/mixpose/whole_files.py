@@ -1,0 +1,30 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+def partial_of(path: Path) -> Path:
+    """Where a file is written before it is whole: beside it, hidden, with its suffix."""
+    return path.with_name(f".{path.stem}.part{path.suffix}")
+
+
+@contextmanager
+def appearing_whole(path: Path) -> Iterator[Path]:
+    """A path to write to, moved to `path` at the end; nothing is left of it after an error.
+
+    What stood at `path` stays until then.  A device or a pipe is written to as it is.
+    """
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    part = partial_of(path)
+    try:
+        yield part
+        os.replace(part, path)  # noqa: PTH105 - also where the file exists, on every system
+    finally:
+        part.unlink(missing_ok=True)

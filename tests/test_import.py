@@ -1,0 +1,380 @@
+"""``mixpose import``: rigs of other programs, to the last bit, and what is odd about them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import calibration_texts as texts
+import numpy as np
+import pytest
+
+from mixpose.errors import SessionError
+from mixpose.importing import gather, session_text
+from mixpose.rigid import Floats
+from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.session import Session, load_session
+from mixpose.session.setup import Unit
+
+Writer = Callable[[Path], list[Path]]
+
+
+def one(name: str, text: str) -> Writer:
+    def write(folder: Path) -> list[Path]:
+        (folder / name).write_text(text, encoding="utf-8")
+        return [folder / name]
+
+    return write
+
+
+# files, unit of their lengths where they do not say, millimetres per unit of the writer, names
+RIGS: dict[str, tuple[Writer, Unit | None, list[str]]] = {
+    "kalibr": (one("chain.yaml", texts.kalibr()), None, ["cam0", "cam1"]),
+    "kalibr as OpenVINS": (
+        one("chain.yaml", texts.kalibr("%YAML:1.0\n\n", ("T_cam_imu", "T_cam_imu"))),
+        None,
+        ["cam0", "cam1"],
+    ),
+    "kalibr as OpenVINS, inverse": (
+        one("c.yaml", texts.kalibr("%YAML:1.0 # type\n", ("T_imu_cam", "T_imu_cam"))),
+        None,
+        ["cam0", "cam1"],
+    ),
+    "opencv stereo yml": (
+        lambda folder: texts.stereo_storage(folder, "yml"),
+        "mm",
+        ["camera1", "camera2"],
+    ),
+    "opencv stereo xml, other order": (
+        lambda folder: texts.stereo_storage(folder, "xml")[::-1],
+        "mm",
+        ["camera1", "camera2"],
+    ),
+    "opencv stereo json": (
+        lambda folder: texts.stereo_storage(folder, "json"),
+        "mm",
+        ["camera1", "camera2"],
+    ),
+    "MC-Calib": (one("c.yml", texts.mc_calib()), "cm", ["camera_0", "camera_1"]),
+    "MC-Calib, header 1.2": (
+        one("c.yml", texts.mc_calib("%YAML 1.2\n---\n")),
+        "cm",
+        ["camera_0", "camera_1"],
+    ),
+    "pycalib": (one("c.json", texts.pycalib()), "cm", ["cam1", "cam2"]),
+    "caliscope": (one("camera_array.toml", texts.toml("cameras.")), None, ["cam0", "cam1"]),
+    "caliscope, matrices": (
+        one("camera_array.toml", texts.toml("cameras.", as_vector=False)),
+        None,
+        ["cam0", "cam1"],
+    ),
+    "aniposelib": (
+        one("calibration.toml", texts.toml("cam_", scale=1000, names=True)),
+        "mm",
+        ["view0", "view1"],
+    ),
+    "colmap images": (
+        lambda folder: texts.colmap(folder, with_rig=False),
+        "m",
+        ["view_0", "view_1"],
+    ),
+    "colmap rigs": (
+        lambda folder: texts.colmap(folder, with_rig=True)[::-1],
+        "m",
+        ["camera1", "camera2"],
+    ),
+}
+
+
+def imported(paths: list[Path], unit: Unit, lengths: Unit | None, output: Path) -> Session:
+    output.write_text(session_text(gather(paths, unit, lengths), output), encoding="utf-8")
+    return load_session(output)
+
+
+def expect_rig(session: Session, millimetres: float) -> None:
+    matrices: list[Floats] = [texts.K1, texts.K2]
+    for setup, K, D in zip(session.sensors, matrices, (texts.D1, texts.D2), strict=True):
+        assert isinstance(setup.sensor, PinholeCamera)
+        np.testing.assert_array_equal(setup.sensor.camera_matrix, K)
+        np.testing.assert_array_equal(setup.sensor.distortion, D)
+    first, second = (setup.sensor for setup in session.sensors)
+    assert isinstance(first, PinholeCamera)
+    assert isinstance(second, PinholeCamera)
+    np.testing.assert_allclose(first.T_sensor_world, np.eye(4), atol=1e-15)
+    # rounding of a product and a projection onto rotations
+    np.testing.assert_allclose(
+        second.T_sensor_world, texts.T_second_first(1000 / millimetres), rtol=1e-12, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("unit", ["mm", "m"])
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_comes_out_as_it_went_in(tmp_path: Path, name: str, unit: Unit) -> None:
+    write, lengths, names = RIGS[name]
+    session = imported(write(tmp_path), unit, lengths, tmp_path / "session.toml")
+    assert [setup.name for setup in session.sensors] == names
+    assert session.unit == unit
+    expect_rig(session, {"mm": 1.0, "m": 1000.0}[unit])
+    if "stereo" not in name and name != "pycalib":
+        assert session.sensors[0].resolution == texts.SIZE
+
+
+@pytest.mark.parametrize("name", [name for name in RIGS if "stereo" not in name])
+def test_a_session_that_names_the_file_has_the_same_cameras(tmp_path: Path, name: str) -> None:
+    write, lengths, names = RIGS[name]
+    paths = write(tmp_path)
+    file = next((path for path in paths if path.name == "cameras.txt"), paths[0]).name
+    names = ["camera1", "camera2"] if "colmap" in name else names
+    sensors = [
+        f'[[sensor]]\nname = "s{each}"\nmodel = "pinhole"\n'
+        f'calibration = {{ file = "{file}", camera = "{each}"'
+        + (f', unit = "{lengths}" }}' if lengths else " }")
+        for each in names
+    ]
+    path = tmp_path / "session.toml"
+    path.write_text(
+        'unit = "mm"\n[object]\nname = "o"\npoints = [[0,0,0],[1,0,0],[0,1,0]]\n'
+        + "\n".join(sensors),
+        encoding="utf-8",
+    )
+    session = load_session(path)
+    if "colmap" in name:  # where its cameras stand is in the other files
+        for setup in session.sensors:
+            assert isinstance(setup.sensor, PinholeCamera)
+            np.testing.assert_array_equal(setup.sensor.T_sensor_world, np.eye(4))
+        return
+    expect_rig(session, 1.0)
+
+
+def test_a_pose_without_a_unit_is_asked_for(tmp_path: Path) -> None:
+    (tmp_path / "c.json").write_text(texts.pycalib(), encoding="utf-8")
+    (tmp_path / "session.toml").write_text(
+        'unit = "mm"\n[object]\nname = "o"\npoints = [[0,0,0],[1,0,0],[0,1,0]]\n'
+        '[[sensor]]\nname = "s"\nmodel = "pinhole"\n'
+        'calibration = { file = "c.json", camera = "cam2" }\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(SessionError, match=r'calibration\.unit: c\.json says where .* unit = "mm"'):
+        load_session(tmp_path / "session.toml")
+
+
+def test_an_ini_file_of_ros(tmp_path: Path) -> None:
+    session = imported(one("c.ini", texts.ROS_INI)(tmp_path), "mm", None, tmp_path / "s.toml")
+    (setup,) = session.sensors
+    assert (setup.name, setup.resolution) == ("left", texts.SIZE)
+    assert isinstance(setup.sensor, PinholeCamera)
+    np.testing.assert_array_equal(setup.sensor.camera_matrix, texts.K1)
+    np.testing.assert_array_equal(setup.sensor.distortion, [*texts.D1, 0.0])
+
+
+def test_fisheye_lenses_of_every_format_that_has_them(tmp_path: Path) -> None:
+    chain = texts.kalibr().replace("radtan", "equidistant")
+    storage = texts.mc_calib().replace("distortion_type: 0", "distortion_type: 1")
+    tables = texts.toml("cameras.").replace("size =", "fisheye = true\nsize =")
+    for k, text in enumerate((chain, storage, tables)):
+        session = imported(one(f"c{k}.toml", text)(tmp_path), "m", "cm", tmp_path / f"s{k}.toml")
+        for setup in session.sensors:
+            assert isinstance(setup.sensor, FisheyeCamera)
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "distortion"),
+    [
+        ("SIMPLE_PINHOLE", "800 640.5 512.5", []),
+        ("PINHOLE", "800 810 640.5 512.5", []),
+        ("SIMPLE_RADIAL", "800 640.5 512.5 -0.1", [-0.1, 0, 0, 0]),
+        ("RADIAL", "800 640.5 512.5 -0.1 0.02", [-0.1, 0.02, 0, 0]),
+        ("FULL_OPENCV", "800 810 640.5 512.5 1 2 3 4 5 6 7 8", [1, 2, 3, 4, 5, 6, 7, 8]),
+        ("OPENCV_FISHEYE", "800 810 640.5 512.5 0.1 0.2 0.3 0.4", [0.1, 0.2, 0.3, 0.4]),
+        ("SIMPLE_RADIAL_FISHEYE", "800 640.5 512.5 0.1", [0.1, 0, 0, 0]),
+    ],
+)
+def test_lenses_of_colmap_and_its_corner_of_pixels(
+    tmp_path: Path, model: str, parameters: str, distortion: list[float]
+) -> None:
+    write = one("cameras.txt", f"# Camera list\n7 {model} 1280 1024 {parameters}\n")
+    (camera,) = gather(write(tmp_path), "mm", None).cameras
+    assert camera.name == "camera7"
+    np.testing.assert_array_equal(camera.intrinsics.camera_matrix[:2, 2], [640, 512])
+    assert camera.intrinsics.camera_matrix[0, 0] == 800
+    np.testing.assert_array_equal(camera.intrinsics.distortion, distortion)
+    assert camera.intrinsics.model == ("fisheye" if "FISHEYE" in model else "pinhole")
+
+
+WRONG = {
+    "kalibr model": (texts.kalibr().replace("model: pinhole", "model: omni"), '"omni"'),
+    "kalibr lens": (texts.kalibr().replace("radtan", "fov"), 'cam0.distortion_model: found "fov"'),
+    "kalibr chain": (
+        texts.kalibr().replace("- [0.0, 0.0, 0.0, 1.0]", "- [0, 1]"),
+        "cam1.T_cn_cnm1",
+    ),
+    "kalibr scaled": (
+        texts.kalibr().replace("- [0.0, 0.0, 0.0, 1.0]", "- [0, 0, 0, 2]"),
+        "found no rigid motion: its last row",
+    ),
+    "opencv": (texts.mc_calib().replace("rows: 3", "rows: 2"), "camera_0.camera_matrix: found a"),
+    "opencv pose": (
+        texts.mc_calib().replace("camera_pose_matrix", "camera_pose_matrix ").replace("1.0]", "9]"),
+        "camera_0",
+    ),
+    "opencv cut": (texts.mc_calib()[:400], "OpenCV cannot parse"),
+    "pycalib": (texts.pycalib().replace('"d"', '"dist"'), "d: missing"),
+    "pycalib rotation": (
+        texts.pycalib().replace("[[1.0, 0.0, 0.0]", "[[1.5, 0.0, 0.0]"),
+        "no rigid motion",
+    ),
+    "ini": (texts.ROS_INI.replace("810.500000", "f"), "camera matrix: found"),
+    "ini size": (texts.ROS_INI.replace("1280", "12.5"), "[image]: found [12.5, 1024]"),
+    "caliscope": (texts.toml("cameras.").replace("1280", '"wide"', 1), "cameras.0.size: found"),
+    "aniposelib": (texts.toml("cam_").replace("-0.11, ", "", 1), "cam_0.distortions: found 3"),
+    "aniposelib rotation": (
+        texts.toml("cam_").replace("rotation = [", "rotation = [1.0, ", 1),
+        "cam_0.rotation: found",
+    ),
+    "colmap model": ("1 FOV 640 480 1 1 320 240 0.1\n", "camera[1]: found"),
+    "colmap parameters": (
+        "1 OPENCV 640 480 1 1 320 240\n",
+        "found 4 parameters of OPENCV; allowed: 8",
+    ),
+    "colmap number": ("1 PINHOLE 640 480 1 x 320 240\n", 'found "x"; allowed: a finite number'),
+    "colmap alone": ("1 1 0 0 0 0 0 0 1 a.png\n\n", "cameras.txt is missing"),
+    "unknown": ("hello: world\n", "found hello; allowed: Kalibr"),
+    "binary": ("\x00\x01", "not YAML"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_of_each_format_is_told_in_one_line(tmp_path: Path, name: str) -> None:
+    text, words = WRONG[name]
+    (tmp_path / "wrong.cal").write_text(text, encoding="utf-8")
+    with pytest.raises(SessionError) as caught:
+        gather([tmp_path / "wrong.cal"], "mm", "mm")
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    assert "wrong.cal: " in message
+    assert words in message
+
+
+def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mixpose", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
+    copied = texts.toml("cam_", names=True)
+    copied += copied.split("[metadata]")[0].replace("cam_", "cam_1").replace("view", "again")
+    (tmp_path / "calibration.toml").write_text(copied, encoding="utf-8")
+    (tmp_path / "marks.csv").write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
+    (tmp_path / "out").mkdir()
+    done = run("import", "calibration.toml", "marks.csv", "-o", "out/s.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert "view0 and again0 are the same camera at the same place" in done.stderr
+    assert "taken to be in mm, which the file does not say; if not, add --lengths" in done.stderr
+    assert "4 cameras (view0, view1, again0, again1), lengths in mm -> out/s.toml" in done.stderr
+    session = load_session(tmp_path / "out" / "s.toml")
+    assert session.body.name == "marks"
+    again = run("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "is there already" in again.stderr
+
+
+def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
+    """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
+    chain = texts.kalibr()
+    chain += chain[chain.index("cam1:") :].replace("cam1:", "cam2:")
+    (tmp_path / "chain.yaml").write_text(chain, encoding="utf-8")
+    output = tmp_path / "s.toml"
+    session = imported([tmp_path / "chain.yaml"], "m", None, output)
+    text = output.read_text(encoding="utf-8").replace('unit = "m"', 'unit = "mm"')
+    lines = text.replace("[0.06, 0.0, 0.0]", "[60, 0, 0]").replace("[0.0, 0.1, 0.0]", "[0, 90, 0]")
+    for setup in session.sensors:
+        source = f'# source = "{setup.name}/*.png"'
+        lines = lines.replace(source, f'source = "{setup.name}.csv"')
+        (tmp_path / f"{setup.name}.csv").write_text("frame,u,v\n0,9,9\n", encoding="utf-8")
+    output.write_text(lines, encoding="utf-8")
+    done = run("check", "s.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "'cam0' and 'cam1' stand 0.32 mm apart" in done.stdout
+    assert "are translations in mm?" in done.stdout
+
+
+def recordings() -> Path:
+    folder = os.environ.get("MIXPOSE_RECORDINGS", "")
+    if not folder or not Path(folder).is_dir():
+        pytest.skip("MIXPOSE_RECORDINGS names no folder of recordings")
+    return Path(folder)
+
+
+def test_every_real_calibration_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    root = recordings() / "calibration_files"
+    counts: dict[str, int] = {}
+    for path in sorted(root.rglob("*")):
+        if path.is_dir() or path.name == "README.md":
+            continue
+        try:
+            session = imported([path], "mm", "mm", tmp_path / f"{path.stem}.toml")
+        except SessionError as error:
+            counts[path.name] = -len(str(error).splitlines())
+        else:
+            counts[path.name] = len(session.sensors)
+    assert counts == {
+        "sleap_anipose_duplicate_camera.toml": 4,
+        "rotation_matrix.toml": 4,
+        "rotation_vector_10cams.toml": 11,
+        "cameras.txt": 1,
+        "cameras_2_opencv_models.txt": 2,
+        "images.txt": -1,  # a line: it says nothing about lenses
+        "euroc_mav.yaml": 2,
+        "kaist_vio.yaml": 2,
+        "rs_d455.yaml": 1,
+        "tum_vi.yaml": 2,
+        "miluv_ifo001.yaml": 2,
+        "miluv_ifo002.yaml": 2,
+        "miluv_ifo003.yaml": 2,
+        "mc_calib_2cams_from_readme.yml": 2,
+        "pycalib_15cams.json": 15,
+        "calib5.ini": 1,
+        "calib8.ini": 1,
+        "camera_info_manager_test.yaml": 1,
+    }
+
+
+def test_baselines_of_real_rigs(tmp_path: Path) -> None:
+    """Euclid's distance of the makers' stereo cameras: 11 cm of EuRoC, 5 cm of RealSense."""
+    root = recordings() / "calibration_files" / "kalibr"
+    for name, expected in {"euroc_mav": 110, "kaist_vio": 50, "miluv_ifo001": 50}.items():
+        session = imported([root / f"{name}.yaml"], "mm", None, tmp_path / f"{name}.toml")
+        second = session.sensors[1].sensor
+        assert isinstance(second, PinholeCamera)
+        baseline = float(np.linalg.norm(second.T_sensor_world[:3, 3]))
+        assert baseline == pytest.approx(expected, rel=0.01)  # as their data sheets round
+
+
+def test_a_copied_camera_in_a_real_file_is_noticed() -> None:
+    path = recordings() / "calibration_files" / "aniposelib" / "sleap_anipose_duplicate_camera.toml"
+    warnings = gather([path], "mm", "mm").warnings
+    assert any(warning.startswith("side and top are the same camera") for warning in warnings)
+
+
+def test_a_real_rig_agrees_with_a_session_that_was_made_by_hand(tmp_path: Path) -> None:
+    """The four web cams, whose extrinsics were copied from caliscope's file."""
+    folder = recordings() / "webcams4_a"
+    path = folder / "caliscope" / "camera_array.toml"
+    session = imported([path], "m", None, tmp_path / "s.toml")
+    by_hand = load_session(folder / "session_as_found.toml")
+    for ours, theirs in zip(session.sensors, by_hand.sensors, strict=True):
+        assert isinstance(ours.sensor, PinholeCamera)
+        assert isinstance(theirs.sensor, PinholeCamera)
+        # ten digits were written down
+        np.testing.assert_allclose(
+            ours.sensor.T_sensor_world, theirs.sensor.T_sensor_world, atol=1e-9
+        )

@@ -1,0 +1,186 @@
+"""A run that is killed, cut off by a full disk or disturbed by another, and goes on: same bytes."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.cli import lines, main
+from mixpose.cli.continuation import note_path
+from mixpose.cli.lines import LineFile
+from mixpose.encoding import decode, encode
+from mixpose.errors import SessionError
+from mixpose.rigid import Floats
+from mixpose.runner import Memory
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from kills import one_round, without_latency
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+BEAMS = SYNTHETIC / "parallel_beams" / "session.toml"
+RANGES = SYNTHETIC / "range_profiles" / "session.toml"
+
+needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="limits of files are POSIX's")
+
+
+def command(*arguments: str | Path) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.parametrize("session", [BEAMS, RANGES], ids=["beams", "ranges"])
+def test_a_run_in_pieces_writes_the_bytes_of_a_run_at_once(session: Path, tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole.jsonl", tmp_path / "parts.jsonl"
+    assert command("run", session, "-o", whole) == 0
+    assert command("run", session, "-o", parts, "--stop", "4") == 0
+    assert command("run", session, "-o", parts, "--stop", "5", "--resume") == 0
+    assert command("run", session, "-o", parts, "--resume") == 0
+    assert without_latency(parts) == without_latency(whole)
+    # nothing is left to go on with, so nothing is left beside the poses
+    assert not note_path(parts).exists()
+
+
+@needs_posix
+def test_a_run_killed_at_random_moments_writes_the_bytes_of_an_undisturbed_one(
+    tmp_path: Path,
+) -> None:
+    assert one_round(BEAMS, tmp_path, random.Random(3), 3) == (3, True)
+
+
+def test_without_what_the_run_knew_its_frames_are_estimated_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, parts = tmp_path / "whole.jsonl", tmp_path / "parts.jsonl"
+    assert command("run", RANGES, "-o", whole) == 0
+    text = whole.read_text(encoding="utf-8").splitlines(keepends=True)
+    parts.write_text("".join(text[:4]) + text[4][:50], encoding="utf-8")
+    assert command("run", RANGES, "-o", parts, "--resume") == 0
+    assert "frames up to 2 are estimated again and left as they are" in capsys.readouterr().err
+    assert without_latency(parts) == without_latency(whole)
+    assert parts.read_text(encoding="utf-8").splitlines(keepends=True)[:4] == text[:4]
+
+
+def test_what_another_run_knew_is_not_believed(tmp_path: Path) -> None:
+    whole, parts = tmp_path / "whole.jsonl", tmp_path / "parts.jsonl"
+    assert command("run", RANGES, "-o", whole) == 0
+    assert command("run", RANGES, "-o", parts, "--stop", "4") == 0
+    lines_there = parts.read_bytes().replace(b'"latency_ms": ', b'"latency_ms": 1')
+    parts.write_bytes(lines_there)  # no longer what the note was about
+    assert command("run", RANGES, "-o", parts, "--resume") == 0
+    assert without_latency(parts) == without_latency(whole)
+
+
+@needs_posix
+def test_two_runs_never_write_to_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lines, "PATIENCE_S", 0.0)
+    first = LineFile(tmp_path / "poses.jsonl")
+    with pytest.raises(SessionError, match="another run is writing to this file"):
+        LineFile(tmp_path / "poses.jsonl")
+    first.close()
+    LineFile(tmp_path / "poses.jsonl").close()
+
+
+def limited(size: int, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """A command whose files cannot grow beyond a size, as on a full disk."""
+    import resource
+
+    def limit() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return subprocess.run(
+        [sys.executable, "-m", "mixpose", *map(str, arguments)],
+        capture_output=True, text=True, check=False, preexec_fn=limit,
+    )  # fmt: skip
+
+
+@needs_posix
+def test_on_a_full_disk_the_last_line_is_whole_and_the_file_is_named(tmp_path: Path) -> None:
+    poses, whole = tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
+    result = limited(6000, "run", RANGES, "-o", poses)
+    assert result.returncode == 2
+    assert result.stderr == (
+        f"mixpose: -o {poses}: cannot be written: File too large; the lines before are whole\n"
+    )
+    content = poses.read_text(encoding="utf-8")
+    assert content.endswith("}\n")
+    assert 1 < len([json.loads(line) for line in content.splitlines()]) < 11
+    assert command("run", RANGES, "-o", poses, "--resume") == 0
+    assert command("run", RANGES, "-o", whole) == 0
+    assert without_latency(poses) == without_latency(whole)
+
+
+@needs_posix
+def test_on_a_full_disk_a_converted_file_stays_as_it_was(tmp_path: Path) -> None:
+    poses, table = tmp_path / "poses.jsonl", tmp_path / "poses.csv"
+    assert command("run", RANGES, "-o", poses) == 0
+    assert command("convert", poses, "-o", table) == 0
+    before = table.read_bytes()
+    result = limited(700, "convert", poses, "-o", table)
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"mixpose: -o {table}: cannot be written: File too large")
+    assert len(result.stderr.splitlines()) == 1
+    assert table.read_bytes() == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["poses.csv", "poses.jsonl"]
+
+
+@needs_posix
+def test_an_overlay_that_a_full_disk_cuts_short_is_no_video_and_stands_in_no_ones_way(
+    tmp_path: Path,
+) -> None:
+    video = tmp_path / "seen.avi"
+    result = limited(30_000, "run", BEAMS, "-o", tmp_path / "p.csv", "--overlay", video)
+    assert result.returncode == 2
+    assert re.match(rf"mixpose: --overlay {video}: .* (disk full|File too large)", result.stderr)
+    assert len(result.stderr.splitlines()) == 1
+    assert not video.exists()
+    video.with_name(".seen.part.avi").write_bytes(b"RIFF as a kill leaves it")
+    again = command("run", BEAMS, "-o", tmp_path / "p.csv", "--overlay", video, "--stop", "2")
+    assert again == 0
+    assert [path.name for path in tmp_path.iterdir() if "part" in path.name] == []
+
+
+@dataclass(frozen=True)
+class Inner:
+    values: Floats
+    weight: float | None = None
+
+
+@dataclass(frozen=True)
+class Outer:
+    parts: tuple[Inner, ...]
+    by_name: dict[str, Inner]
+    count: int = 0
+
+
+def test_records_come_back_bit_by_bit() -> None:
+    rng = np.random.default_rng(0)
+    parts = (Inner(rng.normal(size=(2, 3)).T, 0.1 + 0.2), Inner(np.empty((0, 6))))
+    record = Outer(parts, {"ä": Inner(np.array([np.nan, np.inf, -0.0, 5e-324]))}, 10**30)
+    found = decode(Outer, json.loads(json.dumps(encode(record))))
+    assert found.count == record.count
+    assert found.parts[0].weight == record.parts[0].weight
+    pairs = [*zip(found.parts, parts, strict=True), (found.by_name["ä"], record.by_name["ä"])]
+    for one, other in pairs:
+        assert one.values.tobytes() == other.values.tobytes()
+        assert one.values.flags.f_contiguous == other.values.flags.f_contiguous
+    wrongs: list[object] = [
+        [],
+        {"is": "Path"},
+        {"is": "Inner", "values": []},
+        {"is": "Outer", "a": 1},
+    ]
+    for wrong in wrongs:
+        with pytest.raises(ValueError, match="no Memory"):
+            decode(Memory, wrong)

@@ -1,0 +1,62 @@
+"""A window or a polished floor shows the mirror image of the body."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from detections import TRUTH, detect, view_of
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.fit import EstimatorOptions
+from mixpose.rigid import transform
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Tracker
+from mixpose.tracking.proposal_rules import ProposalRules
+
+Floats = NDArray[np.float64]
+
+# four markers within 1 mm of a plane, one 60 mm before it
+PLATE = np.array(
+    [[-80.0, -50, 0.5], [70, -60, -0.5], [85, 55, 0.5], [-60, 75, -0.5], [10, -15, 60]]
+)
+BODY = Body("plate", tuple(PointFeature(point) for point in PLATE))
+MIRRORED = Body("mirrored", tuple(PointFeature(point) for point in PLATE * [1, 1, -1]))
+
+
+def status(cameras: list[PinholeCamera], shown: Body, *, mirrors: bool = True) -> str:
+    views = detect(cameras, shown, TRUTH, noise=0.2)
+    tracker = Tracker.create(BODY, EstimatorOptions())
+    if not mirrors:  # no body is so flat
+        rules = replace(tracker.rules, proposals=ProposalRules(in_plane=-1.0))
+        tracker = replace(tracker, rules=rules)
+    return tracker.advance(tracker.begin(), 0, None, views)[1].status
+
+
+def test_the_mirror_image_of_a_nearly_flat_body_is_not_the_body(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # four of five markers are met to half a pixel
+    assert status(pinhole_cameras, MIRRORED, mirrors=False) == "ok"
+    assert status(pinhole_cameras, MIRRORED) == "ambiguous"
+
+
+def test_a_flat_body_whose_marker_before_the_plane_is_hidden_is_not_its_mirror_image(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    assert status(pinhole_cameras, BODY) == "ok"
+    flat = Body("flat", BODY.features[:4])
+    assert status(pinhole_cameras, flat) == "ok"
+
+
+def test_a_false_point_beside_a_plane_is_no_mirror_image(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    flat = np.concatenate([PLATE[:4], [[40.0, 30.0, -60.0]]])
+    views = []
+    for k, camera in enumerate(pinhole_cameras):
+        y, _ = camera.project(transform(TRUTH, flat))
+        views.append(view_of(str(k), camera, y))
+    tracker = Tracker.create(BODY, EstimatorOptions())
+    assert tracker.advance(tracker.begin(), 0, None, views)[1].status == "ok"
