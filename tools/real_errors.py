@@ -126,7 +126,9 @@ def bad_lens(folder: Path, seed: int) -> None:
     """Tell the session another principal point, focal length and distortion than there were."""
     path = folder / "session.toml"
     text = path.read_text(encoding="utf-8")
-    text = text.replace("[[900.0, 0, 319.5], [0, 900.0, 255.5]", "[[900.4, 0, 319.9], [0, 900.2, 255.2]")
+    text = text.replace(
+        "[[900.0, 0, 319.5], [0, 900.0, 255.5]", "[[900.4, 0, 319.9], [0, 900.2, 255.2]"
+    )
     path.write_text(text.replace("distortion = [0.0,", "distortion = [0.002,"), encoding="utf-8")
 
 
@@ -134,7 +136,9 @@ def bad_body(folder: Path, seed: int) -> None:
     """Tell the session markers that are off by 0.1 mm."""
     path = folder / "session.toml"
     off = np.array(MARKERS) + np.random.default_rng([seed, 8]).normal(0, 0.1, (len(MARKERS), 3))
-    text = path.read_text(encoding="utf-8").replace(f"points = {MARKERS}", f"points = {off.tolist()}")
+    text = path.read_text(encoding="utf-8").replace(
+        f"points = {MARKERS}", f"points = {off.tolist()}"
+    )
     path.write_text(text, encoding="utf-8")
 
 
@@ -273,7 +277,9 @@ def main() -> int:
     unknown = set(options.cases) - set(CASES)
     if unknown:
         parser.error(f"no such case: {sorted(unknown)[0]!r}; allowed: {', '.join(CASES)}")
-    print("| recording | deg | mm | oracle, deg | mm | ratio (worst) | squared error | inside 95 % | ok, wrong |")
+    print(
+        "| recording | deg | mm | oracle, deg | mm | ratio (worst) | squared error | inside 95 % | ok, wrong |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     stored: dict[str, Any] = {}
     with ProcessPoolExecutor(options.workers) as pool:

@@ -24,6 +24,8 @@ from mixpose.constants import constant
 Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
+_LEAST_DEGREES = 0.5  # of freedom: fewer are none, but for shares that do not add up to whole ones
+
 
 @dataclass(frozen=True)
 class ErrorRules:
@@ -129,9 +131,7 @@ def errors_seen(
         blurs = np.minimum(seen.blurs, blurs)
 
 
-def _seen_at(
-    blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules
-) -> Seen:
+def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
     squared, shares, sensor, dimensions, finest = offsets
     count = len(dimensions)
@@ -140,8 +140,11 @@ def _seen_at(
     q = np.bincount(sensor, weights * squared, count) / np.maximum(total, 1e-12)
     # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
     factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))
-    left = max(1 - free / max(float(factor @ total), 1e-12), 0.0)
-    own = np.array([(left > 0) * factor**2 * q * total, left * factor * total])
+    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+    degrees = factor ** (dimensions / 2) * total
+    most = float(degrees.sum())
+    left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
+    own = np.array([(left > 0) * factor * q * degrees, left * degrees])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     blurs = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))

@@ -42,7 +42,6 @@ from scipy.special import gammaln
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.association import Association
-from mixpose.judgement.noise import information_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -149,6 +148,7 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 
 def log_evidence(
     associations: Sequence[Association],
+    information: Floats,
     variances: Floats,
     free: NDArray[np.bool_],
     prior: Prior,
@@ -161,6 +161,7 @@ def log_evidence(
     ----------
     associations : sequence of Association
         One per sensor that saw something.
+    information : (6, 6) array
     variances : (L,) array
         Of the noise of each, in σ_ε².
     free : (6,) bool
@@ -176,8 +177,7 @@ def log_evidence(
     unseen = sum(one.unseen for one in associations) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
-    information = information_of(associations, variances)[np.ix_(free, free)]
-    inner = information + np.diag(1 / prior.spread[free] ** 2)
+    inner = information[np.ix_(free, free)] + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
     by_volume = float(odds.gained[0] + odds.missed[0]) + laplace + prior.log_density
     if not detection.by_count:

@@ -17,6 +17,7 @@ from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_ev
 from mixpose.judgement.noise import (
     NoiseModel,
     Residuals,
+    information_of,
     noise_of,
 )
 from mixpose.objective import MatchedObjective
@@ -111,8 +112,15 @@ def judge(
     noise = noise_of(found, free, before, rules.noise)
     blind = [replace(one, shares=np.zeros(len(one.features))) for one in unmet]
     variances = np.append(noise.variances, np.ones(len(blind)))
-    size = 2 * objective.projection.body.radius
-    evidence = log_evidence([*found, *blind], variances, free, prior, size, rules.detection)
+    evidence = log_evidence(
+        [*found, *blind],
+        information_of(found, noise.variances),
+        variances,
+        free,
+        prior,
+        2 * objective.projection.body.radius,
+        rules.detection,
+    )
     count = len(found)
     return Judged(
         T_world_object=T_world_object,

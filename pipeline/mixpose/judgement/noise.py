@@ -1,18 +1,19 @@
 """What detections err by, as residuals show it, and the covariance of a pose that follows.
 
 Offsets of the met features from their prediction are of two kinds.  What the extraction errs by is
-independent from feature to feature.  What a calibration, a clock or a lens errs by is alike in all
-features of a sensor: a field over its coordinates, an offset and, less than that, what turns,
-scales and shears the features' image.  In units of each sensor's noise let the variance of the former be
-s², that of the latter τ².  With the weights W, R = 1 − J (JᵀWJ)⁻¹ JᵀW that a pose leaves of errors,
-the fields P as columns and K = PᵀWRP, the residuals r have the expectations
+independent from feature to feature, with a variance s_0².  What a calibration, a clock or a lens
+errs by is alike in all features of a sensor: a field over its coordinates, an offset (s_1²) and
+what turns, scales and shears the features' image (s_2²).  With weights W, the matrix R = 1 − J
+(JᵀWJ)⁻¹ JᵀW that a pose leaves of errors, and the fields P_1 and P_2 as columns, let
+K_jk = P_jᵀ W R P_k.  The residuals r have the expectations
 
-    rᵀWr = s² tr R + τ² tr K,        |PᵀWr|² = s² tr K + τ² tr K²
+    rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
-(C. R. Henderson's method of moments).  Both sums are taken over the frames so far, fading, and give
-s² and τ².  Most of a field a pose takes for its own; the covariance has it back:
+(C. R. Henderson's method of moments).  Their sums over the frames so far, fading, give the three
+variances, in units of each sensor's noise.  Most of a field a pose takes for its own; the
+covariance has it back:
 
-    s² A⁻¹ + τ² A⁻¹ JᵀW P Pᵀ WJ A⁻¹,         A = JᵀWJ.
+    s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹,         A = JᵀWJ.
 
 With ν degrees of freedom the estimate itself is uncertain: the covariance is enlarged so that its
 95 % ellipsoid is that of the F distribution with (d, ν) degrees, d directions being free.  For
@@ -28,6 +29,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
@@ -36,7 +38,8 @@ from mixpose.judgement.association import Association
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for what lasts
+_LEAST = 1e-6  # degrees of freedom: less is as good as none
+_LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 
 
@@ -59,22 +62,17 @@ class NoiseModel:
     forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
     lasting: float = constant(
         0.2,
-        "of the noise: errors that all features of a sensor have in common, before they are seen "
-        "(calibrated web cams and a chessboard: 0.5-5)",
+        "of the noise: an offset that all features of a sensor have in common, before it is seen "
+        "(a chessboard, web cams and action cameras: 0.6-5)",
     )
     lasting_fields: float = constant(
         4.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
     )
     slanted: float = constant(
         0.7,
-        "of a field's offset: what turns, scales and shears (a chessboard 0.65, web cams and "
-        "action cameras 0.25-0.4)",
+        "of `lasting`: what turns, scales and shears (a chessboard 0.65, web cams and action "
+        "cameras 0.25-0.4)",
     )
-
-    def unseen(self, met: float) -> Moments:
-        """What is believed of lasting errors, as moments; a sensor meets so many features."""
-        weight = self.lasting_fields * met**2
-        return Moments(fields=weight * self.lasting**2, twice=weight)
 
     def enlargement(self, directions: int, degrees: float) -> float:
         """Factor that makes the Gaussian ellipsoid as large as that of the F distribution.
@@ -93,41 +91,27 @@ class NoiseModel:
 
 
 class Moments(NamedTuple):
-    """Sums over frames, from which s² and τ² follow.
+    """Sums over frames, from which the variances of independent errors and of fields follow.
 
     Attributes
     ----------
-    squares, degrees : float
-        rᵀWr and tr R.
-    fields : float
-        |PᵀWr|².
-    once, twice : float
-        tr K and tr K².
+    seen : (3,) float64
+        rᵀWr and |P_kᵀWr|².
+    expected : (3, 3) float64
+        Of these, by unit variances of each kind.
     """
 
-    squares: float = 0.0
-    degrees: float = 0.0
-    fields: float = 0.0
-    once: float = 0.0
-    twice: float = 0.0
+    seen: Floats = np.zeros(3)
+    expected: Floats = np.zeros((3, 3))
 
     def joined(self, other: Moments, memory: float) -> Moments:
         """Add those of another frame."""
-        return Moments(*(memory * a + b for a, b in zip(self, other, strict=True)))
-
-    def variances(self) -> tuple[float, float]:
-        """s² and τ²."""
-        if self.degrees < 1:
-            return 1.0, self.fields / max(self.twice, 1e-12)
-        determinant = max(self.degrees * self.twice - self.once**2, 1e-12)
-        lasting = max(self.degrees * self.fields - self.once * self.squares, 0.0) / determinant
-        rest = max(self.squares - lasting * self.once, _LEAST_SHARE * self.squares)
-        return max(rest / self.degrees, _LEAST_SHARE), lasting
+        return Moments(memory * self.seen + other.seen, memory * self.expected + other.expected)
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """What is remembered of residuals: each sensor's noise in σ_ε, and what lasts of it."""
+    """What is remembered of residuals: each sensor's noise in σ_ε, and what fields have of it."""
 
     noise: Mapping[str, Noise] = field(default_factory=dict)
     moments: Moments = Moments()
@@ -172,8 +156,8 @@ def noise_of(
     own, and the frames after it forget it.
     """
     offsets, count = _offsets(associations), int(free.sum())
-    known = [before.noise.get(one.name, Noise()) for one in associations]
-    past = np.array([(one.squares, one.degrees) for one in known]).T
+    last = [before.noise.get(one.name, Noise()) for one in associations]
+    past = np.array([(one.squares, one.degrees) for one in last]).T
     sums, rest = model.memory * past, None
     seen = errors_seen(offsets, count, sums, model.errors)
     if _is_outdone(past, seen, model):
@@ -183,18 +167,13 @@ def noise_of(
     degrees = float(sums[1].sum())
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
     variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
-    own, independent, lasting = _moments(associations, offsets, variances, free, model)
+    own, parts = _moments(associations, offsets, variances, free, model)
     moments = before.moments.joined(own, model.memory)
-    met = float(np.mean([one.met for one in associations]))
-    believed = model.unseen(met)
-    s2, t2 = moments.joined(believed, 1.0).variances()
-    # fields last: no further frame shows more of them
-    fields = (own.once + model.lasting_fields * met) ** 2 / max(own.twice + believed.twice, 1e-12)
+    shares = _shares(moments, own, float(np.mean([one.met for one in associations])), model)
+    # fields last: a further frame shows no more of them
+    factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
     covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = (
-        model.enlargement(count, degrees) * s2 * independent
-        + model.enlargement(count, fields) * t2 * lasting
-    )
+    covariance[np.ix_(free, free)] = np.tensordot(shares.variances * factors, parts, 1)
     told = sums if rest is None else rest
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
     return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
@@ -221,14 +200,35 @@ def _is_outdone(past: Floats, seen: Seen, model: NoiseModel) -> bool:
     return bool(ratio > fdtri(degrees, known, model.by_chance))
 
 
+class _Shares(NamedTuple):
+    """Variances (3,) of independent errors and of fields; degrees of freedom (2,) of the latter."""
+
+    variances: Floats
+    degrees: Floats
+
+
+def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _Shares:
+    """What moments say; each sensor meets so many features, of a frame that has its own moments."""
+    weights = model.lasting_fields * np.array([met, met**2])
+    believed = np.array([_LEAST, weights[1], weights[1]])
+    expected = moments.expected + np.diag(believed)
+    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2])
+    seen = moments.seen + believed * size
+    scale = 1 / np.maximum(expected.diagonal(), _LEAST)
+    variances = nnls(scale[:, None] * expected, scale * seen)[0]
+    variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
+    once, squared = own.expected[0, 1:] + weights[0], own.expected.diagonal()[1:] + weights[1]
+    return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
+
+
 def _moments(
     associations: Sequence[Association],
     offsets: Offsets,
     variances: Floats,
     free: NDArray[np.bool_],
     model: NoiseModel,
-) -> tuple[Moments, Floats, Floats]:
-    """Of one frame, and what unit variances of both kinds make of the pose's covariance.
+) -> tuple[Moments, Floats]:
+    """Of one frame, and the covariances (3, k, k) that unit variances of each kind make.
 
     Detections that are farther off than the extraction errs are left out.
     """
@@ -241,29 +241,34 @@ def _moments(
         scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
         rows = np.concatenate([one.J[..., free], one.offsets[..., None]], axis=2)
         parts.append((scale * rows).reshape(-1, count + 1))
-        blocks.append(_fields(one.places, shares, model.slanted))
+        blocks.append(_fields(one.places, shares))
     weighted = np.concatenate(parts)
     J, r = weighted[:, :count], weighted[:, count]
-    P = block_diag(*blocks)
+    P = [block_diag(*kind) for kind in zip(*blocks)]
     inverse = _inverse(J.T @ J)
-    met = J.T @ P
-    drawn = inverse @ met
-    K = P.T @ P - met.T @ drawn
-    degrees = max(float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count, 0.0)
-    fields = P.T @ r
-    sums = (float(r @ r), degrees, float(fields @ fields), float(np.trace(K)), float((K * K).sum()))
-    return Moments(*sums) if degrees > 0 else Moments(), inverse, drawn @ drawn.T
+    drawn = [inverse @ (J.T @ one) for one in P]
+    left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
+    K = [[float(((a.T @ b) ** 2).sum()) for b in left] for a in P]
+    once = [float((a * b).sum()) for a, b in zip(P, left, strict=True)]
+    degrees = float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count
+    squares = [float(r @ r), *(float(((one.T @ r) ** 2).sum()) for one in P)]
+    expected = np.array([[degrees, *once], [once[0], *K[0]], [once[1], *K[1]]])
+    own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
+    return own, np.array([inverse, *(one @ one.T for one in drawn)])
 
 
-def _fields(places: Floats, shares: Floats, slanted: float) -> Floats:
-    """What all features (n, m) of a sensor may have in common, with their shares: (nm, m + m²)."""
+def _fields(places: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """What all features (n, m) of a sensor have in common, with their shares.
+
+    Offsets (nm, m), and what turns, scales and shears (nm, m²).
+    """
     n, m = places.shape
-    total = max(float(shares.sum()), 1e-12)
+    total = max(float(shares.sum()), _LEAST)
     away = places - shares @ places / total
     size = float(np.sqrt((shares @ (away * away)).sum() / (m * total)))
-    columns = np.concatenate([np.ones((n, 1)), slanted / max(size, 1e-12) * away], axis=1)
-    columns *= np.sqrt(shares)[:, None]
-    return (columns[:, None, :, None] * np.eye(m)[:, None]).reshape(n * m, m * (1 + m))
+    roots, axes = np.sqrt(shares)[:, None, None, None], np.eye(m)
+    slants = roots * away[:, None, :, None] / max(size, _LEAST) * axes[:, None]
+    return (roots[..., 0] * axes).reshape(n * m, m), slants.reshape(n * m, m * m)
 
 
 def _inverse(information: Floats) -> Floats:

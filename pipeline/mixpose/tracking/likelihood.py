@@ -113,11 +113,9 @@ class FrameData:
             self.rules.judgement.detection,
         )
 
-    def at_sigma(
-        self, near: Floats | None = None, *, narrowed: float = 1.0, fine: bool = False
-    ) -> MatchedObjective:
-        """The matched objective at σ_ε, or at a share of it."""
-        sigmas = [narrowed * view.observation.sigma for view in self.views]
+    def at_sigma(self, near: Floats | None = None, *, fine: bool = False) -> MatchedObjective:
+        """The matched objective at σ_ε."""
+        sigmas = [view.observation.sigma for view in self.views]
         steps = FINE_STEPS if fine else LAST_STEPS
         return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
 
