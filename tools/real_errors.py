@@ -29,6 +29,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import mixpose
+from mixpose.frames import read_image
 from mixpose.objective import View
 from mixpose.poses.evaluate import normalised_error_squared
 from mixpose.poses.jsonl import read_poses
@@ -97,7 +98,7 @@ def arm(folder: Path, seed: int) -> None:
         along = np.array([np.cos(angle), np.sin(angle)])
         across = np.array([-along[1], along[0]])
         for k, path in enumerate(sorted(folder.glob(f"c{camera}_*.png"))):
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            image = read_image(path)
             middle = np.array([319.5, 255.5]) + across * (speed * (k - 20))
             mask = np.zeros_like(image)
             ends = [tuple(np.round(16 * (middle + s * 900 * along)).astype(int)) for s in (-1, 1)]
@@ -215,7 +216,10 @@ def _compared(folder: Path) -> Figures:
     rms = np.sqrt((found[:, :4] ** 2).mean(axis=0)) if len(found) else np.full(4, np.nan)
     off = (found[:, 0] > WRONG_DEG) | (found[:, 1] > WRONG_MM)
     return Figures(
-        *rms.tolist(),
+        rotation_deg=float(rms[0]),
+        position=float(rms[1]),
+        oracle_deg=float(rms[2]),
+        oracle_position=float(rms[3]),
         squared=float((found[:, 4] / found[:, 5]).mean()),
         inside=float((found[:, 4] < INSIDE_95).mean()),
         ok=len(found) / count,
@@ -277,10 +281,9 @@ def main() -> int:
     unknown = set(options.cases) - set(CASES)
     if unknown:
         parser.error(f"no such case: {sorted(unknown)[0]!r}; allowed: {', '.join(CASES)}")
-    print(
-        "| recording | deg | mm | oracle, deg | mm | ratio (worst) | squared error | inside 95 % | ok, wrong |"
-    )
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    titles = ("recording", "deg", "mm", "oracle, deg", "mm", "ratio (worst)", "squared error")
+    print("| " + " | ".join((*titles, "inside 95 %", "ok, wrong")) + " |")
+    print("| --- " * (len(titles) + 2) + "|")
     stored: dict[str, Any] = {}
     with ProcessPoolExecutor(options.workers) as pool:
         for name in options.cases or CASES:

@@ -406,8 +406,8 @@ _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
         "tracking/tracker.py",
-        'noise = best.noise if verdict.status == "ok" else track.noise',
-        "noise = best.noise",
+        'residuals = best.residuals if verdict.status == "ok" else track.residuals',
+        "residuals = best.residuals",
         "residuals of a wrong pose make the frames after it unsure",
         (_TRACK,),
     ),

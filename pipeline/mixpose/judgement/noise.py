@@ -61,7 +61,7 @@ class NoiseModel:
     )
     forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
     lasting: float = constant(
-        0.2,
+        0.15,
         "of the noise: an offset that all features of a sensor have in common, before it is seen "
         "(a chessboard, web cams and action cameras: 0.6-5)",
     )
