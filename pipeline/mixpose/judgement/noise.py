@@ -61,12 +61,12 @@ class NoiseModel:
     )
     forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
     lasting: float = constant(
-        0.15,
+        0.18,
         "of the noise: an offset that all features of a sensor have in common, before it is seen "
         "(a chessboard, web cams and action cameras: 0.6-5)",
     )
     lasting_fields: float = constant(
-        4.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
+        3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
     )
     slanted: float = constant(
         0.7,
