@@ -16,6 +16,7 @@ ROOT = Path(mixpose.__file__).parent
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
 GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
     "encoding",
+    "limits",
     "whole_files",
 }
 MAY_IMPORT: dict[str, set[str]] = {
@@ -26,6 +27,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "constants": set(),
     "threads": set(),
     "encoding": set(),
+    "limits": set(),
+    "executing": GROUND,
     "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,
@@ -33,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extraction": GROUND,
     "optimise": set(),
     "objective": GROUND | {"sensors", "body", "density"},
-    "search": GROUND | {"sensors", "body", "density", "objective", "optimise"},
+    "search": GROUND | {"sensors", "body", "density", "objective", "optimise", "judgement"},
     "fit": GROUND | {"sensors", "body", "density", "objective", "optimise"},
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
@@ -61,6 +64,18 @@ MAY_IMPORT["rerun_file"] = GROUND | {
     "density",
     "frames",
     "poses",
+    "session",
+    "runner",
+}
+MAY_IMPORT["calibration"] = GROUND | {
+    "sensors",
+    "body",
+    "density",
+    "objective",
+    "search",
+    "fit",
+    "tracking",
+    "frames",
     "session",
     "runner",
 }

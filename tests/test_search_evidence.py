@@ -1,22 +1,24 @@
-"""How unlikely it is that a pose explains its detections by chance."""
+"""Very many poses are judged at once as each is judged in the end."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from detections import ALL_FREE, EIGHT, TRUTH, view_of
+from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.rigid import transform
-from mixpose.search.budget import EvidenceOptions, PeakOptions
+from mixpose.judgement import Prior, judge
+from mixpose.objective import matched_objective
+from mixpose.rigid import perturb, transform
+from mixpose.search.budget import PeakOptions
 from mixpose.search.detections import sensor_detections
 from mixpose.search.evidence import evidence
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
 
-OPTIONS = EvidenceOptions()
+GATE = 3.0
 
 
 def seen(camera: PinholeCamera, count: int = 8) -> Floats:
@@ -26,7 +28,7 @@ def seen(camera: PinholeCamera, count: int = 8) -> Floats:
 
 def evidence_of(camera: PinholeCamera, points: Floats, body: Body = EIGHT) -> float:
     detections = sensor_detections([view_of("0", camera, points)], body, PeakOptions())
-    return float(evidence(detections, body, TRUTH[None], ALL_FREE, OPTIONS)[0])
+    return float(evidence(detections, body, TRUTH[None], ALL_FREE, GATE)[0][0])
 
 
 def spread_out(camera: PinholeCamera, count: int, away_from: Floats) -> Floats:
@@ -37,21 +39,32 @@ def spread_out(camera: PinholeCamera, count: int, away_from: Floats) -> Floats:
     return np.asarray(places[near > 60][:count])
 
 
+def test_the_evidence_of_the_search_is_that_of_the_judgement(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    never = Prior(-1e9, np.ones(6))  # by volume: so that by count is cheaper
+    for hidden, false in ((0, 0), (2, 6)):
+        views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
+        poses = perturb(TRUTH, np.array([np.zeros(6), [0.3, -0.2, 0.2, 0.002, 0.0, -0.003]]))
+        found, _ = evidence(
+            sensor_detections(views, EIGHT, PeakOptions()), EIGHT, poses, ALL_FREE, GATE
+        )
+        objective = matched_objective(views, EIGHT, [1.5] * len(views))
+        for pose, log_odds in zip(poses, found, strict=True):
+            judged = judge(objective, pose, ALL_FREE, prior=never)
+            assert log_odds == pytest.approx(judged.log_evidence, abs=1e-6)
+
+
 def test_clutter_makes_each_detection_that_is_met_less_telling(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     camera = pinhole_cameras[0]
-    large = Body("large", tuple(PointFeature(3 * point) for point in EIGHT.means))
-    y, visible = camera.project(transform(TRUTH, large.means))
-    assert visible.all()
+    y = seen(camera)
     clutter = spread_out(camera, 56, y)
-    assert len(clutter) == 56
-    alone = evidence_of(camera, y, large)
-    lost = alone - evidence_of(camera, np.concatenate([y, clutter]), large)
-    # eight times as many in the image: ln 8 for each of 8, 10 of whose 16 coordinates are spare;
-    # less as far as the eight lay closer together than all over the image already
-    most = 8 * 10 / 16 * np.log(8)
-    assert 0.3 * most < lost <= most
+    lost = evidence_of(camera, y) - evidence_of(camera, np.concatenate([y, clutter]))
+    # none of them is around the body: three of 64 and not of 8 fix the pose
+    # (up to four of the eight lie on the rim of their box)
+    assert lost == pytest.approx(np.log(64 * 63 * 62 / (8 * 7 * 6)), abs=5 * np.log(8 / 4))
 
 
 def test_a_crowd_around_the_body_makes_chance_matches_likelier(
@@ -59,24 +72,27 @@ def test_a_crowd_around_the_body_makes_chance_matches_likelier(
 ) -> None:
     camera = pinhole_cameras[0]
     y = seen(camera)
-    ring = 25.0 * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
-    crowd = (y[:, None] + ring).reshape(-1, 2)
+    middle = (y.min(axis=0) + y.max(axis=0)) / 2
+    crowd = middle + 12.0 * np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]])
     scattered = spread_out(camera, len(crowd), y)
     crowded, sparse = (
         evidence_of(camera, np.concatenate([y, each])) for each in (crowd, scattered)
     )
-    # three others within 25 px: 5 times as dense as 40 over the whole image
-    assert crowded < sparse - 5.0
+    # 12 and not 8 around the body: ln 1.5 for each of 8, 10 of whose 16 coordinates are spare
+    # (up to four of the eight lie on the rim of their box: at most 12 and not 4)
+    assert 5 * np.log(1.5) - 1e-6 < sparse - crowded < 5 * np.log(3.0)
 
 
-def test_a_feature_in_view_without_a_detection_costs_as_much_as_one_in_three(
+def test_a_feature_in_view_without_a_detection_costs_as_much_as_its_chance(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     camera = pinhole_cameras[0]
-    seven = Body("seven", EIGHT.features[:7])
-    y = seen(camera, 7)
-    lost = evidence_of(camera, y, seven) - evidence_of(camera, y, EIGHT)
-    assert lost == pytest.approx(-np.log(0.3))
+    inner = 0.5 * EIGHT.means.mean(axis=0) + 0.5 * EIGHT.means[0]
+    nine = Body("nine", (*EIGHT.features, PointFeature(inner)))
+    y = seen(camera)
+    lost = evidence_of(camera, y) - evidence_of(camera, y, nine)
+    # a quarter; and three pins are chosen among nine features
+    assert lost == pytest.approx(np.log(4) + np.log(9 * 8 * 7 / (8 * 7 * 6)))
 
 
 def test_detections_met_to_a_tenth_of_a_pixel_are_better_evidence_than_to_a_pixel(
@@ -86,8 +102,8 @@ def test_detections_met_to_a_tenth_of_a_pixel_are_better_evidence_than_to_a_pixe
     y = seen(camera)
     off = np.where(np.arange(16).reshape(8, 2) % 2, 1.5, -1.5) / np.sqrt(2)
     gained = evidence_of(camera, y + 0.1 * off) - evidence_of(camera, y + off)
-    # errors of σ_ε and of a tenth of it, 10 of 16 coordinates being spare: their squares are
-    # estimated as 8/10 and, as none below a tenth is believed, 1/100
-    tight, loose = -5 * np.log(0.01) - 0.5 * 0.08 / 0.01, -5 * np.log(0.8) - 0.5 * 8 / 0.8
-    # detections a pixel aside crowd a little differently
-    assert gained == pytest.approx(tight - loose, abs=0.5)
+    # squared errors of 8 and 0.08 σ², joined with 4 degrees of freedom of 0.2²; 10 of 16
+    # coordinates are spare
+    tight, loose = ((4 * 0.04 + squares) / 14 for squares in (0.08, 8.0))
+    by_each = np.log(loose / tight) - 0.5 * (0.01 / tight - 1 / loose)
+    assert gained == pytest.approx(8 * 10 / 16 * by_each, rel=0.01)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from mixpose.density import Observation
 from mixpose.errors import SessionError
 from mixpose.extraction import Window, extract
-from mixpose.frames import Source, SourceSpec, open_source, pair
+from mixpose.frames import Source, SourceSpec, open_source, pair, paired_by_stamp
+from mixpose.limits import MOST_DETECTIONS
 from mixpose.objective import View
 from mixpose.records import (
     Estimate,
@@ -178,10 +179,11 @@ def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Sou
     for name in replaced:
         if name not in names:
             raise SessionError(f"--source {name}=...: no such sensor, allowed: {', '.join(names)}")
-    return {
+    opened = {
         setup.name: open_source(source_spec(session, setup, replaced.get(setup.name)))
         for setup in session.sensors
     }
+    return paired_by_stamp(opened)
 
 
 def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> SourceSpec:
@@ -348,11 +350,25 @@ def observation_of(
         # noise may take a profile below zero; cutting that off would leave a floor of noise
         pattern = frame.data
     else:
+        _refuse_code(session, options.method)
         pattern = extract(frame.data, options, window=window, base=session.folder)
+        if isinstance(pattern, PointPattern) and len(pattern.points) > MOST_DETECTIONS:
+            # flooded with light or noise: nothing in it can be told from anything
+            pattern = PointPattern(pattern.points[:0], pattern.weights[:0])
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))
     return Observation(pattern, width, intrinsic=options.spot_sigma)
+
+
+def _refuse_code(session: Session, method: str) -> None:
+    """A session file comes from anywhere: what it names is run only where that was allowed."""
+    if ":" in method and not session.allow_code:
+        raise SessionError(
+            f'{session.path}: extract.method: "{method}" runs code of a module that the session '
+            "names; if you trust it, add --allow-code (in Python: load_session(..., "
+            "allow_code=True))"
+        )
 
 
 def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:

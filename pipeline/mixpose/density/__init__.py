@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mixpose.density.atlas import Atlas, draw
+from mixpose.density.atlas import Atlas
 from mixpose.density.blur import render
 from mixpose.density.extraction_error import (
     ErrorRules,
@@ -32,7 +32,6 @@ __all__ = [
     "Window",
     "close_pairs",
     "crowding",
-    "draw",
     "errors_seen",
     "features_met",
     "matched_atlas",

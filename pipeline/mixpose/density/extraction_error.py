@@ -41,6 +41,11 @@ class ErrorRules:
     narrowest: float = constant(
         0.05, "of σ_ε, blur of the last look: what centres of blobs err by at best (0.03 σ_ε)"
     )
+    reach: float = constant(
+        9.0,
+        "σ_ε around features within which detections count: at σ_ε they are drawn to 6, and the "
+        "pose moves by less than the rest",
+    )
     outlying: float = constant(
         3.5, "standard deviations from which an offset is no noise: by chance 2 in 1000 are beyond"
     )

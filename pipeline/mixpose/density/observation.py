@@ -10,14 +10,14 @@ Two densities are made of a pattern g0 whose features have standard deviation σ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density.atlas import REACH, Atlas, draw
+from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.overlap import self_overlap
@@ -32,7 +32,7 @@ MOST_CELLS = 1_500_000
 """Grid points of a dense window; a larger one gets coarser."""
 
 MOST_SIGMAS = 4000.0
-"""Extent of features over the narrowest blur at which they are drawn: pages are 9.9 σ wide, and a
+"""Extent of features over the narrowest blur at which they are drawn: pages are 12 σ wide, and a
 plane has 400 000 of them."""
 
 _MARGIN = 5.0  # standard deviations around a pattern that its density reaches
@@ -88,6 +88,13 @@ class Observation:
         return int(self.pattern.values.size)
 
     @property
+    def weight(self) -> float:
+        """Sum of all weights or values."""
+        pattern = self.pattern
+        values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
+        return float(values.sum())
+
+    @property
     def is_sparse(self) -> bool:
         """Whether its density costs little to draw everywhere: detections, and profiles."""
         return self.cell is None or self.dimension == 1
@@ -105,6 +112,17 @@ class Observation:
             return pattern.points.min(axis=0), pattern.points.max(axis=0)
         size = np.array(pattern.values.shape[::-1])[: self.dimension]
         return pattern.origin, np.asarray(pattern.origin + (size - 1) * pattern.step)
+
+    def around(self, y: Floats, reach: float) -> Observation:
+        """Detections within a reach, in σ_ε, of places (n, m), if there are any."""
+        pattern = self.pattern
+        if not isinstance(pattern, PointPattern) or not len(y):
+            return self
+        away = pattern.points - y[:, None]
+        near = ((away * away).sum(axis=2) < (reach * self.sigma) ** 2).any(axis=0)
+        if not near.any() or near.all():
+            return self
+        return replace(self, pattern=PointPattern(pattern.points[near], pattern.weights[near]))
 
     def narrowest(self, share: float, y: Floats) -> float:
         """Narrowest blur in σ_ε: a share for detections, as far as an atlas reaches.
@@ -167,13 +185,9 @@ class Observation:
 
 
 def matched_atlas(
-    observations: Sequence[Observation],
-    sigmas: Sequence[float],
-    steps_per_sigma: float,
-    near: Sequence[Floats | None] | None = None,
-    around: float = REACH,
+    observations: Sequence[Observation], sigmas: Sequence[float], steps_per_sigma: float
 ) -> Atlas:
-    """Draw C of several sensors, none of which is empty.
+    """C of several sensors, none of which is empty.
 
     Parameters
     ----------
@@ -181,12 +195,7 @@ def matched_atlas(
     sigmas : sequence of float
         Standard deviation of a feature, per sensor, in sensor units.
     steps_per_sigma : float
-        Cells per standard deviation of C, as `mixpose.density.atlas.draw` has it.
-    near : sequence of (n, m) array or None
-        Places about which alone C is wanted; None: wherever it is not zero.
-    around : float
-        Standard deviations about such places within which grey values are drawn.
+        Cells per standard deviation of C.
     """
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
-    patterns = [observation.pattern for observation in observations]
-    return draw(patterns, blurs, steps_per_sigma, near or [None] * len(patterns), around)
+    return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)

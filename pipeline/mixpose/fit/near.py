@@ -10,7 +10,7 @@ same pose.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -25,7 +25,7 @@ from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
 from mixpose.objective import MatchedObjective, Objective, View, build_objective, matched_objective
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA, value_error
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
 
@@ -33,8 +33,10 @@ Floats: TypeAlias = NDArray[np.float64]
 
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
-# after a step that gains 1e-6, 0.002 σ long, a twentieth of it is left to go: residuals draw it
-SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=value_error(LAST_STEPS))
+# what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
+SHARP = NewtonOptions(
+    iterations=40, tolerance=1e-6, value_error=value_error(STEPS_PER_SIGMA), remaining=5e-7
+)
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
 
 
@@ -105,7 +107,7 @@ def fit_near(
     samples : (N, R, 3) array
         Samples of the body, for the objectives that integrate by sampling.
     finest : MatchedObjective or None
-        At σ_ε, wherever something is seen, where it is at hand.
+        At σ_ε, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
     errors : ErrorRules
@@ -113,11 +115,10 @@ def fit_near(
     """
     free = free_mask(options)
     matched = options.objective == "matched"
-    sparse = all(view.observation.is_sparse for view in views)
     ascent = None
-    if matched and sparse and not has_likelihood(views):
-        sigmas = [view.observation.sigma for view in views]
-        finest = finest or matched_objective(views, body, sigmas, steps_per_sigma=LAST_STEPS)
+    if matched:
+        finest = finest or matched_objective(views, body, [v.observation.sigma for v in views])
+    if finest and not has_likelihood(views):
         here = finest.linearise(T_start)
         if here.value >= rules.near * len(views):
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
@@ -127,8 +128,8 @@ def fit_near(
         known = noise or [Noise()] * len(views)
         ascent = _to_the_noise(views, body, ascent, free, finest, known, errors, rules)
     T, is_freed = ascent.state, False
-    if matched and has_likelihood(views):
-        T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free), rules.misfit)
+    if finest and has_likelihood(views):
+        T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
 
 
@@ -154,7 +155,7 @@ def _through_blurs(
         objective: Objective | None = finest if last else None
         if objective is None:
             name, near = options.objective, ascent.state
-            objective = build_objective(name, views, body, samples, sigmas, near, last)
+            objective = build_objective(name, views, body, samples, sigmas, near)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     return ascent
 
@@ -173,7 +174,7 @@ def _to_the_noise(
     known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in views])
     blurs = np.ones(len(views))
-    objective = finest or matched_objective(views, body, sigmas.tolist(), ascent.state)
+    objective = finest or matched_objective(views, body, sigmas.tolist())
     while True:
         offsets = _offsets(objective, ascent.state, errors, rules)
         seen = errors_seen(offsets, int(free.sum()), known, errors)
@@ -183,7 +184,8 @@ def _to_the_noise(
         if clear.all() or (narrower > rules.narrower * blurs).all():
             return ascent
         blurs = narrower
-        objective = matched_objective(views, body, (blurs * sigmas).tolist(), ascent.state)
+        near = _around_the_body(objective, ascent.state, errors.reach)
+        objective = matched_objective(near, body, (blurs * sigmas).tolist())
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 
@@ -191,7 +193,7 @@ def _offsets(
     objective: MatchedObjective, T: Floats, errors: ErrorRules, rules: FitRules
 ) -> Offsets:
     """How far off features are met, as the density around them shows it: v ∇C / C."""
-    at, sampled, _, _ = objective.match(T[None])
+    at, sampled, _ = objective.match(T[None])
     sensor, feature = np.nonzero(at.seen[:, 0] & (sampled[:, 0, :, 0] > 0))
     C, slope = sampled[sensor, 0, feature, 0], sampled[sensor, 0, feature, 1:]
     sigmas = np.array([view.observation.sigma for view in objective.views])
@@ -204,3 +206,14 @@ def _offsets(
         for view, y, seen, m in zip(objective.views, at.y, at.seen, dimensions, strict=True)
     ]
     return Offsets(squared, shares, sensor, dimensions, np.array(finest))
+
+
+def _around_the_body(objective: MatchedObjective, T: Floats, reach: float) -> list[View]:
+    """Views with what was detected around the features alone: a fine grid has to hold no more."""
+    at = objective.projection.project(T[None])
+    return [
+        replace(view, observation=view.observation.around(y[0, seen[0], :m], reach))
+        for view, y, seen, m in zip(
+            objective.views, at.y, at.seen, objective.projection.dimensions, strict=True
+        )
+    ]

@@ -12,7 +12,14 @@ from mixpose.judgement.acceptance import (
     is_sure,
 )
 from mixpose.judgement.association import Association, associate
-from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior
+from mixpose.judgement.evidence import (
+    DetectionModel,
+    Prior,
+    Sighting,
+    flat_prior,
+    odds_of,
+    paid_by_count,
+)
 from mixpose.judgement.expected_covariance import expected_covariance
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
 from mixpose.judgement.noise import NoiseModel, Residuals
@@ -26,6 +33,7 @@ __all__ = [
     "NoiseModel",
     "Prior",
     "Residuals",
+    "Sighting",
     "Verdict",
     "associate",
     "beliefs",
@@ -38,4 +46,6 @@ __all__ = [
     "is_sure",
     "judge",
     "nearest_alike",
+    "odds_of",
+    "paid_by_count",
 ]

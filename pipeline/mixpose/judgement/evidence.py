@@ -102,11 +102,11 @@ class Sighting:
     shares : (H, N) float64
         How far each was met, 0 to its weight.
     offsets : (H, N, m) float64
-        Observed minus predicted places, in units of its noise; 0 where not met.
+        Observed minus predicted places, in σ_ε; 0 where not met.
     by_world : (H, N, m, 3) float64
-        How predicted places change as the feature moves in the world, noises per length.
+        How predicted places change as the feature moves in the world, σ_ε per length.
     crowd : (H,) float64
-        Observed features per unit of noise^m.
+        Observed features per σ_ε^m.
     count : float
         Number of observed features.
     """
@@ -173,7 +173,7 @@ def log_evidence(
     if not any(one.met for one in associations):
         return -np.inf
     sightings = _sightings(associations, variances)
-    odds = odds_of(sightings, size, detection)
+    odds = odds_of(sightings, np.ones(1), size, detection)
     unseen = sum(one.unseen for one in associations) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
@@ -185,13 +185,17 @@ def log_evidence(
     return max(by_volume, float(paid_by_count(odds, sightings, free)[0]))
 
 
-def odds_of(sightings: Sequence[Sighting], size: float, detection: DetectionModel) -> Odds:
+def odds_of(
+    sightings: Sequence[Sighting], variance: Floats, size: float, detection: DetectionModel
+) -> Odds:
     """Odds of H poses against clutter, as if they had not been chosen to fit.
 
     Parameters
     ----------
     sightings : sequence of Sighting
         One per sensor.
+    variance : (H,) array
+        Of offsets, in σ_ε².
     size : float
         Of the body, length units.
     detection : DetectionModel
@@ -202,9 +206,9 @@ def odds_of(sightings: Sequence[Sighting], size: float, detection: DetectionMode
     for one in sightings:
         m = one.offsets.shape[2]
         squares = (one.offsets**2).sum(axis=2)
-        density = one.crowd * (2 * np.pi) ** (m / 2)
+        density = one.crowd * (2 * np.pi * variance) ** (m / 2)
         gain = np.log(detection.probability / np.maximum(density, 1e-300))
-        gain = one.shares * np.maximum(gain[:, None] - squares / 2, 0.0)
+        gain = one.shares * np.maximum(gain[:, None] - squares / (2 * variance[:, None]), 0.0)
         gained += gain
         missed += (one.weights - one.shares) * detection.log_missed
         coordinates += m * one.shares
@@ -212,7 +216,7 @@ def odds_of(sightings: Sequence[Sighting], size: float, detection: DetectionMode
         near.append((gain > 0) & (m == 2))
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
-        space, share = _in_space(sightings, near, together, size)
+        space, share = _in_space(sightings, near, together, variance, size)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -225,6 +229,7 @@ def _in_space(
     sightings: Sequence[Sighting],
     near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
+    variance: Floats,
     size: float,
 ) -> tuple[Floats, Floats]:
     """What features met by several cameras say if clutter are points in space (K,), and shares.
@@ -238,7 +243,7 @@ def _in_space(
         if one.offsets.shape[2] != 2:
             continue
         J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
-        weighted = J * met[:, None, None]
+        weighted = J * (met / variance[chosen[0]])[:, None, None]
         A += weighted.swapaxes(1, 2) @ J
         b += (weighted.swapaxes(1, 2) @ r[..., None])[..., 0]
         share = np.maximum(share, met * one.shares[chosen])
@@ -272,7 +277,10 @@ def _log_choices(sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floa
 
 
 def _sightings(associations: Sequence[Association], variances: Floats) -> list[Sighting]:
-    """Associations of one pose, in units of their noise, each feature in a column of its own."""
+    """Associations of one pose, each feature in a column of its own.
+
+    Their noise stands in the place of σ_ε, so that their variance is 1.
+    """
     columns = 1 + max(int(one.features.max(initial=0)) for one in associations)
     found = []
     units = np.sqrt(variances) * [one.sigma for one in associations]

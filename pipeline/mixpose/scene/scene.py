@@ -7,28 +7,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from mixpose.objective import View
-from mixpose.records import Estimate, label_of
-from mixpose.tracking import Track, Tracker
-
-
-@dataclass(frozen=True)
-class Member:
-    """One body of a scene.
-
-    Attributes
-    ----------
-    tracker : Tracker
-    instance : int or None
-        Which of identical ones; None where there is one only.
-    """
-
-    tracker: Tracker
-    instance: int | None = None
-
-    @property
-    def label(self) -> str:
-        """The body in one word."""
-        return label_of(self.tracker.body.name, self.instance)
+from mixpose.records import Estimate
+from mixpose.scene.joint import Joint
+from mixpose.scene.members import Member
+from mixpose.scene.rules import SceneRules
+from mixpose.tracking import Track
 
 
 class Outcome(NamedTuple):
@@ -43,6 +26,7 @@ class Scene:
     """All bodies that one recording shows, in the order of their pose lines."""
 
     members: tuple[Member, ...]
+    rules: SceneRules = SceneRules()
 
     def begin(self) -> tuple[Track, ...]:
         """The tracks before the first frame."""
@@ -62,8 +46,21 @@ class Scene:
         views : sequence of View
             All sensors with a frame.
         """
-        outcomes = []
-        for member, track in zip(self.members, tracks, strict=True):
+        if len(self.members) == 1:
+            member, track = self.members[0], tracks[0]
             after, estimate = member.tracker.advance(track, frame, time_s, views)
+            return [Outcome(after, replace(estimate, instance=member.instance))]
+        joint = Joint(self.members, tracks, frame, time_s, views, self.rules)
+        joint.solve()
+        verdicts = [
+            member.tracker.verdict(joint.data[k], joint.ranked[k])
+            for k, member in enumerate(self.members)
+        ]
+        outcomes = []
+        for k, member in enumerate(self.members):
+            tracker, verdict, ranked = member.tracker, verdicts[k], joint.ranked[k]
+            estimate = tracker.estimate(frame, time_s, views, verdict, ranked)
+            after = tracker.followed(joint.data[k], frame, time_s, verdict)
+            after = replace(after, doubted=verdict.status != "ok")
             outcomes.append(Outcome(after, replace(estimate, instance=member.instance)))
         return outcomes

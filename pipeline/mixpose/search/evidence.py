@@ -1,11 +1,4 @@
-"""How unlikely it is that a pose explains its detections by chance.
-
-A pose that meets K detections uses up half of its free directions' number of them; every other
-one fell by chance within s of a prediction with a probability of about ``ρ (2π s²)^(m/2)``, ρ
-being how densely detections lie.  The errors' own size s is estimated, up to σ_ε: four
-detections met to a tenth of a pixel are better evidence than five met to a pixel
-(a-contrario model selection, Moisan and Stival, IJCV 2004).
-"""
+"""Very many poses judged at once, by the evidence that every pose is judged by in the end."""
 
 from __future__ import annotations
 
@@ -17,12 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
+from mixpose.density import AssociationRules, ErrorRules
+from mixpose.judgement import DetectionModel, Sighting, odds_of, paid_by_count
 from mixpose.rigid import transform
-from mixpose.search.budget import EvidenceOptions
 from mixpose.search.detections import SensorDetections
 from mixpose.sensors import facing
 
 Floats: TypeAlias = NDArray[np.float64]
+
+_DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
 def evidence(
@@ -30,68 +26,66 @@ def evidence(
     body: Body,
     poses: Floats,
     free: NDArray[np.bool_],
-    options: EvidenceOptions,
-) -> Floats:
-    """Log-likelihood ratio (H,) of poses (H, 4, 4) against chance, in nats.
+    gate: float,
+) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses against clutter, paid by count, and shares (H,) of the body met.
 
-    Sensors without detections (range profiles) do not take part.
+    Parameters
+    ----------
+    detections : sequence of SensorDetections
+        Sensors without detections (range profiles) do not take part.
+    body : Body
+    poses : (H, 4, 4) array
+    free : (6,) bool
+    gate : float
+        Within which a detection is met, in σ_ε.
     """
-    chance, squared, coordinates, missed = np.zeros((4, len(poses)))
-    for each in detections:
-        if not len(each.points):
-            continue
-        m = each.points.shape[1]
-        met, errors, seen, by_chance = _matches(each, body, poses, options)
-        missed += seen - met
-        coordinates += m * met
-        squared += errors
-        chance += by_chance
+    sightings = [_sighting(one, body, poses, gate) for one in detections if len(one.points)]
+    squares, coordinates, met = np.zeros((3, len(poses)))
+    for one in sightings:
+        squares += (one.offsets**2).sum(axis=(1, 2))
+        found = one.shares.sum(axis=1)
+        coordinates += one.offsets.shape[2] * found
+        met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(sightings)
     spare = np.maximum(coordinates - free.sum(), 0.0)
-    s2 = np.clip(squared / np.maximum(spare, 1e-9), options.sharpest**2, 1.0)
-    share = spare / np.maximum(coordinates, 1.0)
-    gain = -share * chance - 0.5 * spare * np.log(s2) - 0.5 * squared / s2
-    return np.asarray(np.where(spare > 0, gain + options.missed * missed, 0.0))
+    degrees = _ERRORS.typical_degrees
+    variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
+    variance /= degrees + spare
+    odds = odds_of(sightings, variance, 2 * body.radius, _DETECTION)
+    return paid_by_count(odds, sightings, free), met
 
 
-def _matches(
-    seen: SensorDetections, body: Body, poses: Floats, options: EvidenceOptions
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Detections met, their squared errors in σ_ε², features in view, log-chances: (H,) each."""
-    sensor, points = seen.view.sensor, seen.points
+def _sighting(seen: SensorDetections, body: Body, poses: Floats, gate: float) -> Sighting:
+    sensor, points, sigma = seen.view.sensor, seen.points, seen.sigma
     world = transform(poses, body.means)
-    y, visible = sensor.project(world)
+    y, by_world, visible = sensor.linearise(world)
     visible = visible & facing(sensor, poses, world, body.normals)
-    tree = cKDTree(points)
-    pose, _ = np.nonzero(visible)
-    gate = options.gate * seen.sigma
-    away, detection = tree.query(y[visible], distance_upper_bound=gate)
-    inside = np.isfinite(away)
+    pose, feature = np.nonzero(visible)
+    away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=gate * sigma)
     # a detection is met by the nearest of the features to which it is the nearest
-    squared = np.full(len(poses) * len(points), np.inf)
-    key = pose[inside] * len(points) + detection[inside]
-    np.minimum.at(squared, key, (away[inside] / seen.sigma) ** 2)
-    by_detection = squared.reshape(len(poses), len(points))
-    met = np.isfinite(by_detection)
-    errors = np.where(met, by_detection, 0.0).sum(axis=1)
-    by_chance = met @ _log_chances(seen, tree, options)
-    return met.sum(axis=1).astype(float), errors, visible.sum(axis=1).astype(float), by_chance
+    near = np.flatnonzero(np.isfinite(away))
+    key = pose[near] * len(points) + nearest[near]
+    order = np.lexsort((away[near], key))
+    first = near[order[np.unique(key[order], return_index=True)[1]]]
+    pose, feature, found = pose[first], feature[first], points[nearest[first]]
+    shares, offsets = np.zeros(visible.shape), np.zeros(y.shape)
+    shares[pose, feature] = 1.0
+    offsets[pose, feature] = (found - y[pose, feature]) / sigma
+    crowd = _crowd(points, y, visible, sigma) * sigma ** y.shape[-1]
+    return Sighting(
+        visible.astype(float), shares, offsets, by_world / sigma, crowd, float(len(points))
+    )
 
 
-def _log_chances(seen: SensorDetections, tree: cKDTree, options: EvidenceOptions) -> Floats:
-    """Logarithms (M,) of the chance that a point falls within σ_ε of a detection.
-
-    Where detections crowd, one of them is met more easily.
-    """
-    sensor, points = seen.view.sensor, seen.points
-    M, m = points.shape
-    sides = np.maximum(np.ptp(points, axis=0), 10 * seen.sigma)
-    whole = sensor.upper - sensor.lower
-    sides = np.where(np.isfinite(whole), whole, sides)
-    bell = (np.sqrt(2 * np.pi) * seen.sigma) ** m
-    density = np.full(M, M / np.prod(sides))
-    k = options.neighbours
-    if m == 2 and k < M:
-        away, _ = tree.query(points, k=[k + 1])
-        reach = np.maximum(away[:, 0], 10 * seen.sigma)
-        density = np.maximum(density, k / (np.pi * reach**2))
-    return np.asarray(np.minimum(np.log(density * bell), -0.1))
+def _crowd(points: Floats, y: Floats, visible: NDArray[np.bool_], sigma: float) -> Floats:
+    """Detections (H,) per unit of the sensor's coordinates, everywhere or around the body."""
+    smallest = _ASSOCIATION.min_region * sigma
+    overall = len(points) / np.maximum(np.ptp(points, axis=0), smallest).prod()
+    lower = np.where(visible[..., None], y, np.inf).min(axis=1)
+    upper = np.where(visible[..., None], y, -np.inf).max(axis=1)
+    empty = ~visible.any(axis=1)
+    lower[empty], upper[empty] = 0.0, 0.0
+    half = np.maximum(upper - lower, smallest) / 2
+    middle = (lower + upper) / 2
+    inside = (np.abs(points - middle[:, None]) <= half[:, None]).all(axis=2).sum(axis=1)
+    return np.asarray(np.maximum(overall, inside / (2 * half).prod(axis=1)))

@@ -18,8 +18,7 @@ from mixpose.body import Body
 from mixpose.density import Noise
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
-from mixpose.objective import MatchedObjective, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
+from mixpose.objective import MatchedObjective, SharedDensities, View, matched_objective
 from mixpose.records import SensorReport
 from mixpose.search import SearchState
 from mixpose.tracking.association_likelihood import are_associated
@@ -77,7 +76,10 @@ class SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it; `log` is written by the proposer that searches."""
+    """A frame, and what is known before it; `log` is written by the proposer that searches.
+
+    `shared` are the densities of a whole scene, where the views hold what is left for this body.
+    """
 
     views: Sequence[View]
     body: Body
@@ -88,6 +90,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
 
     @cached_property
@@ -113,29 +116,18 @@ class FrameData:
             self.rules.judgement.detection,
         )
 
-    def at_sigma(self, near: Floats | None = None, *, fine: bool = False) -> MatchedObjective:
+    @cached_property
+    def finest(self) -> MatchedObjective:
         """The matched objective at σ_ε."""
         sigmas = [view.observation.sigma for view in self.views]
-        steps = FINE_STEPS if fine else LAST_STEPS
-        return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
+        return matched_objective(self.views, self.body, sigmas, shared=self.shared)
 
     def without(self, names: Mapping[str, str]) -> FrameData:
         """The frame without some sensors."""
         if not names:
             return self
         views = [view for view in self.views if view.name not in names]
-        return replace(self, views=views)
-
-    @cached_property
-    def finest(self) -> MatchedObjective | None:
-        """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
-        sparse = all(view.observation.is_sparse for view in self.views)
-        detected = any(view.observation.cell is None for view in self.views)
-        return self.at_sigma() if sparse and detected else None
-
-    def objective_near(self, T_world_object: Floats) -> MatchedObjective:
-        """The objective at σ_ε around a pose."""
-        return self.finest or self.at_sigma(T_world_object, fine=True)
+        return replace(self, views=views, shared=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +165,10 @@ class MatchedLikelihood:
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         rules, others = data.rules.judgement, []
         if start.left_out:
-            found, _ = associate(self.data.objective_near(T), T, rules.association)
+            found, _ = associate(self.data.finest, T, rules.association)
             others = [one for one in found if one.name in start.left_out]
         judged = judge(
-            data.objective_near(T),
+            data.finest,
             T,
             data.free,
             before=data.track.residuals,
@@ -227,7 +219,7 @@ class AssociationLikelihood:
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by the sum over all associations."""
         data, T = self.data, fit.T_world_object
-        judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
+        judged = judge(data.finest, T, data.free, rules=data.rules.judgement)
         anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
             judged,

@@ -88,6 +88,8 @@ class Track:
         By sensor, of the last frame with a pose.
     search : SearchState
         Where a search with a budget goes on while nothing convinces.
+    doubted : bool
+        Whether another body of the scene may have what the last pose meets.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -98,6 +100,7 @@ class Track:
     walk: RandomWalk | None = None
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
+    doubted: bool = False
 
     def missed(self, search: SearchState) -> Track:
         """The track after a frame without a pose."""

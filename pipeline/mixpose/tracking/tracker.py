@@ -116,36 +116,39 @@ class Tracker:
         Track, Estimate
             The track for the next frame, and the frame's estimate without its latency.
         """
-        usable = [view for view in views if not view.observation.is_empty]
-        usable = in_step(usable, track, frame, time_s, self.rules.motion)
-        data = self.data(track, frame, time_s, usable)
-        ranked = self.ranked(data) if usable else []
+        data = self.data(track, frame, time_s, views)
+        ranked = self.ranked(data)
+        verdict = self.verdict(data, ranked)
+        estimate = self.estimate(frame, time_s, views, verdict, ranked)
+        return self.followed(data, frame, time_s, verdict), estimate
+
+    def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
+        """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
         if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
             verdict = replace(verdict, status="ambiguous")
-        told = verdict.best or (ranked[0] if ranked else None)
-        estimate = self._estimate(frame, time_s, views, verdict, told)
-        if verdict.best is None:
-            return track.missed(data.log.state), estimate
-        return self._followed(track, frame, time_s, verdict, verdict.best), estimate
+        return verdict
 
-    def ranked(self, data: FrameData) -> list[Judged]:
+    def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
         Parameters
         ----------
         data : FrameData
-            With at least one view, none of which saw nothing.
+        quickly : bool
+            Whether to look where the body is expected only.
         """
-        likelihood = likelihood_of(data)
         ranked: list[Judged] = []
+        if not data.views:
+            return ranked
+        likelihood = likelihood_of(data)
 
         def consider(start: Start, name: str) -> Judged:
             judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=name)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)
             return judged
 
-        for propose in self.proposers:
+        for propose in self.proposers[:1] if quickly else self.proposers:
             for start in propose(data, ranked):
                 judged = consider(start, propose.__name__)
                 for refine in self.refinements:
@@ -153,16 +156,30 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def _estimate(
+    def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
+        """The same poses, judged by other views, most evident first."""
+        if not data.views:
+            return []
+        likelihood = likelihood_of(data)
+        found = []
+        for one in ranked:
+            left_out = {n: report.why for n, report in one.sensors.items() if report.why}
+            start = Start(one.T_world_object, left_out=left_out)
+            judged = likelihood.judge(likelihood.fit(start), start)
+            found.append(replace(judged, proposer=one.proposer))
+        return sorted(found, key=lambda one: -one.log_evidence)
+
+    def estimate(
         self,
         frame: int,
         time_s: float | None,
         views: Sequence[View],
         verdict: Verdict,
-        told: Judged | None,
+        ranked: Sequence[Judged],
     ) -> Estimate:
         """The estimate of a frame, with reports of the best pose, believed or not."""
         best = verdict.best
+        told = best or (ranked[0] if ranked else None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
         return Estimate(
@@ -178,10 +195,13 @@ class Tracker:
             proposer=best.proposer if best else "",
         )
 
-    def _followed(
-        self, track: Track, frame: int, time_s: float | None, verdict: Verdict, best: Judged
+    def followed(
+        self, data: FrameData, frame: int, time_s: float | None, verdict: Verdict
     ) -> Track:
-        """The track after a frame with poses."""
+        """The track after a frame."""
+        track, best = data.track, verdict.best
+        if best is None:
+            return track.missed(data.log.state)
         found = [
             Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
             for one, weight in verdict.kept
@@ -198,6 +218,8 @@ class Tracker:
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
         """A frame, and what is known before it; arguments as of `advance`."""
+        views = [view for view in views if not view.observation.is_empty]
+        views = in_step(views, track, frame, time_s, self.rules.motion)
         predictions = self.predictions(track, frame, time_s)
         return FrameData(
             views=views,

@@ -1,0 +1,256 @@
+"""Maximise the matched objective over rig and poses, through narrowing blurs.
+
+At each blur the objective is climbed by Gauss-Newton; the blurs end at twice the noise that the
+residuals show, which is learnt on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.calibration.bundle import Bundle, Rows, normal_equations, rows_of, solved, stepped
+from mixpose.calibration.matching import Pairs, feature_spacing, match, nearest_distance
+from mixpose.calibration.rig import Rig
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.records import Floats
+
+GaugeOf = Callable[[Rig], Floats]
+Weighted = tuple[int, Pairs, Rows, Floats]
+
+_MOST_BLURS = 40
+_SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
+_BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Rig and poses at the maximum.
+
+    Attributes
+    ----------
+    rig : Rig
+    poses : (K, 4, 4) float64
+    noise : (L,) float64
+        Standard deviation of a detection's coordinate by sensor.
+    covariance : (G, G) float64
+        Of the free parameters, in the gauge.
+    unknown : (G, u) float64
+        Directions that are not determined, in the parameters' sizes.
+    weighted : tuple
+        Pairs of each sensor with residuals and weights, 1 for what agrees.
+    inflation : float
+        By which variances are larger than independent errors of detections would make them.
+    """
+
+    rig: Rig
+    poses: Floats
+    noise: Floats
+    covariance: Floats
+    unknown: Floats
+    weighted: tuple[tuple[Pairs, Floats, Floats], ...]
+    inflation: float
+
+
+def first_blurs(
+    bundle: Bundle, rig: Rig, poses: Floats, sigmas: Floats, rules: CalibrationRules
+) -> Floats:
+    """Blurs (L,) to begin with: wide enough for what the start is off, not for neighbours."""
+    blurs = np.array(sigmas, dtype=np.float64)
+    for sensor in range(len(rig.sensors)):
+        off = nearest_distance(rig, poses, bundle.frames, bundle.clock, sensor)
+        if len(off):
+            widest = rules.widest * feature_spacing(rig, poses, sensor)
+            wanted = rules.first_blur * float(np.median(off))
+            blurs[sensor] = max(min(wanted, widest), _SHARPEST * sigmas[sensor])
+    return blurs
+
+
+def adjust(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    gauge_of: GaugeOf,
+    sigmas: Floats,
+    rules: CalibrationRules,
+    *,
+    blurs: Floats | None = None,
+    noise: Floats | None = None,
+) -> Adjusted:
+    """Climb from a start to the maximum.
+
+    Parameters
+    ----------
+    bundle : Bundle
+    rig : Rig
+    poses : (K, 4, 4) array
+    gauge_of : callable
+        Rows of the gauge at a rig.
+    sigmas : (L,) array
+        σ_ε by sensor.
+    rules : CalibrationRules
+    blurs : (L,) array or None
+        To begin with; None: as the start needs.
+    noise : (L,) array or None
+        Known noise, of which none is learnt.
+    """
+    blur = first_blurs(bundle, rig, poses, sigmas, rules) if blurs is None else blurs
+    for _ in range(_MOST_BLURS):
+        for _ in range(rules.steps):
+            weighted, _ = _weighted(bundle, rig, poses, blur, blur, rules)
+            rig, poses, _ = _climbed(bundle, rig, poses, gauge_of, weighted)
+        learnt = _noise(bundle, rig, poses, blur, sigmas, rules) if noise is None else noise
+        last = rules.blur * learnt
+        if (blur <= last / rules.narrowing).all():
+            break
+        blur = np.maximum(blur * rules.narrowing, last)
+    for _ in range(rules.last_steps):
+        blur = rules.blur * learnt
+        weighted, _ = _weighted(bundle, rig, poses, blur, learnt, rules)
+        rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
+        before = learnt
+        if noise is None:
+            learnt = _noise(bundle, rig, poses, blur, sigmas, rules)
+        if size < rules.converged and np.allclose(before, learnt, rtol=1e-3):
+            break
+    return _finished(bundle, rig, poses, gauge_of, learnt, rules)
+
+
+def _weighted(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    blur: Floats,
+    noise: Floats,
+    rules: CalibrationRules,
+) -> tuple[list[Weighted], list[Floats]]:
+    """Pairs of all sensors, weighted by the objective and the noise; and by the objective alone."""
+    found: list[Weighted] = []
+    alone: list[Floats] = []
+    for sensor in range(len(rig.sensors)):
+        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], rules.faintest)
+        rows = rows_of(bundle, rig, poses, sensor, pairs)
+        squared = (rows.residual**2).sum(axis=1)
+        weight = pairs.share * np.exp(-squared / (4 * blur[sensor] ** 2)) * rows.known
+        alone.append(weight)
+        found.append((sensor, pairs, rows, weight / noise[sensor] ** 2))
+    return found, alone
+
+
+def _climbed(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    gauge_of: GaugeOf,
+    weighted: Sequence[Weighted],
+) -> tuple[Rig, Floats, float]:
+    """One step; its size in standard deviations of the rig's parameters."""
+    normal = normal_equations(bundle, len(poses), weighted, 1e-9)
+    step = solved(bundle, normal, gauge_of(rig), len(poses))
+    largest = np.abs(step.poses[:, 3:]).max(initial=0.0)
+    for block in bundle.blocks:
+        turns = [abs(v) for v, u in zip(step.rig[block.place], block.units) if u == "rad"]
+        largest = max(largest, *turns, 0.0) if turns else largest
+    if largest > 0.3:  # the linear model does not reach that far
+        step = replace(step, rig=step.rig * 0.3 / largest, poses=step.poses * 0.3 / largest)
+    deviations = np.sqrt(np.maximum(np.diag(step.covariance), 0.0))
+    moved = step.rig[deviations > 0] / deviations[deviations > 0]
+    size = float(np.abs(moved).max(initial=0.0))
+    if not bundle.count:
+        size = float(np.abs(step.poses).max(initial=0.0)) * 1e3
+    rig, poses = stepped(bundle, rig, poses, step)
+    return rig, poses, size
+
+
+def _unknowns(bundle: Bundle, weights: Sequence[Floats], sensors: Sequence[int]) -> float:
+    """Share of the rows that unknowns use up."""
+    rows = sum(m * float(w.sum()) for w, m in zip(weights, sensors, strict=True))
+    used = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
+    return float(min(used / max(rows, 1.0), 0.9))
+
+
+def _noise(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    blur: Floats,
+    sigmas: Floats,
+    rules: CalibrationRules,
+) -> Floats:
+    """Standard deviation of detections (L,) from residuals under a Gaussian weight."""
+    weighted, alone = _weighted(bundle, rig, poses, blur, np.ones(len(blur)), rules)
+    dimensions = [eye.dimension for eye in rig.sensors]
+    used = _unknowns(bundle, alone, dimensions)
+    found = np.array(sigmas, dtype=np.float64)
+    for unit in sorted({eye.unit for eye in rig.sensors}):
+        # sensors of a kind have one noise, in σ_ε: with one each, poses would be drawn to the
+        # sensor that happens to fit best until it had no noise at all
+        alike = [s for s, eye in enumerate(rig.sensors) if eye.unit == unit]
+        squared = [weighted[s][2].residual / sigmas[s] for s in alike]
+        total = sum(dimensions[s] * float(alone[s].sum()) for s in alike)
+        if total <= 6:
+            continue
+        spent = sum(float(alone[s] @ (r**2).sum(axis=1)) for s, r in zip(alike, squared))
+        tilted = spent / (total * (1 - used))
+        # a Gaussian of variance s² under the weight exp(-d²/4b²) has 1/(1/s² + 1/2b²)
+        width = float(np.median(blur[alike] / sigmas[alike]))
+        inverse = max(1 / max(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
+        found[alike] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
+    return found
+
+
+def _finished(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    gauge_of: GaugeOf,
+    noise: Floats,
+    rules: CalibrationRules,
+) -> Adjusted:
+    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules)
+    normal = normal_equations(bundle, len(poses), weighted, 0.0)
+    step = solved(bundle, normal, gauge_of(rig), len(poses))
+    m = float(np.mean([eye.dimension for eye in rig.sensors]))
+    a = 1 / (2 * rules.blur) ** 2
+    # of an M-estimator whose weights are Gaussian, against the inverse of its curvature
+    covariance = step.covariance * (1 + 2 * a) ** (m / 2 + 2) / (1 + 4 * a) ** (m / 2 + 1)
+    inflation = _inflation(bundle, weighted, covariance, len(poses))
+    parts = tuple(
+        (pairs, rows.residual, weight)
+        for (_, pairs, rows, _), weight in zip(weighted, alone, strict=True)
+    )
+    return Adjusted(rig, poses, noise, covariance * inflation, step.unknown, parts, inflation)
+
+
+def _inflation(
+    bundle: Bundle, weighted: Sequence[Weighted], covariance: Floats, frames: int
+) -> float:
+    """By how much frames differ more than independent errors of detections would let them.
+
+    Each frame's pull on the rig has the covariance of its information; a common error of its
+    detections, as of a sensor out of step, makes it larger.
+    """
+    G = bundle.count
+    if not G:
+        return 1.0
+    pulls = np.zeros((frames, G))
+    for _, pairs, rows, weight in weighted:
+        flat = rows.residual * weight[:, None]
+        for block, J in rows.by_rig:
+            columns = np.arange(block.place.start, block.place.stop)
+            pull = np.einsum("nmk,nm->nk", J, flat)
+            np.add.at(pulls, (pairs.frame[:, None], columns[None]), pull)
+        if rows.by_point is not None:
+            start = next(b.start for b in bundle.blocks if b.kind == "body")
+            pull = np.einsum("nmk,nm->nk", rows.by_point, flat)
+            columns = start + 3 * pairs.feature[:, None] + np.arange(3)
+            np.add.at(pulls, (pairs.frame[:, None], columns), pull)
+    active = int(np.count_nonzero(pulls.any(axis=1)))
+    rank = int(np.linalg.matrix_rank(covariance)) if G else 0
+    if active <= rank + 2 or not rank:
+        return 1.0
+    seen = float(np.einsum("ki,ij,kj->", pulls, covariance, pulls)) / rank
+    seen *= active / (active - rank)
+    return seen if seen > 1.3 else 1.0

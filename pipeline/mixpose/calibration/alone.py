@@ -1,0 +1,74 @@
+"""Where the body is for one camera alone: several answers where several fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.density import Observation
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import inverse
+from mixpose.sensors import Sensor
+from mixpose.threads import one_blas_thread
+from mixpose.tracking import Tracker
+
+_LEAST = 4  # detections: three leave four poses of any triangle
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Poses that explain what one sensor saw.
+
+    Attributes
+    ----------
+    poses : (H, 4, 4) float64
+        T_sensor_object, most evident first; none where nothing convinces.
+    evidence : (H,) float64
+        Log-odds against clutter.
+    """
+
+    poses: Floats
+    evidence: Floats
+
+
+NOTHING = Hypotheses(np.zeros((0, 4, 4)), np.zeros(0))
+
+
+def hypotheses(
+    name: str, sensor: Sensor, points: Floats, sigma: float, body: Body, rules: CalibrationRules
+) -> Hypotheses:
+    """Search for the body in one camera's frame.
+
+    Parameters
+    ----------
+    name : str
+    sensor : Sensor
+        A camera.
+    points : (M, 2) array
+        Its detections.
+    sigma : float
+        σ_ε.
+    body : Body
+    rules : CalibrationRules
+    """
+    if len(points) < _LEAST:
+        return NOTHING
+    # the world is put where the camera is, so that poses are relative to it
+    own = sensor.moved(inverse(sensor.T_sensor_world))  # type: ignore[attr-defined]
+    pattern = PointPattern(points, np.ones(len(points)))
+    views = [View(name, own, Observation(pattern, sigma))]
+    tracker = Tracker.create(body, EstimatorOptions())
+    with one_blas_thread():
+        ranked = tracker.ranked(tracker.data(tracker.begin(), 0, None, views))
+    best = ranked[0].log_evidence if ranked else 0.0
+    kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
+    kept = kept[: rules.hypotheses]
+    if not kept:
+        return NOTHING
+    poses = np.array([one.T_world_object for one in kept])
+    return Hypotheses(poses, np.array([one.log_evidence for one in kept]))

@@ -1,0 +1,222 @@
+"""A calibration from beginning to end: start, adjust, leave out what is bad, look at the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.calibration.adjust import Adjusted, GaugeOf, adjust
+from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.bundle import Bundle
+from mixpose.calibration.choice import held_back
+from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.gauge import Freedom, gauge_rows
+from mixpose.calibration.interpolation import neighbours
+from mixpose.calibration.matching import clock_of
+from mixpose.calibration.residuals import met_share, residuals_of, sights_of
+from mixpose.calibration.result import Calibration, Residual
+from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.calibration.start import Start, searched, start_from_cameras, start_together
+from mixpose.calibration.task import Progress, Task, silent
+from mixpose.errors import RecordingError
+from mixpose.records import Floats
+
+
+def calibrate(
+    task: Task,
+    rules: CalibrationRules = CalibrationRules(),
+    *,
+    progress: Progress = silent,
+    found: dict[tuple[int, int], Hypotheses] | None = None,
+) -> Calibration:
+    """Calibrate sensors and body from what the sensors saw.
+
+    Parameters
+    ----------
+    task : Task
+    rules : CalibrationRules
+    progress : callable
+    found : dict or None
+        Hypotheses of single cameras that are known from before; new ones are added.
+
+    Raises
+    ------
+    RecordingError
+        If the body is not found in enough frames.
+    """
+    if task.cameras:
+        known = searched(task, rules, progress, {} if found is None else found)
+        start = start_from_cameras(task, known, rules)
+    else:
+        start = start_together(task, rules, progress)
+    if not len(start.poses):
+        raise RecordingError(
+            "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
+            "check` finds its features"
+        )
+    free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
+    return _Run(replace(task, free=free), start, rules, progress).result()
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Some of the frames with their poses."""
+
+    frames: tuple[SeenFrame, ...]
+    poses: Floats
+
+    def only(self, mask: NDArray[np.bool_]) -> _Part:
+        kept = np.flatnonzero(mask)
+        return _Part(tuple(self.frames[k] for k in kept), self.poses[kept])
+
+
+class _Run:
+    """One calibration: what stays the same during it."""
+
+    def __init__(
+        self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
+    ) -> None:
+        self._task, self._start, self._rules, self._progress = task, start, rules, progress
+        self._known = task.known is not None
+        self._pose_free = task.pose_free & (not self._known)
+        times = [f.time_s for f in start.frames if f.time_s is not None]
+        steps = np.diff(np.unique(times)) if len(times) > 1 else np.ones(1)
+        self._blocks = blocks_of(
+            start.rig,
+            task.free,
+            body=task.body_free,
+            length=_size_of(start.rig, start.poses),
+            interval=float(np.median(steps)),
+        )
+
+    def result(self) -> Calibration:
+        """Do it all."""
+        task, rules = self._task, self._rules
+        everything = _Part(self._start.frames, self._start.poses)
+        mask = held_back(len(everything.poses), rules, runs=task.times_matter)
+        training = everything.only(~mask)
+        self._progress("adjusting all sensors together", 0, 3)
+        adjusted = self._adjusted(training, self._start.rig, None)
+        good = met_share(adjusted, training.frames, task) > rules.least_met
+        bad = [f.number for f, ok in zip(training.frames, good, strict=True) if not ok]
+        if bad and good.any():
+            training = _Part(training.frames, adjusted.poses).only(good)
+            self._progress("adjusting without bad frames", 1, 3)
+            adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
+        self._progress("looking at the frames held back", 2, 3)
+        held = everything.only(mask)
+        held_fit = None
+        if len(held.poses):
+            held_fit = self._posed(held, adjusted.rig)
+            good = met_share(held_fit, held.frames, task) > rules.least_met
+            bad += [f.number for f, ok in zip(held.frames, good, strict=True) if not ok]
+            held = _Part(held.frames, held_fit.poses).only(good)
+            held_fit = self._posed(held, adjusted.rig, adjusted.noise) if good.any() else None
+        return self._told(training, adjusted, held, held_fit, sorted(bad))
+
+    def _bundle(self, part: _Part, blocks: tuple[Block, ...]) -> Bundle:
+        near = neighbours([f.time_s for f in part.frames], self._rules.gap)
+        clock = clock_of(part.frames, near, len(self._task.rig.sensors))
+        return Bundle(part.frames, clock, blocks, self._pose_free, self._rules.undetermined)
+
+    def _gauge(self, poses: Floats) -> GaugeOf:
+        freedom = Freedom(self._pose_free, poses)
+        return lambda rig: gauge_rows(rig, self._blocks, freedom, self._task.length)[0]
+
+    def _adjusted(self, part: _Part, rig: Rig, blurs: Floats | None) -> Adjusted:
+        bundle = self._bundle(part, self._blocks)
+        gauge = self._gauge(part.poses)
+        return adjust(bundle, rig, part.poses, gauge, self._task.sigmas, self._rules, blurs=blurs)
+
+    def _posed(self, part: _Part, rig: Rig, noise: Floats | None = None) -> Adjusted:
+        """Poses only, the rig as it is."""
+        bundle = self._bundle(part, ())
+        blurs = None if noise is None else 2 * self._rules.blur * noise
+        return adjust(
+            bundle,
+            rig,
+            part.poses,
+            lambda _: np.zeros((0, 0)),
+            self._task.sigmas,
+            self._rules,
+            blurs=blurs,
+            noise=noise,
+        )
+
+    def _told(
+        self,
+        training: _Part,
+        adjusted: Adjusted,
+        held: _Part,
+        held_fit: Adjusted | None,
+        bad: list[int],
+    ) -> Calibration:
+        task = self._task
+        bundle = self._bundle(training, ())
+        after = residuals_of(bundle, adjusted.rig, adjusted.poses, adjusted, climb=False)
+        before = residuals_of(bundle, task.rig, adjusted.poses, adjusted, climb=True)
+        none = dict.fromkeys(range(len(task.rig.sensors)), np.nan)
+        held_after, held_before = none, none
+        if held_fit is not None:
+            own = self._bundle(held, ())
+            held_after = residuals_of(own, adjusted.rig, held_fit.poses, held_fit, climb=False)
+            held_before = residuals_of(own, task.rig, held_fit.poses, held_fit, climb=True)
+        freedom = Freedom(self._pose_free, training.poses)
+        _, gauge = gauge_rows(adjusted.rig, self._blocks, freedom, task.length)
+        deviations, refused = _determined(self._blocks, adjusted, task.rig.names, self._rules)
+        numbers = [f.number for f in training.frames]
+        return Calibration(
+            before=task.rig,
+            after=adjusted.rig,
+            blocks=self._blocks,
+            deviations=deviations,
+            covariance=adjusted.covariance,
+            refused=refused,
+            gauge=gauge,
+            through=self._start.through,
+            unlinked=self._start.unlinked,
+            used=tuple(numbers),
+            held=tuple(f.number for f in held.frames) if held_fit is not None else (),
+            bad=tuple(bad),
+            recorded=len(task.frames),
+            residuals={
+                s: Residual(before[s], after[s], held_before[s], held_after[s])
+                for s in range(len(task.rig.sensors))
+            },
+            noise=adjusted.noise,
+            inflation=adjusted.inflation,
+            sights=sights_of(adjusted, numbers),
+            poses=dict(zip(numbers, adjusted.poses, strict=True)),
+            frames=training.frames,
+        )
+
+
+def _size_of(rig: Rig, poses: Floats) -> float:
+    """Median distance from sensors to the body, or from sensor to sensor if that is more."""
+    centres = np.array([centre_of(s) for s in rig.sensors])
+    places = poses[:, :3, 3] + poses[:, :3, :3] @ rig.points.mean(axis=0)
+    away = np.linalg.norm(places[:, None] - centres[None], axis=2)
+    return float(max(np.median(away), 1e-9))
+
+
+def _determined(
+    blocks: Sequence[Block], adjusted: Adjusted, names: Sequence[str], rules: CalibrationRules
+) -> tuple[Floats, tuple[str, ...]]:
+    """Standard deviations, infinite where not determined, and what is refused in words."""
+    deviations = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))
+    labels = [
+        f"{'body' if b.sensor is None else names[b.sensor]}:{b.kind} {name}"
+        for b in blocks
+        for name in b.names
+    ]
+    said = []
+    for direction in adjusted.unknown.T:
+        strongest = np.argsort(-np.abs(direction), kind="stable")[:3]
+        parts = [labels[k] for k in strongest if abs(direction[k]) > 0.2]
+        said.append(" with ".join(parts))
+    deviations[(adjusted.unknown**2).sum(axis=1) > 0.1] = np.inf
+    return deviations, tuple(said)

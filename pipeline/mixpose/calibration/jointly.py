@@ -1,0 +1,71 @@
+"""Where the body is for all sensors together, where none knows it alone: ranges, parallel beams.
+
+The sensors are then believed to stand about where the session has them.  Blurs wider than σ_ε
+forgive what they are off; the narrowest with which most frames convince is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.calibration.task import Progress, Task
+from mixpose.density import Observation
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import TWIST_NAMES
+from mixpose.threads import one_blas_thread
+from mixpose.tracking import Tracker
+
+
+def joint_poses(
+    task: Task, rules: CalibrationRules, progress: Progress
+) -> tuple[tuple[SeenFrame, ...], Floats]:
+    """Frames whose pose all sensors together know, and the poses (K, 4, 4)."""
+    best: list[tuple[SeenFrame, Floats]] = []
+    total = len(task.frames) * len(rules.widened)
+    for turn, factor in enumerate(rules.widened):
+        before = turn * len(task.frames)
+        found = []
+        for done, posed in enumerate(_tracked(task, factor)):
+            progress("searching the body with all sensors", before + done, total)
+            if posed is not None:
+                found.append(posed)
+        if len(found) > len(best):
+            best = found
+        if len(best) >= rules.convinced * len(task.frames):
+            break
+    poses = np.array([T for _, T in best]).reshape(-1, 4, 4)
+    return tuple(frame for frame, _ in best), poses
+
+
+def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | None]:
+    """Each frame with a pose that is believed, sensors blurred by a factor more than σ_ε."""
+    free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
+    turn, distance = task.around
+    options = EstimatorOptions(free=free, fuse=task.fuse)
+    tracker = Tracker.create(task.body, options, task.T_held, rotation_deg=turn, distance=distance)
+    track = tracker.begin()
+    for frame in task.frames:
+        with one_blas_thread():
+            track, estimate = tracker.advance(
+                track, frame.number, frame.time_s, _views(task, frame, factor)
+            )
+        T = estimate.T_world_object
+        yield None if T is None or estimate.status != "ok" else (frame, T)
+
+
+def _views(task: Task, frame: SeenFrame, factor: float) -> list[View]:
+    return [
+        View(
+            task.rig.names[sensor],
+            task.rig.sensors[sensor],
+            Observation(PointPattern(points, np.ones(len(points))), factor * task.sigmas[sensor]),
+        )
+        for sensor, points in frame.points.items()
+        if len(points)
+    ]

@@ -1,0 +1,174 @@
+"""Which detection may be which feature, softly: the weights of the matched objective.
+
+The gradient of ⟨g, h⟩ at a blur σ is that of weighted least squares over all pairs of a detection d
+and a predicted feature p, with the weights exp(−|d − p|²/4σ²); ⟨h, h⟩ keeps features from taking
+the same detection, for which a pair's weight is shared out where several compete.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.interpolation import Neighbours, interpolate
+from mixpose.calibration.rig import Rig
+from mixpose.records import Floats
+from mixpose.rigid import perturb, transform
+from mixpose.sensors import facing
+
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Pairs of detections and features of one sensor, over all frames.
+
+    Attributes
+    ----------
+    frame, feature, detection : (n,) int
+    y : (n, m) float64
+        Detected place.
+    share : (n,) float64
+        1 where nothing competes.
+    """
+
+    frame: Ints
+    feature: Ints
+    detection: Ints
+    y: Floats
+    share: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """When sensors look.
+
+    Attributes
+    ----------
+    near : Neighbours
+    late : (L, K) float64
+        Seconds from a frame's common time to a sensor's; 0 where not known.
+    since : (L, K) float64
+        Seconds from the middle of the recording.
+    """
+
+    near: Neighbours
+    late: Floats
+    since: Floats
+
+    def tau(self, rig: Rig, sensor: int, frame: Ints) -> Floats:
+        """Seconds from the common time of frames (n,) to when a sensor took them."""
+        late = self.late[sensor, frame] + rig.delays[sensor]
+        return np.asarray(late + rig.drifts[sensor] * self.since[sensor, frame])
+
+
+def clock_of(frames: Sequence[SeenFrame], near: Neighbours, sensors: int) -> Clock:
+    """When sensors say that they look."""
+    late, since = np.zeros((sensors, len(frames))), np.zeros((sensors, len(frames)))
+    times = [frame.time_s for frame in frames if frame.time_s is not None]
+    middle = (min(times) + max(times)) / 2 if times else 0.0
+    for k, frame in enumerate(frames):
+        for sensor, time in frame.times.items():
+            if frame.time_s is not None:
+                late[sensor, k] = time - frame.time_s
+                since[sensor, k] = time - middle
+    return Clock(near, late, since)
+
+
+def seen_poses(rig: Rig, poses: Floats, clock: Clock, sensor: int) -> Floats:
+    """Poses (K, 4, 4) at the moments when a sensor looks."""
+    frame = np.arange(len(poses))
+    tau = clock.tau(rig, sensor, frame)
+    if not tau.any():
+        return poses
+    return perturb(poses, interpolate(clock.near, poses, frame, tau).twist)
+
+
+def match(
+    rig: Rig,
+    poses: Floats,
+    frames: Sequence[SeenFrame],
+    clock: Clock,
+    sensor: int,
+    blur: float,
+    faintest: float,
+) -> Pairs:
+    """Pair detections and features of a sensor at a blur.
+
+    Parameters
+    ----------
+    rig : Rig
+    poses : (K, 4, 4) array
+    frames : sequence of SeenFrame
+    clock : Clock
+    sensor : int
+    blur : float
+        In sensor units.
+    faintest : float
+        Weight below which a pair is left out.
+    """
+    at = seen_poses(rig, poses, clock, sensor)
+    eye = rig.sensors[sensor]
+    world = transform(at, rig.points)
+    y, visible = eye.project(world)
+    visible = visible & facing(eye, at, world, rig.normals)
+    reach = 2 * blur * np.sqrt(-np.log(faintest))
+    parts: list[tuple[Ints, Ints, Ints, Floats, Floats]] = []
+    for k, frame in enumerate(frames):
+        points = frame.points.get(sensor)
+        if points is None or not len(points) or not visible[k].any():
+            continue
+        features = np.flatnonzero(visible[k])
+        i, j, weight = _near(y[k, features], points, blur, reach)
+        rivals = np.maximum(
+            np.bincount(i, weight, len(features))[i], np.bincount(j, weight, len(points))[j]
+        )
+        parts.append((np.full(len(i), k), features[i], j, points[j], weight / rivals))
+    if not parts:
+        none = np.zeros(0, dtype=np.intp)
+        return Pairs(none, none, none, np.zeros((0, eye.dimension)), np.zeros(0))
+    return Pairs(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _near(y: Floats, points: Floats, blur: float, reach: float) -> tuple[Ints, Ints, Floats]:
+    """Pairs within reach, as indices of features and detections, with their kernel."""
+    away = y[:, None, :] - points[None, :, :]
+    squared = (away * away).sum(axis=2)
+    i, j = np.nonzero(squared < reach * reach)
+    return i, j, np.exp(-squared[i, j] / (4 * blur * blur))
+
+
+def nearest_distance(
+    rig: Rig, poses: Floats, frames: Sequence[SeenFrame], clock: Clock, sensor: int
+) -> Floats:
+    """Distance of every predicted feature in view to the nearest detection, all frames together."""
+    at = seen_poses(rig, poses, clock, sensor)
+    eye = rig.sensors[sensor]
+    world = transform(at, rig.points)
+    y, visible = eye.project(world)
+    visible = visible & facing(eye, at, world, rig.normals)
+    found = [np.zeros(0)]
+    for k, frame in enumerate(frames):
+        points = frame.points.get(sensor)
+        if points is not None and len(points) and visible[k].any():
+            found.append(cKDTree(points).query(y[k, visible[k]])[0])
+    return np.concatenate(found)
+
+
+def feature_spacing(rig: Rig, poses: Floats, sensor: int) -> float:
+    """Median distance of a feature to its neighbour in a sensor."""
+    eye = rig.sensors[sensor]
+    world = transform(poses, rig.points)
+    y, visible = eye.project(world)
+    visible = visible & facing(eye, poses, world, rig.normals)
+    found = [
+        cKDTree(y[k, visible[k]]).query(y[k, visible[k]], k=2)[0][:, 1]
+        for k in range(len(poses))
+        if visible[k].sum() > 1
+    ]
+    return float(np.median(np.concatenate(found))) if found else np.inf

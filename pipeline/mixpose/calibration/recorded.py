@@ -1,0 +1,140 @@
+"""From a session and its recording to what a calibration takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+
+import numpy as np
+from scipy.signal import find_peaks
+
+from mixpose.body import Body
+from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.rules import CalibrationRules
+from mixpose.calibration.task import Progress
+from mixpose.errors import RecordingError, SessionError
+from mixpose.frames import Source, pair
+from mixpose.objective import View
+from mixpose.records import Floats, FrameSet, GridPattern, PointPattern
+from mixpose.runner import observe, open_sources
+from mixpose.search.budget import PeakOptions
+from mixpose.search.detections import is_pointlike, peaks
+from mixpose.session import Session
+
+_HIGHEST = 0.3  # of a profile's highest peak: a lower one is noise
+_RUN = 8  # frames read together where motion between them counts
+
+
+def require_points(body: Body) -> None:
+    """Refuse bodies whose detections are not points.
+
+    Raises
+    ------
+    SessionError
+    """
+    if not is_pointlike(body):
+        raise SessionError(
+            "calibrate: object: found segments or spread features; allowed: points, which leave "
+            "one detection each"
+        )
+
+
+def read_frames(
+    session: Session,
+    sources: Mapping[str, str],
+    rules: CalibrationRules,
+    progress: Progress,
+    *,
+    runs: bool,
+) -> tuple[SeenFrame, ...]:
+    """Read a recording, or frames spread evenly over it where it is long.
+
+    Parameters
+    ----------
+    session : Session
+    sources : mapping of str to str
+        Recordings in place of the session's.
+    rules : CalibrationRules
+    progress : callable
+    runs : bool
+        Whether frames next to each other are needed, as motion between them counts.
+
+    Raises
+    ------
+    RecordingError
+        If a source is live or cannot be read, or no frame has a detection.
+    """
+    opened = open_sources(session, sources)
+    live = [name for name, source in opened.items() if source.kind == "live"]
+    if live:
+        raise RecordingError(
+            f"sensor {live[0]!r}: source: is live; allowed: a recording, as frames are read twice"
+        )
+    found: list[SeenFrame] = []
+    index = {setup.name: k for k, setup in enumerate(session.sensors)}
+    total = min(_length(opened), rules.most_candidates)
+    for start, stop, step in _stretches(opened, rules, runs=runs):
+        with closing(pair(opened, start, stop, step)) as sets:
+            for frame_set in sets:
+                progress("reading frames", len(found), total)
+                seen = _seen(session, frame_set, index)
+                if any(len(points) for points in seen.points.values()):
+                    found.append(seen)
+    if not found:
+        raise RecordingError(
+            f"{session.path}: found no feature in any frame; see what mixpose check says"
+        )
+    return tuple(found)
+
+
+def _length(opened: Mapping[str, Source]) -> int:
+    return max((source.length or 0 for source in opened.values()), default=0)
+
+
+def _stretches(
+    opened: Mapping[str, Source], rules: CalibrationRules, *, runs: bool
+) -> list[tuple[int | None, int | None, int]]:
+    """Which numbers are read: all, every n-th, or runs of neighbours spread evenly."""
+    length = _length(opened)
+    if length <= rules.most_candidates:
+        return [(None, None, 1)]
+    if not runs:
+        return [(None, None, -(-length // rules.most_candidates))]
+    first = min((s.first for s in opened.values() if s.first is not None), default=0)
+    count = rules.most_candidates // _RUN
+    starts = first + np.linspace(0, length - _RUN, count).astype(int)
+    return [(int(start), int(start) + _RUN, 1) for start in np.unique(starts)]
+
+
+def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:
+    views: Sequence[View] = observe(session, frame_set)
+    points = {index[view.name]: _points(view) for view in views}
+    times = {
+        index[name]: frame.time_s
+        for name, frame in frame_set.frames.items()
+        if frame.time_s is not None
+    }
+    return SeenFrame(frame_set.number, frame_set.time_s, points, times)
+
+
+def _points(view: View) -> Floats:
+    pattern = view.observation.pattern
+    if isinstance(pattern, PointPattern):
+        return pattern.points[pattern.weights > 0]
+    if view.observation.dimension == 2:
+        return peaks(pattern, view.observation.sigma, PeakOptions())
+    return _profile_peaks(pattern)
+
+
+def _profile_peaks(pattern: GridPattern) -> Floats:
+    """Ranges (M, 1) of the peaks of a profile, by parabolas through their tops."""
+    values = np.asarray(pattern.values[0], dtype=np.float64)
+    top = float(values.max(initial=0.0))
+    if top <= 0:
+        return np.zeros((0, 1))
+    at, _ = find_peaks(values, height=_HIGHEST * top, prominence=_HIGHEST * top / 2)
+    inner = at[(at > 0) & (at < len(values) - 1)]
+    before, here, after = values[inner - 1], values[inner], values[inner + 1]
+    shift = 0.5 * (after - before) / np.maximum(2 * here - before - after, 1e-12)
+    places = pattern.origin[0] + pattern.step * (inner + np.clip(shift, -0.5, 0.5))
+    return np.asarray(places[:, None])

@@ -1,0 +1,75 @@
+"""How closely a calibration meets what was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mixpose.calibration.adjust import Adjusted
+from mixpose.calibration.bundle import Bundle, normal_equations, rows_of, solved, stepped
+from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.result import Sights
+from mixpose.calibration.rig import Rig
+from mixpose.calibration.task import Task
+from mixpose.records import Floats
+
+_MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
+_CLIMBS = 12
+
+
+def residuals_of(
+    bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted, *, climb: bool
+) -> dict[int, float]:
+    """Root mean square residual of each sensor over the pairs that a calibration met.
+
+    Parameters
+    ----------
+    bundle : Bundle
+        Without parameters of the rig.
+    rig : Rig
+    poses : (K, 4, 4) array
+    adjusted : Adjusted
+        Which detection is which feature.
+    climb : bool
+        Whether poses are first fitted to this rig.
+    """
+    sensors = range(len(rig.sensors))
+    weights = [weight * (weight > _MET) for _, _, weight in adjusted.weighted]
+    for _ in range(_CLIMBS if climb and bundle.pose_free.any() else 0):
+        rows = []
+        for s in sensors:
+            pairs = adjusted.weighted[s][0]
+            each = rows_of(bundle, rig, poses, s, pairs)
+            rows.append((s, pairs, each, (weights[s] > 0) * each.known / adjusted.noise[s] ** 2))
+        normal = normal_equations(bundle, len(poses), rows, 1e-6)
+        step = solved(bundle, normal, np.zeros((0, 0)), len(poses))
+        rig, poses = stepped(bundle, rig, poses, step)
+    found = {}
+    for s in sensors:
+        each = rows_of(bundle, rig, poses, s, adjusted.weighted[s][0])
+        mask = (weights[s] > 0) & each.known
+        squared = (each.residual**2).sum(axis=1)
+        found[s] = float(np.sqrt(squared[mask].mean())) if mask.any() else float("nan")
+    return found
+
+
+def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Share (K,) of the features that frames could show which were met, all sensors together."""
+    met, expected = np.zeros(len(frames)), np.zeros(len(frames))
+    for s in range(len(task.rig.sensors)):
+        pairs, _, weight = adjusted.weighted[s]
+        met += np.bincount(pairs.frame, weight > _MET, len(frames))
+        for k, frame in enumerate(frames):
+            expected[k] += min(len(frame.points.get(s, ())), len(task.rig.points))
+    return met / np.maximum(expected, 1)
+
+
+def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
+    """What each sensor saw and met."""
+    found = {}
+    for s, (pairs, residual, weight) in enumerate(adjusted.weighted):
+        kept = weight > _MET
+        named = np.array(numbers, dtype=np.intp)[pairs.frame[kept]]
+        found[s] = Sights(pairs.y[kept], residual[kept], named, pairs.feature[kept])
+    return found

@@ -1,0 +1,52 @@
+"""What a calibration goes by, with reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mixpose.constants import constant
+
+
+@dataclass(frozen=True)
+class CalibrationRules:
+    """Limits, tolerances and blurs of a calibration."""
+
+    blur: float = constant(
+        2.0,
+        "last blur by the noise that residuals show: the maximum of the objective is then 97 % as "
+        "precise as least squares, and a detection 6 standard deviations off has no pull",
+    )
+    narrowing: float = constant(0.5, "of a blur to the next: halving loses no frame of any case")
+    first_blur: float = constant(2.0, "of the median distance to the nearest feature at the start")
+    widest: float = constant(0.35, "of the distance between neighbouring features in a sensor")
+    steps: int = constant(4, "Gauss-Newton steps at each blur but the last")
+    last_steps: int = constant(40, "most at the last blur; most cases need 6")
+    converged: float = constant(1e-3, "standard deviations moved in a step: then it is the last")
+    faintest: float = constant(0.02, "weight below which a pair of detection and feature is left")
+    margin: float = constant(12.0, "log-odds behind the best pose of a sensor: less likely is none")
+    hypotheses: int = constant(6, "poses kept for a sensor's frame: flat bodies have two or four")
+    turn_deg: float = constant(
+        6.0, "by which poses of single cameras err at most, flat bodies seen from afar included"
+    )
+    shift: float = constant(0.12, "of the distance to the body, likewise: depth errs most")
+    seeds: int = constant(600, "relative poses that are tried as the middle of all others")
+    least_link: int = constant(2, "frames that must agree on where two sensors stand")
+    held_back: float = constant(0.2, "of the frames, whose residual is that of unseen data")
+    least_frames: int = constant(4, "left to calibrate from, else none is held back")
+    most_frames: int = constant(120, "taken; chosen by information where a recording has more")
+    most_candidates: int = constant(240, "frames among which those are chosen")
+    least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
+    bad_frame: float = constant(4.0, "residual of a frame by the median of all: it is left out")
+    undetermined: float = constant(
+        0.25,
+        "standard deviation by the size of what is sought (the rig, a focal length, a turn of "
+        "1 rad): nothing is known of such a direction",
+    )
+    widened: tuple[float, ...] = constant(
+        (1.0, 4.0, 12.0), "σ_ε with which sensors that know no pose alone are tried together"
+    )
+    convinced: float = constant(0.8, "of the frames: then no wider blur is tried")
+    gap: float = constant(2.5, "frame intervals over which motion is interpolated")
+    moved: float = constant(
+        4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"
+    )

@@ -1,0 +1,200 @@
+"""A calibration in words: a table for people."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from mixpose.calibration.result import Calibration
+from mixpose.calibration.rig import Block, centre_of
+from mixpose.records import Floats
+from mixpose.rigid import rotation_angle_deg
+
+_WORST = 3
+_CELLS = 4  # by which an image is divided along each side to tell its coverage
+
+
+def lines_of(found: Calibration, unit: str) -> list[str]:
+    """Lines of the report on a terminal."""
+    lines = [_frames_line(found)]
+    lines += [f"{'gauge':<10}{text}" for text in found.gauge]
+    lines += [""]
+    for block in found.blocks:
+        if block.kind != "body":
+            lines += _block_lines(found, block, unit)
+    if any(block.kind == "body" for block in found.blocks):
+        lines += _body_lines(found, unit)
+    lines += ["", *_residual_lines(found, unit), "", *_worst_lines(found, unit)]
+    lines += _coverage_lines(found)
+    if found.inflation > 1:
+        lines.append(
+            f"{'spread':<10}frames differ {np.sqrt(found.inflation):.2g} times as much as errors "
+            "of single detections would let them (motion, body or lens); deviations include it"
+        )
+    for direction in found.refused:
+        lines.append(f"{'refused':<10}not determined: {direction}")
+    return lines
+
+
+def _frames_line(found: Calibration) -> str:
+    parts = [f"{len(found.used)} calibrated from", f"{len(found.held)} held back"]
+    if found.bad:
+        parts.append(f"{len(found.bad)} bad")
+    rest = found.recorded - len(found.used) - len(found.held) - len(found.bad)
+    if rest > 0:
+        parts.append(f"{rest} not needed or without the body")
+    return f"{'frames':<10}{', '.join(parts)}"
+
+
+def _block_lines(found: Calibration, block: Block, unit: str) -> list[str]:
+    assert block.sensor is not None, "the body has lines of its own"
+    name = found.after.names[block.sensor]
+    before, after = values_of(found, block)
+    lines = []
+    if block.kind == "pose":
+        lines.append(_moved_line(found, block, unit))
+        return lines
+    for k, part in enumerate(block.names):
+        of = unit if block.units[k] == "length" else block.units[k]
+        scale, of = (1e3, "ms") if of == "s" else (1.0, of)
+        deviation = found.deviations[block.start + k] * scale
+        said = f"± {deviation:.2g} {of}" if np.isfinite(deviation) else "not determined"
+        title = f"{name} {block.kind}" + (f" {part}" if len(block.names) > 1 else "")
+        lines.append(f"{title:<28}{before[k] * scale:>14.6g} -> {after[k] * scale:<14.6g}{said}")
+    return lines
+
+
+def _moved_line(found: Calibration, block: Block, unit: str) -> str:
+    assert block.sensor is not None
+    one, two = (rig.sensors[block.sensor] for rig in (found.before, found.after))
+    turn = float(rotation_angle_deg(one.T_sensor_world, two.T_sensor_world))  # type: ignore[attr-defined]
+    shift = float(np.linalg.norm(centre_of(two) - centre_of(one)))
+    deviation = found.deviations[block.place]
+    words = []
+    for part, of, scale in ((deviation[:3], unit, 1.0), (deviation[3:], "deg", 180 / np.pi)):
+        known = np.isfinite(part)
+        total = np.sqrt((part[known] ** 2).sum()) * scale
+        words.append(f"{total:.2g} {of}" if known.all() else "not determined")
+    via = found.through.get(block.sensor)
+    link = ""
+    if via is not None:
+        other = "known poses" if via[0] is None else found.after.names[via[0]]
+        link = f"; linked through {other} in {via[1]} frames"
+    title = f"{found.after.names[block.sensor]} pose"
+    return f"{title:<28}turned by {turn:.4g} ± {words[1]}, moved by {shift:.5g} ± {words[0]}{link}"
+
+
+def values_of(found: Calibration, block: Block) -> tuple[Floats, Floats]:
+    """Values of a block before and after."""
+    both = []
+    for rig in (found.before, found.after):
+        sensor = rig.sensors[block.sensor or 0]
+        value: Floats
+        if block.kind == "position":
+            value = sensor.position  # type: ignore[attr-defined]
+        elif block.kind == "range_bias":
+            value = np.array([sensor.range_bias])  # type: ignore[attr-defined]
+        elif block.kind == "focal":
+            K = sensor.camera_matrix  # type: ignore[attr-defined]
+            value = np.array([K[0, 0], K[1, 1]])[: len(block.names)]
+        elif block.kind == "principal_point":
+            K = getattr(sensor, "camera_matrix", None)
+            value = sensor.principal_point if K is None else K[:2, 2]  # type: ignore[attr-defined]
+        elif block.kind == "distortion":
+            value = np.zeros(len(block.names))
+            given = sensor.distortion[: len(value)]  # type: ignore[attr-defined]
+            value[: len(given)] = given
+        else:
+            source = rig.delays if block.kind == "delay" else rig.drifts
+            value = source[[block.sensor or 0]]
+        both.append(np.asarray(value, dtype=np.float64))
+    return both[0], both[1]
+
+
+def _body_lines(found: Calibration, unit: str) -> list[str]:
+    block = next(b for b in found.blocks if b.kind == "body")
+    deviation = found.deviations[block.place].reshape(-1, 3)
+    shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
+    lines = []
+    for i, (moved, each) in enumerate(zip(shift, deviation, strict=True)):
+        total = np.sqrt((each**2).sum())
+        said = f"± {total:.2g} {unit}" if np.isfinite(total) else "not determined"
+        lines.append(f"{f'body feature {i}':<28}moved by {moved:.4g} {said}")
+    return lines
+
+
+def _residual_lines(found: Calibration, unit: str) -> list[str]:
+    lines = [
+        f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>22}",
+        f"{'':<20}{'':>10}{'':>10}{'before':>12}{'after':>10}",
+    ]
+    for sensor, each in found.residuals.items():
+        of = "px" if found.after.sensors[sensor].unit == "px" else unit
+        numbers = "".join(
+            f"{value:>{width}.3g}" if np.isfinite(value) else f"{'–':>{width}}"
+            for value, width in (
+                (each.before, 10),
+                (each.after, 10),
+                (each.held_before, 12),
+                (each.held_after, 10),
+            )
+        )
+        lines.append(f"{found.after.names[sensor]:<20}{numbers} {of}")
+    return lines
+
+
+def _worst_lines(found: Calibration, unit: str) -> list[str]:
+    """Frames and features that fit worst, by name."""
+    lines = []
+    frames: dict[int, list[float]] = {}
+    features: dict[int, list[float]] = {}
+    for sensor, sights in found.sights.items():
+        squared = (sights.offset**2).sum(axis=1) / found.noise[sensor] ** 2
+        for number, feature, value in zip(sights.frame, sights.feature, squared, strict=True):
+            frames.setdefault(int(number), []).append(float(value))
+            features.setdefault(int(feature), []).append(float(value))
+    for title, groups in (("frames", frames), ("features", features)):
+        rms = {key: float(np.sqrt(np.mean(values))) for key, values in groups.items()}
+        worst = sorted(rms, key=lambda key: (-rms[key], key))[:_WORST]
+        typical = float(np.median(list(rms.values()))) if rms else 1.0
+        parts = ", ".join(f"{key} ({rms[key] / typical:.2g})" for key in worst)
+        lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {parts}")
+    return lines
+
+
+def coverage(found: Calibration, sensor: int) -> Floats | None:
+    """Detections met in each of 4 x 4 parts of a camera's image; None for other sensors."""
+    eye = found.after.sensors[sensor]
+    resolution = getattr(eye, "resolution", None)
+    if eye.dimension != 2 or resolution is None:
+        return None
+    y = found.sights[sensor].y
+    edges = [np.linspace(-0.5, size - 0.5, _CELLS + 1) for size in resolution]
+    return np.asarray(np.histogram2d(y[:, 1], y[:, 0], bins=(edges[1], edges[0]))[0])
+
+
+def _coverage_lines(found: Calibration) -> list[str]:
+    lines = []
+    for sensor, name in enumerate(found.after.names):
+        counts = coverage(found, sensor)
+        if counts is None:
+            continue
+        empty = Counter(counts.ravel() == 0)[True]
+        said = f"{counts.size - empty} of {counts.size} parts of the image seen"
+        if empty:
+            said += f"; none at {_where(counts)}"
+        lines.append(f"{'coverage':<10}{name}: {said}")
+    return lines
+
+
+def _where(counts: Floats) -> str:
+    """Which sides of the image are empty, in words."""
+    sides = {
+        "top": counts[0],
+        "bottom": counts[-1],
+        "left": counts[:, 0],
+        "right": counts[:, -1],
+    }
+    empty = [name for name, row in sides.items() if not row.any()]
+    return ", ".join(empty) if empty else "some corners or gaps"

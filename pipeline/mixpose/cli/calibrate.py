@@ -1,0 +1,224 @@
+"""``mixpose calibrate``: a session with the sensors that its recording tells of."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mixpose import __version__
+from mixpose.calibration import Calibration, CalibrationRules, Rig, Task, calibrate, free_parameters
+from mixpose.calibration.free import words_of
+from mixpose.calibration.recorded import read_frames, require_points
+from mixpose.calibration.saved import MARK as SAVED_MARK
+from mixpose.calibration.saved import Saved
+from mixpose.calibration.task import Progress
+from mixpose.calibration.telling import lines_of
+from mixpose.calibration.writing import MARK, calibrated_text
+from mixpose.cli.notices import say, warn
+from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.run import named_sources
+from mixpose.errors import RecordingError, SessionError
+from mixpose.fit import free_mask
+from mixpose.poses.jsonl import read_poses
+from mixpose.records import Floats
+from mixpose.session import Session, load_session
+from mixpose.whole_files import appearing_whole
+
+
+@dataclass(frozen=True)
+class CalibrateRequest:
+    """What was asked for.
+
+    Attributes
+    ----------
+    output : Path or None
+    poses : Path or None
+        Known poses of the body.
+    free : tuple of str
+    sources : tuple of str
+        ``NAME=PATH``.
+    report : Path or None
+    """
+
+    output: Path | None
+    poses: Path | None
+    free: tuple[str, ...]
+    sources: tuple[str, ...]
+    report: Path | None
+
+
+def calibrate_session(path: Path, request: CalibrateRequest) -> None:
+    """Calibrate a session and write what was found.
+
+    Raises
+    ------
+    SessionError
+        If the session or an option is wrong, or the output would overwrite something else.
+    RecordingError
+        If the recording or the poses cannot be read, or do not show the body.
+    """
+    session = load_session(path)
+    output = request.output
+    if output is None:
+        raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml")
+    inputs = [path] if request.poses is None else [path, request.poses]
+    refuse_to_overwrite_but(output, inputs, MARK)
+    rules = CalibrationRules()
+    with _watched() as progress:
+        task = task_of(session, request, rules, progress)
+        say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
+        partial = output.with_name(f"{output.name}.partial")
+        refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
+        saved = Saved(partial, _key_of(session, task))
+        if saved.resumed:
+            say(f"going on: {saved.resumed} frames of cameras were searched before")
+        finished = False
+        try:
+            found = calibrate(task, rules, progress=progress, found=saved)
+            finished = True
+        finally:
+            saved.close(finished=finished)
+    text = calibrated_text(session, found, output, __version__)
+    try:
+        with appearing_whole(output) as part:
+            part.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
+    sys.stdout.write("\n".join(lines_of(found, session.unit)) + "\n")
+    _warn(found)
+    say(f"calibrated from {len(found.used)} frames -> {output}")
+
+
+def task_of(
+    session: Session, request: CalibrateRequest, rules: CalibrationRules, progress: Progress
+) -> Task:
+    """Read the recording, and the poses where they are known."""
+    require_points(session.body)
+    setups = session.sensors
+    rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
+    known = None if request.poses is None else known_poses(request.poses, session)
+    free, body = free_parameters(rig, request.free, poses_known=known is not None)
+    kinds = {kind for each in free.values() for kind in each}
+    runs = bool(kinds & {"delay", "drift"})
+    frames = read_frames(session, named_sources(request.sources), rules, progress, runs=runs)
+    if runs and any(frame.time_s is None for frame in frames):
+        raise SessionError(
+            f"{session.path}: --free delay: found frames without times; allowed: fps or times for "
+            "every sensor, or a video"
+        )
+    start = session.start
+    return Task(
+        rig=rig,
+        body=session.body,
+        frames=frames,
+        sigmas=np.array([one.extract.sigma for one in setups]),
+        free=free,
+        body_free=body,
+        pose_free=free_mask(session.estimator),
+        T_held=None if start is None else start.T_world_object,
+        around=(None, None) if start is None else (start.rotation_deg, start.distance),
+        fuse=session.estimator.fuse,
+        known=known,
+    )
+
+
+def known_poses(path: Path, session: Session) -> dict[int, Floats]:
+    """Poses of the session's body by frame number.
+
+    Raises
+    ------
+    RecordingError
+        If the file holds none, or its unit is another.
+    """
+    poses = read_poses(path)
+    if poses.unit is not None and poses.unit != session.unit:
+        raise RecordingError(
+            f"--poses {path}: found the unit {poses.unit}; allowed: that of the session, "
+            f"{session.unit}"
+        )
+    found = {
+        line.frame: line.T_world_object
+        for line in poses.poses
+        if line.T_world_object is not None
+        and line.status == "ok"
+        and line.object == session.body.name
+    }
+    if not found:
+        raise RecordingError(
+            f"--poses {path}: found no pose of {session.body.name!r} that is ok; allowed: pose "
+            "lines of the session's object"
+        )
+    return found
+
+
+def _key_of(session: Session, task: Task) -> str:
+    """What the hypotheses of single cameras depend on."""
+    digest = hashlib.sha256(f"{__version__} {session.sha256}".encode())
+    for frame in task.frames:
+        digest.update(str(frame.number).encode())
+        for sensor, points in sorted(frame.points.items()):
+            digest.update(str(sensor).encode() + np.ascontiguousarray(points).tobytes())
+    return digest.hexdigest()
+
+
+def _warn(found: Calibration) -> None:
+    names = found.after.names
+    for sensor in found.unlinked:
+        warn(
+            f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
+            "was: record the body where both see it"
+        )
+    for direction in found.refused:
+        warn(f"not determined, stays as it was: {direction}")
+    if found.bad:
+        numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
+        warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")
+
+
+@contextmanager
+def _watched() -> Iterator[Progress]:
+    """Progress: a bar on a terminal; and how long the search will take, before it does."""
+    said: dict[str, float] = {}
+
+    def expect(stage: str, done: int, total: int) -> None:
+        if stage.startswith("searching") and total > 20:
+            if done == 0:
+                said[stage] = time.perf_counter()
+            elif done == 4 and stage in said:
+                each = (time.perf_counter() - said.pop(stage)) / 4
+                say(f"{total} frames of cameras to search, about {_duration(each * total)}")
+
+    if not sys.stderr.isatty():
+        yield expect
+        return
+    from rich.console import Console  # noqa: PLC0415 - only where it is shown
+    from rich.progress import Progress as Bar  # noqa: PLC0415
+
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, object] = {}
+
+        def show(stage: str, done: int, total: int) -> None:
+            expect(stage, done, total)
+            if stage not in tasks:
+                for other in tasks.values():
+                    bar.update(other, visible=False)  # type: ignore[arg-type]
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
+
+        yield show
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
+def parse_free(words: Sequence[str]) -> tuple[str, ...]:
+    """Words of ``--free``, which may be several in one."""
+    return tuple(part for word in words for part in word.split())

@@ -1,0 +1,79 @@
+"""`mixpose calibrate`, as it is typed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
+from mixpose.session import load_session
+
+RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
+FRAMES = 8
+
+
+def mixpose(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mixpose", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def bumped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Eight frames of two cameras, the second turned by 2 degrees and moved by 20 mm."""
+    folder = tmp_path_factory.mktemp("bumped")
+    text = (RECORDING / "session.toml").read_text()
+    for camera in ("left", "right"):
+        names = sorted(path.as_posix() for path in RECORDING.glob(f"{camera}*.png"))[::5]
+        text = text.replace(f'source = "{camera}*.png"', f"source = {names[:FRAMES]}")
+    T = load_session(RECORDING / "session.toml").sensors[1].sensor.T_sensor_world  # type: ignore[attr-defined]
+    T = from_rotation_vector(np.radians([1.2, -1.2, 1.06]), [12.0, -12.0, 10.6]) @ T
+    old = "rotation_vector = [-0.04, 0.81, -0.03]\ntranslation = [-11.0, 6.0, 820.0]"
+    assert old in text
+    path = folder / "session.toml"
+    path.write_text(text.replace(old, f"T_sensor_world = {T.tolist()}"))
+    return path
+
+
+def test_a_camera_that_was_bumped_is_put_back_where_it_stands(bumped: Path) -> None:
+    output = bumped.with_name("calibrated.toml")
+    done = mixpose("calibrate", bumped, "-o", output)
+    assert done.returncode == 0, done.stderr
+    truth = load_session(RECORDING / "session.toml").sensors[1].sensor.T_sensor_world  # type: ignore[attr-defined]
+    found = load_session(output).sensors[1].sensor.T_sensor_world  # type: ignore[attr-defined]
+    # six frames with centres good to 0.01 px: standard deviations of 0.003 degrees and 0.05 mm
+    assert rotation_angle_deg(truth, found) < 0.02
+    assert np.linalg.norm(inverse(truth)[:3, 3] - inverse(found)[:3, 3]) < 0.15
+    assert np.array_equal(
+        load_session(output).sensors[0].sensor.T_sensor_world,  # type: ignore[attr-defined]
+        load_session(bumped).sensors[0].sensor.T_sensor_world,  # type: ignore[attr-defined]
+    )
+    assert "turned by 2" in done.stdout
+    assert "held back" in done.stdout
+    text = output.read_text()
+    assert text.startswith("# Calibrated by mixpose")
+    assert "# Two cameras at about right angles" in text  # the user's comments stay
+    assert tomllib.loads(text)["sensor"][0]["source"][0].endswith(".png")
+    assert not output.with_name("calibrated.toml.partial").exists()
+
+
+def test_a_wrong_word_for_what_is_free_is_one_line(bumped: Path) -> None:
+    for word, said in (
+        ("right:posse", "did you mean pose?"),
+        ("middle:pose", "no such sensor; allowed: left, right"),
+        ("left:range_bias", "it has pose, focal"),
+    ):
+        done = mixpose("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--free", word)
+        assert done.returncode == 2
+        assert said in done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_the_session_itself_is_not_overwritten(bumped: Path) -> None:
+    done = mixpose("calibrate", bumped, "-o", bumped)
+    assert done.returncode == 2
+    assert "is an input of this run" in done.stderr
