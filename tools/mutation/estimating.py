@@ -274,7 +274,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "gain[:, None] - squares / 2",
+        "gain[:, None] - squares / (2 * variance[:, None])",
         "gain[:, None] - 0 * squares",
         "a pose that meets features loosely is as good as one that meets them",
     ),

@@ -31,7 +31,7 @@ class Association:
     shares : (n,) float64
         How far each was met, 0 to its weight.
     places : (n, m) float64
-        Predicted.
+        Where they are predicted.
     offsets : (n, m) float64
         Observed minus predicted place of each, sensor units; 0 where it was not met.  Two that
         were detected as one have those of their middle.
@@ -49,8 +49,6 @@ class Association:
         Observed features per unit of the sensor's coordinates, around the prediction.
     count : float
         Number of observed features.
-    places : (n, m) float64
-        Where they are predicted.
     detections : (n,) int
         The observed features by which they were met; -1 for none.
     merged : int
