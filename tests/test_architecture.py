@@ -58,6 +58,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
 }
+MAY_IMPORT["design"] = GROUND | {
+    "sensors",
+    "body",
+    "objective",
+    "judgement",
+    "fit",
+    "checking",
+    "session",
+    "simulation",
+    "runner",
+}
 MAY_IMPORT["rerun_file"] = GROUND | {
     "sensors",
     "body",

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mixpose.cli.app_calibrate import calibrate
+from mixpose.cli.app_design import design
 from mixpose.cli.words import (
     AllowCode,
     ConvertFormat,
@@ -183,7 +184,7 @@ def import_(
         typer.Argument(
             metavar="FILE...",
             help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and at most one body: .csv, .rom, .vsk or .obj.",
+            "and bodies: .csv, .rom, .vsk or .obj.",
         ),
     ],
     output: Annotated[
@@ -397,3 +398,4 @@ def report(
 
 
 app.command()(calibrate)
+app.command()(design)
