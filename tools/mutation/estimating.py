@@ -411,7 +411,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-worse-twin-kept",
         "judgement/acceptance.py",
-        "if new.log_evidence > old.log_evidence:",
+        "if new.log_evidence > old.log_evidence - rules.as_evident:",
         "if new.log_evidence < old.log_evidence:",
         "of two fits that are one pose the worse is told",
     ),
