@@ -31,6 +31,7 @@ from mixpose.scene import Member, Outcome, Scene
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
+    UNKNOWN_S,
     Expectation,
     Track,
     Tracker,
@@ -326,8 +327,29 @@ def observe(
         frame = frame_set.frames.get(setup.name)
         if frame is not None:
             observation = observation_of(session, setup, frame, (windows or {}).get(setup.name))
-            views.append(View(setup.name, setup.sensor, observation, _delay(frame_set, frame)))
+            views.append(_view(setup, observation, frame_set, frame))
     return views
+
+
+def _view(
+    setup: SensorSetup, observation: Observation, frame_set: FrameSet, frame: RawFrame
+) -> View:
+    """What a sensor observed, and when."""
+    told = 0.0 if setup.delay == "estimate" else setup.delay
+    if (setup.delay or setup.readout) and frame_set.time_s is None:
+        key = "delay" if setup.delay else "readout"
+        raise SessionError(
+            f"sensor {setup.name!r}: {key}: stands without times; add fps, or times with a row for "
+            "each frame"
+        )
+    return View(
+        setup.name,
+        setup.sensor,
+        observation,
+        _delay(frame_set, frame) + told,
+        setup.readout,
+        UNKNOWN_S if setup.delay == "estimate" else None,
+    )
 
 
 def _delay(frame_set: FrameSet, frame: RawFrame) -> float:

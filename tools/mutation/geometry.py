@@ -96,6 +96,14 @@ _RECORDS = (
 
 _BATCH = (
     Mutant(
+        "sensors-a-late-body-keeps-its-velocity",
+        "sensors/moving.py",
+        "(self.velocity + 0.5 * seconds * self.acceleration) * seconds",
+        "self.velocity * seconds",
+        "sensors that are late by much see the body off its course",
+        ("test_sensors_moving.py",),
+    ),
+    Mutant(
         "sensors-batch-jacobian-without-lens",
         "sensors/batch.py",
         "J = K @ lens.derivative(y) @ J",

@@ -28,6 +28,7 @@ from mixpose.objective import MatchedObjective, Objective, View, build_objective
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
+from mixpose.sensors import Motion
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -71,6 +72,8 @@ class Fit:
         Evaluations at the finest blur.
     freed : bool
         Whether the body did not fit, and the pose was fitted to freed features.
+    motion : Motion or None
+        Of the body, where sensors see it at moments of their own.
     """
 
     T_world_object: Floats
@@ -78,6 +81,7 @@ class Fit:
     converged: bool
     iterations: int
     freed: bool = False
+    motion: Motion | None = None
 
 
 def fit_near(

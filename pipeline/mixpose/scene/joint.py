@@ -20,6 +20,7 @@ from mixpose.objective import SharedDensities, View, project_body
 from mixpose.records import PointPattern
 from mixpose.scene.members import Member
 from mixpose.scene.ownership import (
+    MERGED,
     Claim,
     Left,
     Owners,
@@ -30,7 +31,9 @@ from mixpose.scene.ownership import (
     hides_near,
     is_reached,
     left_for,
+    merged_spots,
     overlap,
+    unmet_places,
 )
 from mixpose.scene.rules import SceneRules
 from mixpose.tracking import Track
@@ -71,6 +74,7 @@ class Joint:
         self._left: dict[int, Left] = {}
         self._owners: dict[int, Owners] = {}
         self._claims: dict[int, Claims] = {}
+        self._merged: dict[str, set[int]] = {}
         self._shared: SharedDensities | None = None
         if self._views and all(
             isinstance(view.observation.pattern, PointPattern) for view in self._views
@@ -81,7 +85,8 @@ class Joint:
         """Find the poses of all members."""
         self._follow([k for k in range(len(self.members)) if self._is_trusted(k)])
         self._look_for([k for k in range(len(self.members)) if k not in self._claims])
-        owners = claimed(self._views, self._claims)
+        self._part()
+        owners = self._owned()
         for k in range(len(self.members)):
             if not are_alike(k, owners, self._owners[k]):
                 self._rejudge(k, left_for(k, self._views, owners))
@@ -101,6 +106,33 @@ class Joint:
             stale = [k for k in self._claims if self._is_touched(k, owners)]
             if not stale:
                 break
+
+    def _part(self) -> None:
+        """Take from bodies what may be their feature and another's in one spot, and fit again."""
+        rules = self._rules
+        unmet = {k: unmet_places(self.ranked[k][0]) for k in self._claims}
+        found = merged_spots(self._views, self._claims, unmet, rules.touching, rules.pulled)
+        if not found:
+            return
+        for name, numbers in found.items():
+            self._merged.setdefault(name, set()).update(numbers)
+        owners = self._owned()
+        for k in list(self._claims):
+            if are_alike(k, owners, self._owners[k]):
+                continue
+            before = self.ranked[k]
+            self._look(k, owners, start=before)
+            if self.ranked[k]:
+                self._claim(k)
+            else:
+                self.ranked[k] = before
+
+    def _owned(self) -> Owners:
+        """Owners by all that is claimed so far."""
+        owners = claimed(self._views, self._claims)
+        for name, numbers in self._merged.items():
+            owners[name][list(numbers)] = MERGED
+        return owners
 
     def _look_for(self, others: Sequence[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
@@ -133,9 +165,17 @@ class Joint:
             self._left[k], self._owners[k] = self._left[twin], owners
 
     def _look(
-        self, k: int, owners: Owners, *, expected: Mapping[str, Floats] | None = None
+        self,
+        k: int,
+        owners: Owners,
+        *,
+        expected: Mapping[str, Floats] | None = None,
+        start: Sequence[Judged] = (),
     ) -> None:
-        """Poses of a body on what others leave; near where it is expected, if that is known."""
+        """Poses of a body on what others leave; near where it is expected, if that is known.
+
+        With `start`, from these poses alone.
+        """
         tracker = self.members[k].tracker
         left = left_for(k, self._views, owners)
         track = self.tracks[k]
@@ -144,8 +184,14 @@ class Joint:
         data = tracker.data(track, self._frame, self._time_s, left.views)
         if expected is not None and self._may_share(data, left, expected):
             data = replace(data, shared=self._shared)
+        if start:
+            self.ranked[k] = tracker.refitted(data, start)
+        else:
+            self.ranked[k] = tracker.ranked(data, quickly=expected is not None)
+        if track is not self.tracks[k]:
+            known = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
+            data = replace(known, log=data.log)
         self.data[k], self._left[k], self._owners[k] = data, left, owners
-        self.ranked[k] = tracker.ranked(data, quickly=expected is not None)
 
     def _rejudge(self, k: int, left: Left) -> None:
         """The poses of a body again, by what is left for it in the end."""

@@ -154,6 +154,48 @@ def claimed(views: Sequence[View], claims: Mapping[int, Mapping[str, Claim]]) ->
     return owners
 
 
+def unmet_places(judged: Judged) -> dict[str, Floats]:
+    """Where a pose has features that nothing was found at, by sensor."""
+    return {one.name: one.places[one.shares == 0] for one in judged.associations}
+
+
+def merged_spots(
+    views: Sequence[View],
+    claims: Mapping[int, Mapping[str, Claim]],
+    unmet: Mapping[int, Mapping[str, Floats]],
+    touching: float,
+    pulled: float,
+) -> dict[str, set[int]]:
+    """Detections that may be features of two bodies in one spot, by sensor.
+
+    One body meets it loosely, and another has a feature beside it that nothing was found at.
+
+    Parameters
+    ----------
+    views : sequence of View
+    claims, unmet
+        By body.
+    touching : float
+        How near the other's feature is at most, in σ_ε.
+    pulled : float
+        Squared offset in σ_ε² from which a detection is met loosely.
+    """
+    found: dict[str, set[int]] = {}
+    for view in views:
+        name, most = view.name, (touching * view.observation.sigma) ** 2
+        for k, by_sensor in claims.items():
+            loose = by_sensor[name].squared > pulled if name in by_sensor else np.zeros(0)
+            others = [unmet[o][name] for o in unmet if o != k and name in unmet[o]]
+            if not loose.any() or not any(map(len, others)):
+                continue
+            numbers = by_sensor[name].detections[loose.astype(bool)]
+            away = _points(views, name)[numbers][:, None] - np.concatenate(others)
+            near = ((away * away).sum(axis=2) < most).any(axis=1)
+            if near.any():
+                found.setdefault(name, set()).update(numbers[near].tolist())
+    return found
+
+
 def _points(views: Sequence[View], name: str) -> Floats:
     pattern = next(view.observation.pattern for view in views if view.name == name)
     assert isinstance(pattern, PointPattern)

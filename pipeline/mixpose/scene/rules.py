@@ -29,6 +29,16 @@ class SceneRules:
         "share of the detections of one body, met by another too, from which it is either the "
         "one or the other; below, their images only touch",
     )
+    touching: float = constant(
+        3.0,
+        "σ_ε between a spot and another body's feature that is seen nowhere else: images of "
+        "spots run together at twice their width",
+    )
+    pulled: float = constant(
+        0.1,
+        "squared offset in σ_ε² from which such a spot is taken for both: two and a half "
+        "times what blobs have (0.2²)",
+    )
     forgotten: int = constant(
         5,
         "frames without a pose after which identical bodies are searched for as one: velocities "

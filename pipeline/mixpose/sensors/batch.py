@@ -90,14 +90,16 @@ class PinholeBatch:
         P = np.array([camera.T_sensor_world for camera in cameras])[:, :3]
         if self._lens is None:
             P = self._K @ P
-        self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3].reshape(-1, 1)
+        self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
         self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
-        points = self._rows @ points_world.T
+        if points_world.ndim == 2:
+            points = (self._rows @ points_world.T).reshape(self._count, 3, -1)
+        else:
+            points = self._rows.reshape(self._count, 3, 3) @ points_world.swapaxes(1, 2)
         points += self._t
-        points = points.reshape(self._count, 3, -1)
         depth = points[:, 2]
         in_front = depth > NEAREST
         if np.count_nonzero(in_front) < in_front.size:

@@ -17,14 +17,33 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import Noise
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
-from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
-from mixpose.objective import MatchedObjective, SharedDensities, View, matched_objective
+from mixpose.judgement import (
+    Association,
+    Judged,
+    Prior,
+    associate,
+    flat_prior,
+    judge,
+    nearest_alike,
+)
+from mixpose.objective import (
+    MatchedObjective,
+    SharedDensities,
+    View,
+    matched_objective,
+    project_body,
+)
 from mixpose.records import SensorReport
+from mixpose.rigid import twist_between
 from mixpose.search import SearchState
+from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
+from mixpose.tracking.course import Expected, unknown
+from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion
+from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Prediction, Track, prior_of
+from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -76,8 +95,11 @@ class SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it; `log` is written by the proposer that searches.
+    """A frame, and what is known before it.
 
+    `log` is written by the proposer that searches.  `elapsed` is the time since the last pose,
+    seconds, None where it is not known.  Where views see the body in motion as of the common time,
+    `still` is the frame with the sensors as they stand.
     `shared` are the densities of a whole scene, where the views hold what is left for this body.
     """
 
@@ -92,6 +114,8 @@ class FrameData:
     rules: Rules
     shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
+    elapsed: float | None = None
+    still: FrameData | None = None
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -119,6 +143,10 @@ class FrameData:
     @cached_property
     def finest(self) -> MatchedObjective:
         """The matched objective at σ_ε."""
+        if self.still is not None:  # densities do not move with the sensors
+            views = tuple(self.views)
+            projection = project_body(tuple(view.sensor for view in views), self.body)
+            return replace(self.still.finest, views=views, projection=projection)
         sigmas = [view.observation.sigma for view in self.views]
         return matched_objective(self.views, self.body, sigmas, shared=self.shared)
 
@@ -127,7 +155,62 @@ class FrameData:
         if not names:
             return self
         views = [view for view in self.views if view.name not in names]
-        return replace(self, views=views, shared=None)
+        still = self.still.without(names) if self.still else None
+        return replace(self, views=views, still=still, shared=None)
+
+    def in_motion(self, motion: Motion) -> FrameData:
+        """The frame as of the common time, of a body that moves."""
+        still = self.still or self
+        return replace(still, views=seen_in_motion(still.views, motion), still=still)
+
+    def expected(self, T_world_object: Floats) -> Expected:
+        """The velocity that the frames before let expect of a pose."""
+        rules, track = self.rules, self.track
+        nothing = unknown(self.body.radius, rules.course)
+        if not self.elapsed or not track.branches or self.elapsed > rules.course.longest_s:
+            return nothing
+        course = nearest_branch(track, T_world_object, self.body).course
+        if course is None:
+            return nothing
+        T = nearest_alike(T_world_object, self.body, course.T_world_object)
+        expected = course.expected(T, self.elapsed, rules.course)
+        is_far = (np.abs(expected.velocity) > nothing.deviation).any()
+        return nothing if is_far else expected
+
+    def steady(self, T_world_object: Floats) -> Expected:
+        """The velocity at a pose, by the last two steps alone."""
+        nothing = unknown(self.body.radius, self.rules.course)
+        branch = (
+            nearest_branch(self.track, T_world_object, self.body) if self.track.branches else None
+        )
+        if branch is None or branch.velocity is None or not self.elapsed:
+            return nothing
+        T = nearest_alike(T_world_object, self.body, branch.T_world_object)
+        mean = twist_between(branch.T_world_object, T) / self.elapsed
+        velocity = mean + (mean - branch.velocity) / 2
+        return Expected(velocity, np.full(6, 1.5 / self.elapsed), nothing.deviation, np.zeros(6))
+
+    def motion(self, T_world_object: Floats) -> Motion:
+        """How the body is expected to move at a pose."""
+        expected = self.expected(T_world_object)
+        return Motion(T_world_object, expected.velocity, expected.acceleration)
+
+    def offsets(
+        self, T_world_object: Floats, found: Sequence[Association] | None = None
+    ) -> Offsets:
+        """How far off features are met at a pose, and when they were seen."""
+        if found is None:
+            rules = self.rules.judgement.association
+            found, _ = associate(self.finest, T_world_object, rules)
+        names = {view.name: k for k, view in enumerate(self.views)}
+        chosen = [names[one.name] for one in found]
+        views = [(self.still or self).views[k] for k in chosen]
+        places = [np.zeros((len(one.features), 1)) for one in found]
+        if any(view.readout for view in views):
+            sensors = tuple(self.views[k].sensor for k in chosen)
+            y = project_body(sensors, self.body).project(T_world_object[None]).y[:, 0]
+            places = [at[one.features] for at, one in zip(y, found, strict=True)]
+        return offsets_of(found, views, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,24 +228,34 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs."""
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        data = self.data.without(start.left_out)
-        return fit_near(
-            data.views,
-            data.body,
-            start.T_world_object,
-            start.uncertainty,
-            data.options,
-            data.samples,
-            finest=data.finest,
-            noise=data.noise,
-            errors=data.rules.judgement.noise.errors,
-            rules=data.rules.fit,
-        )
+        data, uncertainty = self.data.without(start.left_out), start.uncertainty
+
+        def climb(seen: FrameData, T_start: Floats) -> Fit:
+            return fit_near(
+                seen.views,
+                seen.body,
+                T_start,
+                uncertainty,
+                seen.options,
+                seen.samples,
+                finest=seen.finest,
+                noise=seen.noise,
+                errors=seen.rules.judgement.noise.errors,
+                rules=seen.rules.fit,
+            )
+
+        if is_timed(data.views):
+            return fit_in_motion(data, start.T_world_object, climb)
+        return climb(data, start.T_world_object)
 
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        motion = fit.motion
+        if is_timed(data.views):
+            motion = motion or data.motion(T)
+            data = data.in_motion(motion)
         rules, others = data.rules.judgement, []
         if start.left_out:
             found, _ = associate(self.data.finest, T, rules.association)
@@ -180,6 +273,8 @@ class MatchedLikelihood:
             one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
             for one in others
         }
+        if motion is not None:
+            judged = with_motion_unknown(judged, data, motion)
         return replace(
             judged,
             sensors=judged.sensors | reports,
