@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mixpose.cli.findings import Stretches
-from mixpose.judgement import AcceptanceRules, Association, Noise, NoiseModel, contradict
+from mixpose.density import Noise
+from mixpose.judgement import AcceptanceRules, Association, NoiseModel, Residuals, contradict
 from mixpose.judgement.judge import Judged
 from mixpose.records import SensorReport
 from mixpose.rigid import Floats
@@ -47,6 +48,7 @@ def test_swapped_cameras_are_told_by_what_they_see(tmp_path: Path) -> None:
 def association(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Association:
     return Association(
         name=name, explained=0.5, features=np.arange(len(met)), shares=met, offsets=offsets, J=J,
+        places=np.zeros_like(offsets), finest=1.0,
         expected=float(len(met)), unseen=0.0, sigma=1.0, crowd=1e-5, count=count,
         surplus=max(count - float(met.sum()), 0.0),
     )  # fmt: skip
@@ -56,7 +58,7 @@ def judged_of(*associations: Association) -> Judged:
     return Judged(
         T_world_object=np.eye(4), sensors={one.name: SensorReport(True) for one in associations},
         score=1.0, coverage=1.0, measurements=20.0, covariance=np.eye(6), log_evidence=50.0,
-        noise=Noise(), associations=associations, value=1.0,
+        residuals=Residuals(), associations=associations, value=1.0,
     )  # fmt: skip
 
 

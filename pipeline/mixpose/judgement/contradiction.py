@@ -12,10 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import fdtri
 
+from mixpose.density import Noise
 from mixpose.judgement.acceptance import AcceptanceRules
 from mixpose.judgement.association import Association
 from mixpose.judgement.judge import Judged
-from mixpose.judgement.noise import Noise, NoiseModel
+from mixpose.judgement.noise import NoiseModel
 
 APART = "two sensors contradict each other"
 
@@ -65,7 +66,7 @@ def _is_between(
     own = sum(one.measurements - rank for one, (_, rank) in zip(used, apart, strict=True))
     if degrees < 1 or own < 1:
         return False
-    known = before.variance if before.degrees >= model.known else model.typical**2
+    known = before.variance if before.degrees >= model.known else model.errors.typical**2
     times = rules.disagreeing if before.degrees >= model.known else rules.strange
     if squares / degrees < times * max(known, model.smallest**2):
         return False

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_alike
+from mixpose.judgement import DetectionModel, Prior, Residuals, flat_prior, nearest_alike
 from mixpose.rigid import perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.course import Course, CourseRules
@@ -86,8 +86,8 @@ class Track:
         Its time.
     misses : int
         Frames since then.
-    noise : Noise
-        Residuals so far.
+    residuals : Residuals
+        So far.
     walk : RandomWalk or None
         None before two uncertain poses.
     tallies : mapping of str to SensorTally
@@ -108,7 +108,7 @@ class Track:
     frame: int | None = None
     time_s: float | None = None
     misses: int = 0
-    noise: Noise = field(default_factory=Noise)
+    residuals: Residuals = Residuals()
     walk: RandomWalk | None = None
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
@@ -207,7 +207,7 @@ def follow(
     found: Sequence[Found],
     frame: int,
     time_s: float | None,
-    noise: Noise,
+    residuals: Residuals,
     tallies: Mapping[str, SensorTally],
     rules: MotionRules,
     course_rules: CourseRules = CourseRules(),
@@ -223,8 +223,8 @@ def follow(
         Best first.
     frame, time_s
         Of the frame.
-    noise : Noise
-        Residuals so far.
+    residuals : Residuals
+        So far.
     tallies
         Of the best pose, as `Track` has them.
     rules : MotionRules
@@ -257,8 +257,9 @@ def follow(
                 course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
     met = [one for one in tallies.values() if one.met >= _MOST * one.in_view > 0]
-    after = Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
-    return replace(after, clutter=track.clutter, agreed=track.agreed or len(met) > 1)
+    agreed = track.agreed or len(met) > 1
+    parts = tuple(branches), frame, time_s, 0, residuals, walk, tallies
+    return Track(*parts, delays=track.delays, clutter=track.clutter, agreed=agreed)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

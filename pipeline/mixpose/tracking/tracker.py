@@ -136,7 +136,7 @@ class Tracker:
         if is_reflection(data, best):
             return replace(verdict, status="ambiguous", doubt=MIRRORED)
         track, noise = data.track, self.rules.judgement.noise
-        if contradict(best, track.noise, track.agreed, self.rules.acceptance, noise):
+        if contradict(best, track.residuals.total, track.agreed, self.rules.acceptance, noise):
             return replace(verdict, status="ambiguous", doubt=APART)
         return verdict
 
@@ -245,7 +245,7 @@ class Tracker:
             )
             for one, weight in verdict.kept
         ]
-        noise = best.noise if verdict.status == "ok" else track.noise
+        residuals = best.residuals if verdict.status == "ok" else track.residuals
         motion = self.rules.motion
         followed = follow(
             track,
@@ -253,7 +253,7 @@ class Tracker:
             found,
             frame,
             time_s,
-            noise,
+            residuals,
             _tallies(best),
             motion,
             self.rules.course,
