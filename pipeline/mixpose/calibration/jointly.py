@@ -1,7 +1,7 @@
 """Where the body is for all sensors together, where none knows it alone: ranges, parallel beams.
 
 The sensors are then believed to stand about where the session has them.  Blurs wider than σ_ε
-forgive what they are off; the narrowest with which most frames convince is taken.
+forgive what they are off, until the rig can be adjusted to what was found.
 """
 
 from __future__ import annotations
@@ -24,23 +24,17 @@ from mixpose.tracking import Tracker
 
 def joint_poses(
     task: Task, rules: CalibrationRules, progress: Progress
-) -> tuple[tuple[SeenFrame, ...], Floats]:
-    """Frames whose pose all sensors together know, and the poses (K, 4, 4)."""
-    best: list[tuple[SeenFrame, Floats]] = []
-    total = len(task.frames) * len(rules.widened)
-    for turn, factor in enumerate(rules.widened):
-        before = turn * len(task.frames)
-        found = []
+) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
+    """Frames whose pose all sensors together know, and the poses (K, 4, 4), blur after blur."""
+    for factor in rules.widened:
+        found: list[tuple[SeenFrame, Floats]] = []
         for done, posed in enumerate(_tracked(task, factor)):
-            progress("searching the body with all sensors", before + done, total)
+            progress("searching the body with all sensors", done, len(task.frames))
             if posed is not None:
                 found.append(posed)
-        if len(found) > len(best):
-            best = found
-        if len(best) >= rules.convinced * len(task.frames):
-            break
-    poses = np.array([T for _, T in best]).reshape(-1, 4, 4)
-    return tuple(frame for frame, _ in best), poses
+        if found:
+            poses = np.array([T for _, T in found])
+            yield tuple(frame for frame, _ in found), poses
 
 
 def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | None]:

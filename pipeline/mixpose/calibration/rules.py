@@ -43,9 +43,13 @@ class CalibrationRules:
         "1 rad): nothing is known of such a direction",
     )
     widened: tuple[float, ...] = constant(
-        (1.0, 4.0, 12.0), "σ_ε with which sensors that know no pose alone are tried together"
+        (1.0, 2.5, 6.0),
+        "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "
+        "adjusted: sensors 30 mm off need the second where σ_ε is 5 mm",
     )
-    convinced: float = constant(0.8, "of the frames: then no wider blur is tried")
+    failed: float = constant(
+        1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"
+    )
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")
     moved: float = constant(
         4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"

@@ -38,10 +38,11 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
 
 
 def _frames_line(found: Calibration) -> str:
-    parts = [f"{len(found.used)} calibrated from", f"{len(found.held)} held back"]
+    first = len(found.used) - len(found.held)
+    parts = [f"{first} calibrated from", f"{len(found.held)} held back, then taken too"]
     if found.bad:
         parts.append(f"{len(found.bad)} bad")
-    rest = found.recorded - len(found.used) - len(found.held) - len(found.bad)
+    rest = found.recorded - len(found.used) - len(found.bad)
     if rest > 0:
         parts.append(f"{rest} not needed or without the body")
     return f"{'frames':<10}{', '.join(parts)}"
