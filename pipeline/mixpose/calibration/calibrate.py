@@ -15,12 +15,13 @@ from mixpose.calibration.choice import held_back
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import neighbours
+from mixpose.calibration.latecomers import placed
 from mixpose.calibration.matching import clock_of
 from mixpose.calibration.residuals import met_share, residuals_of, sights_of
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.start import Start, searched, start_from_cameras, starts_together
+from mixpose.calibration.start import Start, searched, start_from_cameras, starts_together, without
 from mixpose.calibration.task import Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
@@ -57,8 +58,7 @@ def calibrate(
     for start in starts:
         if not len(start.poses):
             continue
-        free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
-        one = _Run(replace(task, free=free), start, rules, progress).result()
+        one = _Run(task, start, rules, progress).result()
         off = float((one.noise / task.sigmas).max())
         if best is None or off < float((best.noise / task.sigmas).max()):
             best = one
@@ -101,12 +101,20 @@ class _Run:
         self._pose_free = task.pose_free & (not self._known)
         times = [f.time_s for f in start.frames if f.time_s is not None]
         steps = np.diff(np.unique(times)) if len(times) > 1 else np.ones(1)
-        self._blocks = blocks_of(
-            start.rig,
-            task.free,
-            body=task.body_free,
-            length=_size_of(start.rig, start.poses),
-            interval=float(np.median(steps)),
+        self._interval = float(np.median(steps))
+        self._asked = task.free
+        self._late: dict[int, Floats] = {}
+        free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
+        self._task = replace(task, free=free)
+        self._blocks = self._laid_out()
+
+    def _laid_out(self) -> tuple[Block, ...]:
+        return blocks_of(
+            self._start.rig,
+            self._task.free,
+            body=self._task.body_free,
+            length=_size_of(self._start.rig, self._start.poses),
+            interval=self._interval,
         )
 
     def result(self) -> Calibration:
@@ -123,6 +131,7 @@ class _Run:
             training = _Part(training.frames, adjusted.poses).only(good)
             self._progress("adjusting without bad frames", 1, 4)
             adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
+        self._place_latecomers(training, adjusted)
         self._progress("looking at the frames held back", 2, 4)
         held = everything.only(mask)
         held_fit = None
@@ -134,12 +143,51 @@ class _Run:
             held_fit = self._posed(held, adjusted.rig, adjusted.noise) if good.any() else None
         training = _Part(training.frames, adjusted.poses)
         told = self._residuals(training, adjusted, held, held_fit)
-        if held_fit is not None:
+        if held_fit is not None or self._late:
             self._progress("adjusting with all frames", 3, 4)
-            training = training.joined(_Part(held.frames, held_fit.poses))
-            adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
+            if held_fit is not None:
+                training = training.joined(_Part(held.frames, held_fit.poses))
+            training, rig = self._completed(training, adjusted.rig)
+            adjusted = self._adjusted(training, rig, rules.blur * adjusted.noise * 2)
         numbers = tuple(f.number for f in held.frames) if held_fit is not None else ()
         return self._told(training, adjusted, numbers, told, sorted(bad))
+
+    def _place_latecomers(self, training: _Part, adjusted: Adjusted) -> None:
+        """Place cameras that could not be linked by what they see alone."""
+        task, start = self._task, self._start
+        if not start.unlinked:
+            return
+        numbers = {frame.number: frame for frame in task.frames}
+        frames = tuple(numbers[frame.number] for frame in training.frames)
+        linked = [s for s in task.cameras if s not in start.unlinked]
+        for sensor in start.unlinked:
+            T = placed(
+                task,
+                adjusted.rig,
+                sensor,
+                linked,
+                frames,
+                adjusted.poses,
+                adjusted.noise,
+                self._rules,
+            )
+            if T is not None:
+                self._late[sensor] = T
+
+    def _completed(self, part: _Part, rig: Rig) -> tuple[_Part, Rig]:
+        """Frames with what the cameras that came late saw, and the rig with them."""
+        task = self._task
+        if not self._late:
+            return part, rig
+        rest = {s for s in self._start.unlinked if s not in self._late}
+        numbers = {frame.number: frame for frame in task.frames}
+        frames = tuple(without(numbers[f.number], rest) for f in part.frames)
+        for sensor, T in self._late.items():
+            rig = rig.placed(sensor, T)
+        free = {s: kinds for s, kinds in self._asked.items() if s not in rest}
+        self._task = replace(task, free=free)
+        self._blocks = self._laid_out()
+        return _Part(frames, part.poses), rig
 
     def _bundle(self, part: _Part, blocks: tuple[Block, ...]) -> Bundle:
         near = neighbours([f.time_s for f in part.frames], self._rules.gap)
@@ -208,7 +256,7 @@ class _Run:
             refused=refused,
             gauge=gauge,
             through=self._start.through,
-            unlinked=self._start.unlinked,
+            unlinked=tuple(s for s in self._start.unlinked if s not in self._late),
             used=tuple(numbers),
             held=held,
             bad=tuple(bad),

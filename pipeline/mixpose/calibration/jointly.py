@@ -27,18 +27,22 @@ def joint_poses(
 ) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
     """Frames whose pose all sensors together know, and the poses (K, 4, 4), blur after blur."""
     for factor in rules.widened:
-        found: list[tuple[SeenFrame, Floats]] = []
-        for done, posed in enumerate(_tracked(task, factor)):
+        sure: list[tuple[SeenFrame, Floats]] = []
+        doubtful: list[tuple[SeenFrame, Floats]] = []
+        for done, (posed, is_sure) in enumerate(_tracked(task, factor)):
             progress("searching the body with all sensors", done, len(task.frames))
             if posed is not None:
-                found.append(posed)
+                (sure if is_sure else doubtful).append(posed)
+        # where hardly any pose is believed, the likeliest are a start, and deviations will tell
+        few = len(sure) < rules.believed * len(task.frames)
+        found = sorted(sure + doubtful, key=lambda one: one[0].number) if few else sure
         if found:
             poses = np.array([T for _, T in found])
             yield tuple(frame for frame, _ in found), poses
 
 
-def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | None]:
-    """Each frame with a pose that is believed, sensors blurred by a factor more than σ_ε."""
+def _tracked(task: Task, factor: float) -> Iterator[tuple[tuple[SeenFrame, Floats] | None, bool]]:
+    """Each frame with its pose, and whether it is believed, at a factor times σ_ε."""
     free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
     turn, distance = task.around
     options = EstimatorOptions(free=free, fuse=task.fuse)
@@ -50,7 +54,7 @@ def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | N
                 track, frame.number, frame.time_s, _views(task, frame, factor)
             )
         T = estimate.T_world_object
-        yield None if T is None or estimate.status != "ok" else (frame, T)
+        yield None if T is None else (frame, T), estimate.status == "ok"
 
 
 def _views(task: Task, frame: SeenFrame, factor: float) -> list[View]:

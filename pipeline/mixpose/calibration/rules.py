@@ -50,6 +50,11 @@ class CalibrationRules:
     failed: float = constant(
         1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"
     )
+    believed: float = constant(0.3, "of the frames: with fewer, doubtful poses are a start too")
+    explained: float = constant(
+        0.6, "of a late camera's detections that poses known by then must explain"
+    )
+    least_detections: int = constant(8, "explained likewise: four points fit many places")
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")
     moved: float = constant(
         4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,7 +96,7 @@ def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Sta
         unlinked = tuple(s for s in unlinked if s in movable)
     return Start(
         rig,
-        tuple(_without(task.frames[k], unlinked) for k in kept),
+        tuple(without(task.frames[k], unlinked) for k in kept),
         poses[kept],
         {s: (a, n) for s, (a, n) in through.items()},
         unlinked,
@@ -114,7 +114,7 @@ def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> 
     yield Start(biased(task, frames, poses), frames, poses, {}, ())
 
 
-def _without(frame: SeenFrame, sensors: tuple[int, ...]) -> SeenFrame:
+def without(frame: SeenFrame, sensors: Collection[int]) -> SeenFrame:
     """A frame without what some sensors saw."""
     points = {s: y for s, y in frame.points.items() if s not in sensors}
     return replace(frame, points=points)
@@ -139,7 +139,7 @@ def _from_known_poses(
         rig = rig.placed(sensor, link.T_a_b)
         through[sensor] = (None, link.frames)
     gone = tuple(unlinked)
-    frames = tuple(_without(task.frames[k], gone) for k in kept)
+    frames = tuple(without(task.frames[k], gone) for k in kept)
     return Start(rig, frames, poses, through, gone)
 
 

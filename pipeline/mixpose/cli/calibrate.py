@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +103,8 @@ def task_of(
     require_points(session.body)
     setups = session.sensors
     rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
+    late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
+    rig = replace(rig, delays=np.array(late, dtype=np.float64))
     known = None if request.poses is None else known_poses(request.poses, session)
     free, body = free_parameters(rig, request.free, poses_known=known is not None)
     kinds = {kind for each in free.values() for kind in each}
