@@ -78,7 +78,7 @@ def placed(
             blurs=blurs,
             noise=noise,
         )
-        met = float(fit.weighted[sensor][2].sum())
+        met = float(np.count_nonzero(fit.weighted[sensor][2] > rules.faintest))
         if met > best_met:
             best, best_met = fit.rig.sensors[sensor].T_sensor_world, met  # type: ignore[attr-defined]
     enough = best_met >= max(rules.explained * total, rules.least_detections)

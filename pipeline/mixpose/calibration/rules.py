@@ -36,7 +36,6 @@ class CalibrationRules:
     most_frames: int = constant(120, "taken; chosen by information where a recording has more")
     most_candidates: int = constant(240, "frames among which those are chosen")
     least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
-    bad_frame: float = constant(4.0, "residual of a frame by the median of all: it is left out")
     undetermined: float = constant(
         0.25,
         "standard deviation by the size of what is sought (the rig, a focal length, a turn of "
@@ -52,10 +51,13 @@ class CalibrationRules:
     )
     believed: float = constant(0.3, "of the frames: with fewer, doubtful poses are a start too")
     explained: float = constant(
-        0.6, "of a late camera's detections that poses known by then must explain"
+        0.5, "of a late camera's detections that poses known by then must explain"
     )
     least_detections: int = constant(8, "explained likewise: four points fit many places")
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")
     moved: float = constant(
-        4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"
+        4.0, "standard deviations: a sensor that did not move is never that far off in simulation"
+    )
+    worse: float = constant(
+        1.5, "times the residual of a new calibration, from which an old one no longer holds"
     )
