@@ -75,7 +75,7 @@ def _consensus(before: Rig, after: Rig) -> Floats:
     """
     count = len(before.names)
     poses = [(_pose(before, k), _pose(after, k)) for k in range(count)]
-    motions = [inverse(b) @ a for a, b in poses if a is not None and b is not None]
+    motions = [inverse(old) @ new for old, new in poses if old is not None and new is not None]
     if len(motions) < 3:  # of two, none is outvoted: the first is believed
         return motions[0] if motions else _from_places(before, after)
     worth = []

@@ -214,7 +214,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
             f"{one.name:<20}turned by {one.turn_deg:.3g} ± {one.turn_deviation_deg:.2g} deg, moved "
             f"by {one.shift:.3g} ± {one.shift_deviation:.2g} {unit}; residual "
             f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"
-            + ("  MOVED" if one.moved else "")
+            + ("  MOVED" if one.moved and len(told) > 2 else "")
         )
     lines += [f"{'not known':<20}{found.after.names[k]}: shares no view" for k in found.unlinked]
     if not bumped:
