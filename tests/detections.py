@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import View, project_body
-from mixpose.objective.matched import LAST_STEPS
+from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.records import PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import Sensor
@@ -62,7 +62,7 @@ def random_start(seed: int, length: float = 6.0, angle_deg: float = 3.0) -> Floa
 def interpolation_bound(views: Sequence[View], body: Body, T: Floats, free: Mask) -> Floats:
     """By how much the look-up of exact detections may move each number of a pose (6,).
 
-    Features apart: looked up linearly, the zero of a gradient moves by up to √3/36 n⁻³ standard
+    Features apart: as the look-up is, the zero of a gradient moves by up to √3/72 n⁻³ standard
     deviations of C along each axis (`test_density_atlas.py`), with n cells per standard deviation.
     Least squares put the pose where such errors of all coordinates, whatever their signs, move it
     by the sums of the magnitudes of the rows of the inverse.
@@ -88,6 +88,6 @@ def _moved_by_look_up(
         at.J[k, 0, at.seen[k, 0], : view.sensor.dimension].reshape(-1, 6) / view.observation.sigma
         for k, view in enumerate(views)
     ]
-    error = np.sqrt(3) / 36 / LAST_STEPS**3 * np.sqrt(2)  # in σ_ε
+    error = np.sqrt(3) / 72 / STEPS_PER_SIGMA**3 * np.sqrt(2)  # in σ_ε
     inverse = np.linalg.pinv(np.concatenate(rows)[:, free])
     return np.asarray(np.abs(of_pose[:, free] @ inverse).sum(axis=1) * error)

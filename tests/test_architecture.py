@@ -16,6 +16,7 @@ ROOT = Path(mixpose.__file__).parent
 # Each room with the rooms it may import from; rooms of one floor do not know each other.
 GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
     "encoding",
+    "limits",
     "whole_files",
 }
 MAY_IMPORT: dict[str, set[str]] = {
@@ -26,6 +27,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "constants": set(),
     "threads": set(),
     "encoding": set(),
+    "limits": set(),
+    "executing": GROUND,
     "whole_files": set(),
     "sensors": GROUND,
     "body": GROUND,
@@ -54,6 +57,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
+}
+MAY_IMPORT["design"] = GROUND | {
+    "sensors",
+    "body",
+    "objective",
+    "judgement",
+    "fit",
+    "checking",
+    "session",
+    "simulation",
+    "runner",
 }
 MAY_IMPORT["rerun_file"] = GROUND | {
     "sensors",

@@ -50,6 +50,15 @@ def test_a_flat_body_far_away_may_be_tilted_the_other_way() -> None:
     assert found[0].difference < 0.5
 
 
+def test_a_body_all_around_its_cameras_is_like_nothing_else() -> None:
+    """Three cameras 0.1 apart in the middle of it, as where metres are taken for millimetres."""
+    setups = [camera(from_parts(np.eye(3), np.array([x, 0.0, 0.0]))) for x in (0.0, 0.1, -0.1)]
+    for seed in range(3):
+        R = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+        T = from_parts(R, np.array([0.0, 0.0, 1.0]))
+        assert look_alikes(setups, body_of(SOLID), T, ALL) == []
+
+
 def test_near_by_perspective_tells_the_tilts_apart() -> None:
     assert look_alikes([camera()], body_of(TEE), facing_camera(250.0), ALL) == []
 

@@ -8,13 +8,17 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from mixpose.cli.lines import LineFile
+from mixpose.cli.recording_job import Job, finished, run_job
 from mixpose.cli.request import RunRequest
-from mixpose.cli.several import run_sessions
+from mixpose.cli.several import names_of, run_sessions, sessions_of
 from mixpose.errors import SessionError
 from mixpose.selection import Selection
 
@@ -41,51 +45,154 @@ def refusal(*sessions: Path, output: Path | None, sources: tuple[str, ...] = ())
     return str(caught.value)
 
 
+def long_sessions(folder: Path, names: str) -> list[Path]:
+    """Sessions with a recording that takes a while."""
+    text = "\n".join(
+        line
+        for line in RANGES.read_text(encoding="utf-8").replace(".npy", ".csv").splitlines()
+        if not line.startswith(("range_min", "bin_size"))
+    )
+    rows = "".join(f"{k},950\n{k},1010\n{k},1080\n" for k in range(5000))
+    for name in ("front", "side", "top"):
+        (folder / f"{name}.csv").write_text("frame,range\n" + rows, encoding="utf-8")
+    sessions = [folder / f"{name}.toml" for name in names]
+    for session in sessions:
+        session.write_text(text, encoding="utf-8")
+    return sessions
+
+
+def wait_until(condition: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def status_of(folder: Path) -> dict[str, Any]:
+    status: dict[str, Any] = json.loads((folder / "status.json").read_text(encoding="utf-8"))
+    return status
+
+
 def test_several_sessions_give_the_poses_that_each_gives_alone(tmp_path: Path) -> None:
     folder = tmp_path / "poses"
     result = mixpose("run", RANGES, BEAMS, "--workers", "2", "-o", folder, "--stop", "3")
     assert result.returncode == 0, result.stderr
     assert result.stdout == ""
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "parallel_beams.jsonl", "range_profiles.jsonl",
-    ]  # fmt: skip
+    names = ["parallel_beams", "range_profiles", "summary.csv", "summary.json"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    for name in names[:2]:
+        files = sorted(path.name for path in (folder / name).iterdir())
+        assert files == ["log.txt", "poses.jsonl", "status.json"]
     assert f"mixpose: {RANGES}: 3 frames: 3 ok" in result.stderr
+    assert result.stderr.endswith(f"2 recordings: 2 done -> {folder / 'summary.csv'}\n")
     alone = tmp_path / "alone.jsonl"
     assert mixpose("run", BEAMS, "-o", alone, "--stop", "3").returncode == 0
-    assert poses_of(folder / "parallel_beams.jsonl") == poses_of(alone)
+    assert poses_of(folder / "parallel_beams" / "poses.jsonl") == poses_of(alone)
+    status = status_of(folder / "parallel_beams")
+    assert (status["state"], status["frames"]) == ("done", {"ok": 3})
 
-    resumed = mixpose("run", RANGES, BEAMS, "-o", folder, "--stop", "5", "--resume")
-    assert resumed.returncode == 0, resumed.stderr
-    for name in ("range_profiles", "parallel_beams"):
-        frames = [pose["frame"] for pose in poses_of(folder / f"{name}.jsonl")[1:]]
-        assert frames == [0, 1, 2, 3, 4]
+    before = (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns
+    again = mixpose("run", RANGES, BEAMS, "-o", folder, "--stop", "3")
+    assert "2 of 2 recordings are done already" in again.stderr
+    assert (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns == before
 
 
-def test_a_session_that_fails_is_named_and_the_others_are_done(tmp_path: Path) -> None:
-    spoilt = tmp_path / "spoilt.toml"
+def test_a_session_that_fails_is_named_and_the_same_command_does_what_is_left(
+    tmp_path: Path,
+) -> None:
+    spoilt, missing = tmp_path / "spoilt.toml", tmp_path / "missing.toml"
     text = RANGES.read_text(encoding="utf-8")
     spoilt.write_text(text, encoding="utf-8")  # its profiles are not in this folder
-    missing = tmp_path / "missing.toml"
+    listed = tmp_path / "all.txt"
+    listed.write_text(f"# of today\n{missing}\nspoilt.toml\n\n{RANGES}\n", encoding="utf-8")
     folder = tmp_path / "poses"
-    result = mixpose("run", missing, spoilt, RANGES, "--workers", "2", "-o", folder, "--stop", "2")
+    command = ("run", listed, "--workers", "2", "-o", folder, "--stop", "2")
+    result = mixpose(*command)
     assert result.returncode == 3  # a session that is wrong is 2, a recording that is missing 3
-    lines = sorted(result.stderr.splitlines())
-    assert len(lines) == 3, result.stderr
     assert f"mixpose: {missing}: no such file" in result.stderr
     assert f"mixpose: {spoilt}: " in result.stderr
-    assert [path.name for path in folder.iterdir()] == ["range_profiles.jsonl"]
+    assert "3 recordings: 1 done, 2 failed" in result.stderr
+    assert status_of(folder / "range_profiles")["state"] == "done"
+    failed = status_of(folder / "spoilt")
+    assert (failed["state"], failed["exit_status"]) == ("failed", 3)
+    assert "front.npy: no such file" in failed["reason"]
+    assert "front.npy: no such file" in (folder / "spoilt" / "log.txt").read_text(encoding="utf-8")
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert (summary["recordings"], summary["done"], summary["failed"]) == (3, 1, 2)
+    table = (folder / "summary.csv").read_text(encoding="utf-8").splitlines()
+    assert table[0] == "name,state,ok,ambiguous,lost,warnings,seconds,reason"
+    assert [line.split(",")[:3] for line in table[1:]] == [
+        ["missing", "failed", "0"], ["spoilt", "failed", "0"], ["range_profiles", "done", "2"],
+    ]  # fmt: skip
+
+    for name in ("front", "side", "top"):
+        shutil.copy(RANGES.parent / f"{name}.npy", tmp_path)
+    again = mixpose(*command)
+    assert "1 of 3 recordings are done already" in again.stderr
+    assert again.returncode == 2
+    assert status_of(folder / "spoilt")["state"] == "done"
+    assert not [path.name for path in folder.iterdir() if path.name.startswith(".")]
 
 
-def test_sessions_whose_poses_would_share_a_file_are_refused(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        (tmp_path / name).mkdir()
-        shutil.copy(RANGES, tmp_path / name / "same.toml")
-    first, second = tmp_path / "a" / "same.toml", tmp_path / "b" / "same.toml"
+def test_sessions_of_one_name_are_told_apart_by_their_folders() -> None:
+    sessions = ["/d/a/same.toml", "/d/b/same.toml", "/d/c/session.toml", "/e/c/session.toml"]
+    assert names_of([Path(s) for s in sessions]) == ["a-same", "b-same", "d-c", "e-c"]
+    assert names_of([Path("/d/one.toml"), Path("/d/One.toml")]) == ["d-one-0", "d-One-1"]
+
+
+def test_a_pattern_names_sessions_and_one_that_matches_none_is_told(tmp_path: Path) -> None:
+    found = sessions_of([str(SYNTHETIC / "*" / "session.toml"), str(RANGES)])
+    names = [path.parent.name for path in found]
+    assert {"one_camera_video", "parallel_beams", "range_profiles", "two_cameras"} <= {*names}
+    assert len({*names}) == len(names)  # one of them was named twice
+    with pytest.raises(SessionError, match="matches no session file"):
+        sessions_of([str(tmp_path / "*.toml")])
+    (tmp_path / "empty.txt").write_text("# nothing\n", encoding="utf-8")
+    with pytest.raises(SessionError, match="names no session"):
+        sessions_of([str(tmp_path / "empty.txt")])
+
+
+def test_a_folder_that_another_worker_made_whole_stays(tmp_path: Path) -> None:
+    job = Job(str(BEAMS), "ab", str(tmp_path), "beams", "poses.jsonl", ("--stop=1",), "0", True)
+    first, second = run_job(job), run_job(replace(job, mixpose="1"))
+    assert first.state == second.state == "done"
+    assert finished(job) is None  # of another version: done again
+    assert finished(replace(job, mixpose="1")) == second
+    made = (tmp_path / "beams" / "poses.jsonl").stat().st_mtime_ns
+    assert run_job(replace(job, mixpose="1")) == second
+    assert (tmp_path / "beams" / "poses.jsonl").stat().st_mtime_ns == made
+    assert [path.name for path in tmp_path.iterdir()] == ["beams"]
+
+
+def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
+    job = Job(str(tmp_path / "no.toml"), "", str(tmp_path), "no", "poses.jsonl", (), "0", True)
+    outcome = run_job(job)
+    assert outcome.state == "failed"
+    assert "a folder that all workers see under the same name" in str(outcome.reason)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes end otherwise there")
+def test_the_children_of_a_killed_parent_end_and_the_same_command_goes_on(tmp_path: Path) -> None:
+    sessions = long_sessions(tmp_path, "ab")
     folder = tmp_path / "poses"
-    message = refusal(first, second, output=folder)
-    for words in (str(first), str(second), str(folder / "same.jsonl"), "rename"):
-        assert words in message
-    assert not folder.exists()
+    command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
+    process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.DEVNULL)
+    begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in "ab"]
+    assert wait_until(lambda: all(p.exists() and p.stat().st_size > 3000 for p in begun))
+    process.kill()
+    process.wait()
+    # whoever still writes holds the lock; when nobody does, the files stay as they are
+    for path in begun:
+        LineFile(path, afresh=False).close()
+    sizes = [path.stat().st_size for path in begun]
+    time.sleep(0.3)
+    assert sizes == [path.stat().st_size for path in begun]
+    assert all(size > 3000 for size in sizes)
+    for path in begun:
+        frames = [pose["frame"] for pose in poses_of(path)[1:]]
+        assert frames == list(range(len(frames)))
 
 
 def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None:
@@ -112,32 +219,16 @@ def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:
 def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
     tmp_path: Path, request_to_end: signal.Signals
 ) -> None:
-    text = "\n".join(
-        line
-        for line in RANGES.read_text(encoding="utf-8").replace(".npy", ".csv").splitlines()
-        if not line.startswith(("range_min", "bin_size"))
-    )
-    rows = "".join(f"{k},950\n{k},1010\n{k},1080\n" for k in range(5000))
-    for name in ("front", "side", "top"):
-        (tmp_path / f"{name}.csv").write_text("frame,range\n" + rows, encoding="utf-8")
-    sessions = [tmp_path / f"{name}.toml" for name in "abc"]  # the third one waits its turn
-    for session in sessions:
-        session.write_text(text, encoding="utf-8")
+    sessions = long_sessions(tmp_path, "abc")  # the third one waits its turn
     folder = tmp_path / "poses"
     command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
     process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.PIPE, text=True)
-    begun = [folder / "a.jsonl", folder / "b.jsonl"]
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline:
-        if all(path.exists() and path.stat().st_size > 3000 for path in begun):
-            break
-        time.sleep(0.05)
+    begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in "ab"]
+    assert wait_until(lambda: all(p.exists() and p.stat().st_size > 3000 for p in begun))
     process.send_signal(request_to_end)
     _, stderr = process.communicate(timeout=30)
     assert process.returncode == 130
-    said = "interrupted; everything so far is written\n"
-    expected = sorted(["mixpose: " + said, *(f"mixpose: {s}: {said}" for s in sessions[:2])])
-    assert sorted(stderr.splitlines(keepends=True)) == expected
+    assert stderr.splitlines()[-1] == "mixpose: interrupted; everything so far is written"
     for path in begun:
         assert len(poses_of(path)) > 1
-    assert not (folder / "c.jsonl").exists()
+    assert not [path for path in folder.iterdir() if path.name[:2] in ("c", ".c")]

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.density import Atlas, draw
+from mixpose.density import Atlas
 from mixpose.density.atlas import MAX_PAGES, REACH
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats = NDArray[np.float64]
 
 SIGMA = 2.0
 """Of the blur that is drawn: √2 σ_ε in the matched objective."""
+
+STEPS = [2.5, STEPS_PER_SIGMA, 8.0]
 
 CUT = math.exp(-(REACH**2) / 2)
 """Share of its peak at which a Gaussian may end, where its pages end."""
@@ -43,7 +46,7 @@ def peak(count: int, m: int = 2, sigma: float = SIGMA) -> float:
 
 
 def points_only(points: Floats, steps: float, sigma: float = SIGMA) -> Atlas:
-    return draw([PointPattern(points, np.ones(len(points)))], [sigma], steps, [None])
+    return Atlas([PointPattern(points, np.ones(len(points)))], [sigma], steps)
 
 
 def far_apart(seed: int, side: int = 10) -> Floats:
@@ -53,41 +56,60 @@ def far_apart(seed: int, side: int = 10) -> Floats:
     return np.stack([u.ravel(), v.ravel()], axis=1) + rng.uniform(0, SIGMA, (side**2, 2))
 
 
-def cubic_term(steps: float) -> float:
-    """By how much linear look-up may move the zero of the gradient of a Gaussian, in σ.
+def spline_error(steps: float, derivative: float) -> float:
+    """By how much a look-up errs along one axis, of the peak and in σ, for a third derivative.
 
-    Between two cells h apart, a share t of the way, linear interpolation of f errs by
-    −h² t (1−t) f''/2 − h³ t (1−t)(1−2t) f'''/6.  At the peak f'' of the gradient is 0, f''' is
-    3 C/σ⁴, and a gradient error e moves its zero by e σ²/C; t (1−t)(1−2t) is at most √3/18.
+    A share t of the way between two cells h apart, a quadratic spline whose coefficients are the
+    values errs by h³ B₃(t)/6 of the third derivative, with the Bernoulli polynomial B₃ of t, at
+    most √3/36; what it blurs on average is drawn narrower.  A part for what follows; single
+    precision.
     """
-    return math.sqrt(3) / 36 / steps**3
+    return (1 + 0.4 / steps) * math.sqrt(3) / 216 / steps**3 * derivative + 1e-6
 
 
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, LAST_STEPS, FINE_STEPS])
+# of a Gaussian, in peaks: its steepest slope, and its derivatives of third and of fourth order
+SLOPE, THIRD, FOURTH = 0.61, 1.38, 3.0
+
+
+@pytest.mark.parametrize("steps", STEPS)
 def test_gradients_of_features_apart_are_zero_where_the_detections_are(steps: float) -> None:
     points = far_apart(1)
     atlas = points_only(points, steps)
     value, gradient = looked_up(atlas, points)
-    off = np.linalg.norm(SIGMA * gradient / value[:, None], axis=1)
-    # along two axes; a twentieth for what follows the cubic term; coordinates of an array of at
-    # most 32000 rows are rounded to 2⁻¹⁰ cells
-    assert off.max() < 1.05 * math.sqrt(2) * cubic_term(steps) + 2**-10 / steps
+    away = SIGMA * gradient / value[:, None]
+    # coordinates of an array of some thousand rows are rounded to 2⁻¹³ cells
+    most = spline_error(steps, FOURTH) + 2**-13 / steps
+    assert np.abs(away).max() < most
     # and no systematic shift: 200 numbers that are as likely to either side
-    assert np.abs((SIGMA * gradient / value[:, None]).mean()) < cubic_term(steps) / 4
+    assert np.abs(away.mean()) < most / 5
 
 
-def test_where_estimates_end_places_are_off_by_a_thousandth_of_sigma() -> None:
+@pytest.mark.parametrize("apart", [None, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0])
+def test_where_estimates_end_places_are_off_by_a_thousandth_of_sigma(apart: float | None) -> None:
+    # a feature alone, and two that draw each other: to where exact sums have their peak
+    rng = np.random.default_rng(11)
     points = far_apart(11)
-    atlas = points_only(points, LAST_STEPS)
-    y = points + np.random.default_rng(11).uniform(-0.5, 0.5, points.shape)
-    for _ in range(8):  # mean-shift, which a Gaussian ends at once
-        value, gradient = looked_up(atlas, y)
-        y = y + SIGMA**2 * gradient / value[:, None]
-    # 2 √3/36 n⁻³ of σ_ε = SIGMA / √2, along two axes: 7.7e-4 at 5 cells
-    assert np.linalg.norm(y - points, axis=1).max() < 1e-3 * SIGMA / math.sqrt(2)
+    if apart is not None:
+        turns = rng.uniform(0, 2 * np.pi, len(points))
+        towards = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+        points = np.concatenate([points, points + apart * SIGMA / math.sqrt(2) * towards])
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    densities: list[Callable[[Floats], tuple[Floats, Floats]]] = [
+        lambda y: looked_up(atlas, y),
+        lambda y: exact(points, y),
+    ]
+    ends = []
+    for density in densities:
+        y = points + np.random.default_rng(11).uniform(-0.1, 0.1, points.shape)
+        for _ in range(40):  # mean-shift; features that draw each other slow it down
+            value, gradient = density(y)
+            y = y + SIGMA**2 * gradient / value[:, None]
+        ends.append(y)
+    off = np.linalg.norm(ends[0] - ends[1], axis=1).max() * math.sqrt(2) / SIGMA
+    assert off < 1.05e-3  # σ_ε
 
 
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, LAST_STEPS, FINE_STEPS])
+@pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("apart", [2.0, 3.0, 4.0, 5.0, 6.0])
 def test_gradients_of_pairs_are_those_of_two_gaussians(apart: float, steps: float) -> None:
     # features of σ_ε = SIGMA / √2, 2 to 6 σ_ε apart, looked up within σ_ε of either
@@ -100,17 +122,15 @@ def test_gradients_of_pairs_are_those_of_two_gaussians(apart: float, steps: floa
     value, gradient = looked_up(points_only(points, steps), y)
     expected_value, expected = exact(points, y)
     top = peak(len(points))
-    # h²/2 (t (1−t) − 1/6) of the second derivative, which is at most 1.38 C/σ³ along the gradient
-    # and 0.61 C/σ³ across, of either; less than 3 σ away the other one may be cut off
-    linear = 2 * (1.38 + 0.61) / 12 / steps**2 + 2 * cubic_term(steps)
-    assert np.abs(gradient - expected).max() < (linear + REACH * CUT) * top / SIGMA
-    # the same of the value: its curvature is at most C/σ² along each axis
-    assert np.abs(value - expected_value).max() < (2 * 2 / 12 / steps**2 + CUT) * top
+    # of either, along the gradient and across; where it ends
+    bend = 2 * spline_error(steps, FOURTH + SLOPE * THIRD) + REACH * CUT
+    assert np.abs(gradient - expected).max() < bend * top / SIGMA
+    assert np.abs(value - expected_value).max() < (2 * 2 * spline_error(steps, THIRD) + CUT) * top
 
 
 @pytest.mark.parametrize("m", [1, 2])
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, LAST_STEPS, FINE_STEPS])
-def test_values_err_by_the_curvature_within_a_cell(steps: float, m: int) -> None:
+@pytest.mark.parametrize("steps", STEPS)
+def test_values_err_by_the_third_derivative_within_a_cell(steps: float, m: int) -> None:
     rng = np.random.default_rng(3)
     points = far_apart(3)
     if m == 1:
@@ -119,15 +139,13 @@ def test_values_err_by_the_curvature_within_a_cell(steps: float, m: int) -> None
     y = y + rng.uniform(0.1 - REACH, REACH - 0.1, y.shape) * SIGMA
     value, gradient = looked_up(points_only(points, steps), y)
     expected_value, expected = exact(points, y)
-    # between cells h apart a value errs by h²/2 (t (1−t) − 1/6) C'', at most h²/12, of which the
-    # average is drawn narrower; 2 % for the fourth derivative; single precision
-    assert np.abs(value - expected_value).max() < 1.02 * m / 12 / steps**2 * peak(len(points), m)
-    slope = peak(len(points), m) / SIGMA
-    bend = 1.05 * (1.38 + 0.61 * (m - 1)) / 12 / steps**2 + 2 * cubic_term(steps)
-    assert np.abs(gradient - expected).max() < bend * slope
+    top = peak(len(points), m)
+    assert np.abs(value - expected_value).max() < m * spline_error(steps, THIRD) * top
+    bend = spline_error(steps, FOURTH + (m - 1) * SLOPE * THIRD)
+    assert np.abs(gradient - expected).max() < bend * top / SIGMA
 
 
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, LAST_STEPS, FINE_STEPS])
+@pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("m", [1, 2])
 def test_a_drawn_density_integrates_to_one(steps: float, m: int) -> None:
     points = np.random.default_rng(4).uniform(0, 12 * SIGMA, (9, m))
@@ -154,20 +172,18 @@ def test_grey_values_are_sums_over_pixels() -> None:
     y = np.random.default_rng(5).uniform((100, 50), (179, 109), (500, 2))
     squared = ((pixels - y[:, None]) ** 2).sum(axis=2)
     expected = np.exp(-0.5 * squared / SIGMA**2) @ weights / (2 * np.pi * SIGMA**2)
-    everywhere = draw([pattern], [SIGMA], FINE_STEPS, [None])
-    value, gradient = looked_up(everywhere, y)
+    atlas = Atlas([pattern], [SIGMA], 8.0)
+    looked_up(atlas, y[:5])
+    few = atlas.values.size
+    value, gradient = looked_up(atlas, y)
     # spots of standard deviation 1.5 blurred by 2 bend less than the blur alone
-    assert np.abs(value - expected).max() < 2 / 12 / FINE_STEPS**2 * expected.max()
-    # drawn around some places only, it is the same there
-    near = draw([pattern], [SIGMA], FINE_STEPS, [y[:5]])
-    # cells begin elsewhere
-    bend = 2 * 2 / 12 / FINE_STEPS**2 * expected.max()
-    np.testing.assert_allclose(looked_up(near, y[:5])[0], value[:5], atol=bend)
-    assert near.values.size < everywhere.values.size
+    assert np.abs(value - expected).max() < 2 * spline_error(8.0, THIRD) * expected.max()
+    # what is not looked up is not drawn
+    assert few < atlas.values.size
     assert np.abs(gradient).max() > 0
 
 
-def test_grey_values_drawn_close_to_places_have_their_gradients_to_the_last_digits() -> None:
+def test_grey_values_drawn_finely_have_their_gradients_to_the_last_digits() -> None:
     sigma, blur, step = 4.0, 3.0, 0.8
     for m in (1, 2):
         place = np.array([31.3, 24.8])[:m]
@@ -176,12 +192,12 @@ def test_grey_values_drawn_close_to_places_have_their_gradients_to_the_last_digi
         values = bells[0][None] if m == 1 else np.outer(bells[1], bells[0])
         pattern = GridPattern(values.astype(np.float32), np.zeros(m), step)
         y = place + np.array([[0.0, 0.0], [2.1, -1.3], [-3.3, 4.0]])[:, :m]
-        atlas = draw([pattern], [blur], 256.0, [y], 0.0625)
+        atlas = Atlas([pattern], [blur], FINE_STEPS)
         # a Gaussian blurred by a Gaussian is a Gaussian
         both = math.hypot(sigma, blur)
         C, slope = exact(place[None], y, both)
         value, gradient = looked_up(atlas, y)
-        # 256 cells per standard deviation: single precision and the cut at 6 sigma are left
+        # single precision and the cut at 6 sigma are left
         np.testing.assert_allclose(value, C, rtol=2e-5)
         np.testing.assert_allclose(gradient, slope, atol=2e-5 * C.max())
 
@@ -190,7 +206,8 @@ def test_pages_join_without_a_seam() -> None:
     points = far_apart(6, side=4)
     atlas = points_only(points, STEPS_PER_SIGMA)
     step = SIGMA / STEPS_PER_SIGMA
-    borders = (atlas.origin[0] + atlas.page * np.arange(1, atlas.shape[0])) * step
+    plane = atlas.plane
+    borders = (plane.origin[0] + plane.page * np.arange(1, plane.shape[0])) * step
     beside = 1e-4 * step
     crossed = 0
     for x in borders:
@@ -207,7 +224,7 @@ def test_pages_join_without_a_seam() -> None:
     assert crossed > 2
 
 
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, LAST_STEPS, FINE_STEPS])
+@pytest.mark.parametrize("steps", STEPS)
 @pytest.mark.parametrize("m", [1, 2])
 def test_a_detection_counts_once_wherever_the_origin_is(m: int, steps: float) -> None:
     rng = np.random.default_rng(7)
@@ -216,7 +233,7 @@ def test_a_detection_counts_once_wherever_the_origin_is(m: int, steps: float) ->
             point = rng.normal(0, scale, (1, m))
             value, _ = looked_up(points_only(point, steps), point)
             # where rounding puts it on two pages that are one, it is twice as high
-            assert value[0] == pytest.approx(peak(1, m), rel=m / 6 / steps**2)
+            assert value[0] == pytest.approx(peak(1, m), rel=m * spline_error(steps, THIRD))
 
 
 def test_ranges_and_images_lie_in_one_atlas_as_each_alone() -> None:
@@ -226,7 +243,7 @@ def test_ranges_and_images_lie_in_one_atlas_as_each_alone() -> None:
     profile = GridPattern(rng.uniform(0, 1, (1, 200)).astype(np.float32), np.array([900.0]), 0.5)
     patterns: list[Pattern] = [image, ranges, profile, grey_values()]
     sigmas = [2.0, 0.3, 3.0, 2.0]
-    together = draw(patterns, sigmas, STEPS_PER_SIGMA, [None] * 4)
+    together = Atlas(patterns, sigmas, STEPS_PER_SIGMA)
     places = [
         image.points + rng.normal(0, 1, (6, 2)),
         np.repeat(ranges.points, 2, axis=0) + rng.normal(0, 0.3, (8, 1)),
@@ -234,13 +251,13 @@ def test_ranges_and_images_lie_in_one_atlas_as_each_alone() -> None:
         rng.uniform((100, 50), (179, 109), (9, 2)),
     ]
     for k, (pattern, sigma, y) in enumerate(zip(patterns, sigmas, places, strict=True)):
-        alone = draw([pattern], [sigma], STEPS_PER_SIGMA, [None])
+        alone = Atlas([pattern], [sigma], STEPS_PER_SIGMA)
         value, gradient = looked_up(together, y, k)
         expected, expected_gradient = looked_up(alone, y)
-        # cells begin elsewhere: both err by up to 1/12 n² of the curvature, of m axes
+        # cells begin elsewhere: both err, of m axes
         top = expected.max()
-        assert np.abs(value - expected).max() < 2 * 2 / 12 / STEPS_PER_SIGMA**2 * top
-        bend = 2 * (1.38 + 0.61) / 12 / STEPS_PER_SIGMA**2 + 4 * cubic_term(STEPS_PER_SIGMA)
+        assert np.abs(value - expected).max() < 2 * 2 * spline_error(STEPS_PER_SIGMA, THIRD) * top
+        bend = 2 * spline_error(STEPS_PER_SIGMA, FOURTH + SLOPE * THIRD)
         assert np.abs(gradient - expected_gradient).max() < bend * top / sigma
         # where the one-dimensional ones have a second coordinate, it does not pull
         padded = np.zeros((4, 1, len(y), 2))
@@ -258,15 +275,15 @@ def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> Non
         points = np.concatenate([near, [far]])
         atlas = points_only(points, STEPS_PER_SIGMA)
         value, _ = looked_up(atlas, near)
-        # cells begin elsewhere: 1/12 n² along two axes, each
-        np.testing.assert_allclose(value, expected, rtol=4 / 12 / STEPS_PER_SIGMA**2)
+        # cells begin elsewhere, along two axes, each
+        np.testing.assert_allclose(value, expected, rtol=4 * spline_error(STEPS_PER_SIGMA, THIRD))
         assert len(atlas.table) < 1.1 * MAX_PAGES
-        assert atlas.values.nbytes < 1e6
+        assert atlas.values.nbytes < 2e6
     several = rng.uniform(-1e7, 1e7, (20, 2))
     assert points_only(several, STEPS_PER_SIGMA).values.nbytes < 1e6
 
 
-@pytest.mark.parametrize("steps", [STEPS_PER_SIGMA, FINE_STEPS])
+@pytest.mark.parametrize("steps", STEPS)
 def test_a_detection_is_drawn_well_beyond_where_features_are_met(steps: float) -> None:
     # features are met within 1.55 standard deviations; what reaches farther draws a neighbour, in
     # the prediction as in the observation
@@ -277,12 +294,10 @@ def test_a_detection_is_drawn_well_beyond_where_features_are_met(steps: float) -
         y = points + z * SIGMA * np.array([np.cos(turn), np.sin(turn)])
         value, gradient = looked_up(atlas, y)
         expected, slope = exact(points, y)
-        # 1/12 n² of the second derivative, twice for what it changes by within a cell; slopes are
-        # z times as large as values, and so are their second derivatives
-        off = 2 * z**2 / 12 / steps**2 * expected.max()
+        # the third derivative is z³ times the value at most, and twice that within a cell
+        off = (spline_error(steps, 2 * z**3) + 2e-6) * expected.max()
         np.testing.assert_allclose(value, expected, atol=off)
         np.testing.assert_allclose(gradient, slope, atol=z * off / SIGMA)
-        assert expected.min() > 2 * off
 
 
 def test_where_nothing_is_drawn_the_density_is_zero() -> None:
@@ -291,10 +306,3 @@ def test_where_nothing_is_drawn_the_density_is_zero() -> None:
     value, gradient = looked_up(atlas, outside)
     assert not value.any()
     assert not gradient.any()
-
-
-def test_no_detection_near_the_predicted_features_is_an_empty_density() -> None:
-    points = np.array([[100.0, 100.0]])
-    pattern = PointPattern(points, np.ones(1))
-    atlas = draw([pattern], [SIGMA], STEPS_PER_SIGMA, [np.array([[5000.0, 5000.0]])])
-    assert not looked_up(atlas, points)[0].any()

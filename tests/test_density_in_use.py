@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import mixpose
-from mixpose.density import Atlas, draw, observation
+from mixpose.density import Atlas, observation
 from mixpose.objective import View, project_body
 from mixpose.pictures.stages import densities_picture
 from mixpose.records import Estimate, FrameSet
@@ -57,12 +57,12 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
         return remap(values, u, v, *others, **named)
 
     def drawn(*arguments: Any, **named: Any) -> Atlas:
-        atlas = draw(*arguments, **named)
+        atlas = Atlas(*arguments, **named)
         found.drawn.append(atlas)
         return atlas
 
     monkeypatch.setattr("mixpose.density.grid.cv2.remap", recorded)
-    monkeypatch.setattr(observation, "draw", drawn)
+    monkeypatch.setattr(observation, "Atlas", drawn)
     return found
 
 

@@ -102,6 +102,14 @@ def test_the_page_about_importing_can_be_followed_in_an_empty_folder(
     assert (tmp_path / "poses.jsonl").stat().st_size > 0
 
 
+def test_the_page_about_design_can_be_followed_in_an_empty_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    follow("docs/design.md", capfd)
+    assert (tmp_path / "design.png").stat().st_size > 0
+
+
 def test_the_first_two_minutes_print_what_the_readme_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,8 +9,8 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, ScheduleRules, blur_schedule, fit_near
-from mixpose.fit.prior import FINE, Likelihood, likelihood_near
-from mixpose.objective import View
+from mixpose.fit.prior import Likelihood, likelihood_at
+from mixpose.objective import View, matched_objective
 from mixpose.records import GridPattern
 from mixpose.rigid import Floats, perturb, twist_between
 from mixpose.sensors import ParallelBeam, PinholeCamera
@@ -91,7 +91,8 @@ def shifted(x: float, y: float) -> Floats:
 
 
 def likelihood(view: View, misfit: float = 1.0) -> Likelihood:
-    return likelihood_near([view], DOT, shifted(*PLACE), scale=FINE, misfit=misfit)
+    objective = matched_objective([view], DOT, [view.observation.sigma])
+    return likelihood_at(objective, shifted(*PLACE), misfit)
 
 
 def explained(image: Floats, x: float, y: float) -> float:
@@ -110,15 +111,15 @@ def test_the_likelihood_is_that_of_white_noise_of_every_pixel(misfit: float) -> 
     energies = np.array([explained(image, *place) for place in places])
     variance = ((image**2).sum() - energies[0]) / image.size
     expected = energies / (2 * variance * misfit)
-    # linear look-up errs by up to 1/12 n² along either axis, n = 8, and is squared
-    assert found == pytest.approx(expected, rel=2 * 2 / 12 / 8**2)
+    # single precision
+    assert found == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_place_that_explains_less_than_half_of_the_image_may_have_rivals() -> None:
     view, image = grey(1)
     found = likelihood(view)
     share = explained(image, *PLACE) / (image**2).sum()
-    assert found.shares[0] == pytest.approx(share, rel=2 * 2 / 12 / 8**2)
+    assert found.shares[0] == pytest.approx(share, rel=1e-5)
     assert share < 0.25
     assert not found.is_alone
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
 from mixpose.fit import prior as prior_module
 from mixpose.fit.prior import Prior, cell_variances, most_probable
-from mixpose.objective import Quadratic
+from mixpose.objective import MatchedObjective, Quadratic
 from mixpose.rigid import perturb, twist_between
 
 Floats = NDArray[np.float64]
@@ -53,12 +53,11 @@ class Parabola:
 
 Toy = Normals | Parabola
 MostProbable = Callable[[Toy, Floats, Prior], Floats]
-BODY = Body("point", (PointFeature(np.zeros(3)),))
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A likelihood as it is drawn around a pose: the same everywhere."""
+    """A likelihood as it is at a pose: the same everywhere."""
 
     objective: Toy
 
@@ -72,8 +71,8 @@ def most_probable_of(monkeypatch: pytest.MonkeyPatch) -> MostProbable:
     """The most probable pose of a likelihood that is given, not drawn."""
 
     def maximise(toy: Toy, T: Floats, prior: Prior) -> Floats:
-        monkeypatch.setattr(prior_module, "likelihood_near", lambda *_, **__: Drawn(toy))
-        return most_probable([], BODY, T, prior)
+        monkeypatch.setattr(prior_module, "likelihood_at", lambda *_: Drawn(toy))
+        return most_probable(cast(MatchedObjective, None), T, prior)
 
     return maximise
 

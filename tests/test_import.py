@@ -14,7 +14,7 @@ import pytest
 
 from mixpose.errors import SessionError
 from mixpose.importing import gather, session_text
-from mixpose.rigid import Floats
+from mixpose.rigid import Floats, from_parts, rotation_matrix
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import Session, load_session
 from mixpose.session.setup import Unit
@@ -147,6 +147,32 @@ def test_a_session_that_names_the_file_has_the_same_cameras(tmp_path: Path, name
             np.testing.assert_array_equal(setup.sensor.T_sensor_world, np.eye(4))
         return
     expect_rig(session, 1.0)
+
+
+def test_a_chain_of_three_cameras_is_followed_from_link_to_link(tmp_path: Path) -> None:
+    chain = texts.kalibr()
+    chain += chain[chain.index("cam1:") :].replace("cam1:", "cam2:")
+    session = imported(one("c.yaml", chain)(tmp_path), "m", None, tmp_path / "s.toml")
+    third = session.sensors[2].sensor
+    assert isinstance(third, PinholeCamera)
+    step = texts.T_second_first()
+    np.testing.assert_allclose(third.T_sensor_world, step @ step, atol=1e-12)
+    # a link of another kind, so that their order matters
+    other = from_parts(rotation_matrix([0.3, 0.1, -0.2]), [0.1, 0.2, 0.0])
+    head, _, tail = chain.rpartition("T_cn_cnm1:")
+    rows = "".join(f"    - {row}\n" for row in other.tolist())
+    chain = f"{head}T_cn_cnm1:\n{rows}{tail[tail.index('  camera_model') :]}"
+    session = imported(one("c.yaml", chain)(tmp_path), "m", None, tmp_path / "s.toml")
+    third = session.sensors[2].sensor
+    assert isinstance(third, PinholeCamera)
+    np.testing.assert_allclose(third.T_sensor_world, other @ step, atol=1e-12)
+
+
+def test_cameras_of_two_worlds_are_not_put_into_one(tmp_path: Path) -> None:
+    for name in ("a.yaml", "b.yaml"):
+        (tmp_path / name).write_text(texts.kalibr(), encoding="utf-8")
+    with pytest.raises(SessionError, match=r"b\.yaml: its cameras stand in another world than"):
+        gather([tmp_path / "a.yaml", tmp_path / "b.yaml"], "mm", None)
 
 
 def test_a_pose_without_a_unit_is_asked_for(tmp_path: Path) -> None:
@@ -285,6 +311,18 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     again = run("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
     assert again.returncode == 2
     assert "is there already" in again.stderr
+
+
+def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
+    (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
+    for folder, x in (("a", 5), ("b", 7)):
+        (tmp_path / folder).mkdir()
+        table = f"name,x,y,z\np,0,0,0\nq,{x},0,0\nr,0,9,0\n"
+        (tmp_path / folder / "marks.csv").write_text(table, encoding="utf-8")
+    paths = [tmp_path / "chain.yaml", tmp_path / "a" / "marks.csv", tmp_path / "b" / "marks.csv"]
+    session = imported(paths, "mm", None, tmp_path / "s.toml")
+    assert [one.body.name for one in session.objects] == ["marks_1", "marks_2"]
+    assert [one.body.means[1, 0] for one in session.objects] == [5, 7]
 
 
 def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:

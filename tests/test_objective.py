@@ -69,7 +69,7 @@ def on_fine_grids(name: ObjectiveName, views: list[View], body: Body, sigma: flo
     """An objective whose densities are so fine that interpolation errs by less than 0.1 %."""
     if name == "matched":
         sigmas = [sigma] * len(views)
-        return matched_objective(views, body, sigmas, TRUTH, steps_per_sigma=24.0)
+        return matched_objective(views, body, sigmas, steps_per_sigma=24.0)
     terms = []
     for view in views:
         lower, upper = view.observation.extent
@@ -211,7 +211,7 @@ def test_the_matched_share_is_one_at_the_truth_and_what_clutter_leaves_of_it(
     cluttered = PointPattern(np.concatenate([pattern.points, false]), np.ones(9))
     for found, expected in ((pattern, 1.0), (cluttered, 6 / 9)):
         views = [View("0", camera, Observation(found, 2.0))]
-        objective = matched_objective(views, paper_body, [2.0], TRUTH, steps_per_sigma=FINE_STEPS)
+        objective = matched_objective(views, paper_body, [2.0], steps_per_sigma=FINE_STEPS)
         share = objective.value(TRUTH[None])[0] / objective.weights[0, 0]
         # bilinear values on 8 grid points per σ err by 1/8²/12 along each axis, twice that squared
         assert share == pytest.approx(expected, rel=2e-3)

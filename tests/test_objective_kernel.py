@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import peak
-from mixpose.objective.kernel import Overlaps, Slopes, inner_products, overlaps, slopes
+from mixpose.objective.kernel import Overlaps, Slopes, overlaps, slopes
 from mixpose.objective.projection import Projected
 
 Floats = NDArray[np.float64]
@@ -151,13 +151,12 @@ def test_at_a_pose_that_fits_exactly_the_curvature_is_the_hessian(spacing: float
 
 def test_the_norm_counts_every_pair_of_features_that_overlap() -> None:
     scene = Scene(3.0)
-    at, sampled, over = scene.at(twists(2))
+    at, _, over = scene.at(twists(2))
     away = at.y[:, :, :, None] - at.y[:, :, None]
     bells = np.exp(-0.5 * (away**2).sum(axis=4) / VARIANCES[..., None, None])
     expected = np.einsum("lhi,lhj,lhij->lh", at.weights, at.weights, bells) * TOPS
-    np.testing.assert_allclose(over.norm, expected, rtol=1e-10)
-    C = sampled[..., 0] * at.weights
-    np.testing.assert_allclose(inner_products(C, over).product, C.sum(axis=2), rtol=1e-12)
+    # pairs with less than e⁻¹⁶ of a peak are left out
+    np.testing.assert_allclose(over.norm, expected, rtol=1e-6)
 
 
 def test_features_that_are_not_seen_neither_count_nor_pull() -> None:

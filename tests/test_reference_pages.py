@@ -82,7 +82,7 @@ def test_every_command_and_option_is_on_the_page() -> None:
         "`-o, --output PATH`",
         "`--source NAME=PATH`",
         "`--quick`",
-        "`--format jsonl|csv|tum|bop|ros`: Format of the poses. Default: jsonl.",
+        "`--format jsonl|csv|tum|bop|ros`: Else by the suffix: .jsonl",
         "`--frames N`: Number of frames. Needed, at least 1.",
     ):
         assert words in page

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from mixpose.cli import lines, main
-from mixpose.cli.continuation import note_path
-from mixpose.cli.lines import LineFile
+from mixpose.cli.lines import LineFile, note_path
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
 from mixpose.rigid import Floats

@@ -28,7 +28,7 @@ def seen(camera: PinholeCamera, count: int = 8) -> Floats:
 
 def evidence_of(camera: PinholeCamera, points: Floats, body: Body = EIGHT) -> float:
     detections = sensor_detections([view_of("0", camera, points)], body, PeakOptions())
-    return float(evidence(detections, body, TRUTH[None], ALL_FREE, GATE)[0])
+    return float(evidence(detections, body, TRUTH[None], ALL_FREE, GATE)[0][0])
 
 
 def spread_out(camera: PinholeCamera, count: int, away_from: Floats) -> Floats:
@@ -46,7 +46,7 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
     for hidden, false in ((0, 0), (2, 6)):
         views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
         poses = perturb(TRUTH, np.array([np.zeros(6), [0.3, -0.2, 0.2, 0.002, 0.0, -0.003]]))
-        found = evidence(
+        found, _ = evidence(
             sensor_detections(views, EIGHT, PeakOptions()), EIGHT, poses, ALL_FREE, GATE
         )
         objective = matched_objective(views, EIGHT, [1.5] * len(views))

@@ -138,7 +138,8 @@ def test_candidates_differ_by_more_than_the_bodys_symmetries(
     ]
     assert off[0] < 0.01
     # densities are looked up on a grid of three cells per σ: 1 % of a value
-    assert candidates[0].score == pytest.approx(2.0, rel=0.01)
+    # six features of two cameras, far from clutter: no other pose is a thousandth as likely
+    assert candidates[0].evidence > candidates[1].evidence + 7 if len(candidates) > 1 else True
     assert all(each > 1.0 for each in off[1:])
 
 

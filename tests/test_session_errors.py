@@ -67,6 +67,7 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
     ({"left": LINES["left"] + "\ndelay = 6"}, ["delay: found 6", "from -1 to 1"]),
     ({"left": LINES["left"] + "\nreadout = -0.1"}, ["readout: found -0.1", "from 0 to 1"]),
     ({"left": LINES["left"] + "\nexposure = 2"}, ["exposure: found 2", "from 0 to 1"]),
+    ({"left": LINES["left"] + "\nreadout = 0.02"}, ["readout: stands without resolution"]),
     # markers with a size
     ({"points": LINES["points"] + '\nshape = "ball"'}, ['object.shape: found "ball"', '"sphere"']),
     (

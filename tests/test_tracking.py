@@ -18,7 +18,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
-from mixpose.objective.matched import LAST_STEPS
+from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.records import PointPattern
 from mixpose.rigid import (
     from_rotation_vector,
@@ -66,7 +66,7 @@ def test_mixing_a_camera_and_ranges_in_one_rig(
     assert (twist < interpolation_bound(views, body, TRUTH, ALL_FREE)).all()
     # of 24 coordinates least squares leave no more than the look-up errs by; all of that in 8
     # ranges; σ_ε is 1.5, C wider by √2
-    look_up = np.sqrt(3) / 36 / LAST_STEPS**3 * np.sqrt(2) * 1.5
+    look_up = np.sqrt(3) / 72 / STEPS_PER_SIGMA**3 * np.sqrt(2) * 1.5
     assert estimate.sensors["1"].rms == pytest.approx(0.0, abs=np.sqrt(24 / 8) * look_up)
 
 

@@ -109,6 +109,6 @@ def test_a_closer_look_is_hardly_bent_by_a_false_detection_beside_a_hidden_featu
     T_begin = perturb(T_bent, step_without_loosest(bent.associations, tracker.free, rules))
     # eleven of twelve are exact: without the twelfth they agree on the truth
     assert rotation_angle_deg(T_begin, T) < 1e-3
-    narrow = matched_objective(views, BODY, [rules.narrow * SIGMA] * 2, T_begin)
+    narrow = matched_objective(views, BODY, [rules.narrow * SIGMA] * 2)
     T_sharp = ascend(narrow.linearise, perturb, T_begin, tracker.free, SHARP).state
     assert rotation_angle_deg(T_sharp, T) < 0.3 * rotation_angle_deg(T_bent, T)

@@ -108,14 +108,13 @@ def test_a_symmetric_body_is_where_it_was_predicted_whichever_way_it_is_turned()
         assert prior_near(TRUTH @ symmetry, body=square)[0] == pytest.approx(expected)
 
 
-def test_a_velocity_is_per_second_and_steadied_over_two_steps() -> None:
+def test_a_velocity_is_per_second() -> None:
     track = followed(Track(), [moved(0)], 0, 0.0)
     assert track.branches[0].velocity is None
     track = followed(track, [moved(1)], 1, 0.1)
     assert track.branches[0].velocity == pytest.approx([50.0, 0, 0, 0, 0, 0])
     track = followed(track, [moved(3)], 2, 0.2)
     assert track.branches[0].velocity == pytest.approx([100.0, 0, 0, 0, 0, 0])
-    assert track.branches[0].steady == pytest.approx([75.0, 0, 0, 0, 0, 0])
     # it moved by 5 more than expected: as much may happen again, in any direction
     assert track.branches[0].uncertainty[:3] == pytest.approx([5.0] * 3)
     least = RULES.steady_distance * EIGHT.radius

@@ -98,6 +98,68 @@ camera_matrix = [[705.3, 0.0, 318.2], [0.0, 704.8, 243.9], [0.0, 0.0, 1.0]]
 distortion = [-0.15, 0.06, 0.0, 0.0]
 """
 
+SEVERAL_BODIES = """\
+# Two cameras see four bodies that move and hide each other: a tool, a reference, and two rods that
+# are identical.  None has a start.
+unit = "mm"
+
+[[object]]
+name = "tool"
+points = [
+    [0.0, 0.0, 0.0],
+    [52.0, 6.0, 10.0],
+    [-35.0, 38.0, -12.0],
+    [-30.0, -46.0, 15.0],
+    [36.0, 30.0, 42.0],
+    [22.0, -35.0, -38.0],
+]
+
+[[object]]
+name = "reference"
+points = [
+    [0.0, 0.0, 0.0],
+    [60.0, 0.0, 5.0],
+    [0.0, 48.0, -8.0],
+    [-44.0, -14.0, 30.0],
+    [18.0, -40.0, 44.0],
+]
+
+[[object]]
+name = "rod"
+count = 2
+points = [
+    [-60.0, 0.0, 0.0],
+    [-28.0, 20.0, 6.0],
+    [4.0, -18.0, 14.0],
+    [31.0, 9.0, -21.0],
+    [62.0, -7.0, 10.0],
+]
+
+[extract]
+method = "blobs"
+sigma = 1.5
+
+[[sensor]]
+name = "left"
+model = "pinhole"
+source = "left*.png"
+fps = 25
+resolution = [640, 512]
+camera_matrix = [[812.4, 0.0, 322.7], [0.0, 811.9, 251.3], [0.0, 0.0, 1.0]]
+rotation_vector = [0.06, -0.72, 0.02]
+translation = [14.0, -9.0, 900.0]
+
+[[sensor]]
+name = "right"
+model = "pinhole"
+source = "right*.png"
+fps = 25
+resolution = [640, 512]
+camera_matrix = [[807.2, 0.0, 315.9], [0.0, 807.8, 260.4], [0.0, 0.0, 1.0]]
+rotation_vector = [-0.04, 0.81, -0.03]
+translation = [-11.0, 6.0, 930.0]
+"""
+
 PAPER_OBJECT = """\
 [object]
 name = "six-points"
@@ -292,6 +354,18 @@ RECORDINGS = {
             amplitude_translation=30.0,
             amplitude_rotation_deg=25.0,
             period_s=3.0,
+        ),
+    ),
+    "several_bodies": Recording(
+        SEVERAL_BODIES,
+        SimulationOptions(
+            frames=30,
+            seed=15,
+            background=-2.5,  # nearly all noise is clipped
+            noise=1.0,
+            amplitude_translation=30.0,
+            amplitude_rotation_deg=18.0,
+            period_s=3.3,
         ),
     ),
     "one_camera_video": Recording(

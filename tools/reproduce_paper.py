@@ -40,10 +40,15 @@ def main() -> None:
         metavar="TIMES",
         help="scenario III at so many times the paper's deformation, too",
     )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a dask.distributed cluster whose workers have this folder in PYTHONPATH; or local",
+    )
     options = parser.parse_args()
     complain(parser, options)
     console = Console(width=None if Console().is_terminal else 110)
-    table = rms_table(collect(options.runs, options.seed))
+    table = rms_table(collect(options.runs, options.seed, options.scheduler))
     show(table, options.runs, console)
     result = as_json(table, options.runs, options.seed)
     if options.deformation:

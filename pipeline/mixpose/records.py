@@ -105,6 +105,14 @@ class FrameSet:
 
 
 @dataclass(frozen=True)
+class DelaySeen:
+    """How late a sensor is against the first one, in seconds, and its standard deviation."""
+
+    seconds: float
+    deviation: float
+
+
+@dataclass(frozen=True)
 class SensorReport:
     """How one sensor took part in an estimate.
 
@@ -159,6 +167,9 @@ class Estimate:
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
+    delays : mapping of str to DelaySeen
+        How late sensors are beyond what the session says, as far as the frames so far show it; no
+        part of the pose line.
     """
 
     frame: int
@@ -173,6 +184,7 @@ class Estimate:
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
     proposer: str = field(default="", compare=False)
+    delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
 
     @property
     def label(self) -> str:

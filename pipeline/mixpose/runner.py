@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from mixpose.density import Observation
 from mixpose.errors import SessionError
 from mixpose.extraction import Window, extract
-from mixpose.frames import Source, SourceSpec, open_source, pair
+from mixpose.frames import Source, SourceSpec, open_source, pair, paired_by_stamp
+from mixpose.limits import MOST_DETECTIONS
 from mixpose.objective import View
 from mixpose.records import (
     Estimate,
@@ -30,6 +31,7 @@ from mixpose.scene import Member, Outcome, Scene
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
+    UNKNOWN_S,
     Expectation,
     Track,
     Tracker,
@@ -178,10 +180,11 @@ def open_sources(session: Session, replaced: Mapping[str, str]) -> dict[str, Sou
     for name in replaced:
         if name not in names:
             raise SessionError(f"--source {name}=...: no such sensor, allowed: {', '.join(names)}")
-    return {
+    opened = {
         setup.name: open_source(source_spec(session, setup, replaced.get(setup.name)))
         for setup in session.sensors
     }
+    return paired_by_stamp(opened)
 
 
 def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> SourceSpec:
@@ -324,8 +327,29 @@ def observe(
         frame = frame_set.frames.get(setup.name)
         if frame is not None:
             observation = observation_of(session, setup, frame, (windows or {}).get(setup.name))
-            views.append(View(setup.name, setup.sensor, observation, _delay(frame_set, frame)))
+            views.append(_view(setup, observation, frame_set, frame))
     return views
+
+
+def _view(
+    setup: SensorSetup, observation: Observation, frame_set: FrameSet, frame: RawFrame
+) -> View:
+    """What a sensor observed, and when."""
+    told = 0.0 if setup.delay == "estimate" else setup.delay
+    if (setup.delay or setup.readout) and frame_set.time_s is None:
+        key = "delay" if setup.delay else "readout"
+        raise SessionError(
+            f"sensor {setup.name!r}: {key}: stands without times; add fps, or times with a row for "
+            "each frame"
+        )
+    return View(
+        setup.name,
+        setup.sensor,
+        observation,
+        _delay(frame_set, frame) + told,
+        setup.readout,
+        UNKNOWN_S if setup.delay == "estimate" else None,
+    )
 
 
 def _delay(frame_set: FrameSet, frame: RawFrame) -> float:
@@ -348,11 +372,25 @@ def observation_of(
         # noise may take a profile below zero; cutting that off would leave a floor of noise
         pattern = frame.data
     else:
+        _refuse_code(session, options.method)
         pattern = extract(frame.data, options, window=window, base=session.folder)
+        if isinstance(pattern, PointPattern) and len(pattern.points) > MOST_DETECTIONS:
+            # flooded with light or noise: nothing in it can be told from anything
+            pattern = PointPattern(pattern.points[:0], pattern.weights[:0])
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))
     return Observation(pattern, width, intrinsic=options.spot_sigma)
+
+
+def _refuse_code(session: Session, method: str) -> None:
+    """A session file comes from anywhere: what it names is run only where that was allowed."""
+    if ":" in method and not session.allow_code:
+        raise SessionError(
+            f'{session.path}: extract.method: "{method}" runs code of a module that the session '
+            "names; if you trust it, add --allow-code (in Python: load_session(..., "
+            "allow_code=True))"
+        )
 
 
 def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:

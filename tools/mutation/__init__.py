@@ -10,6 +10,7 @@ from mutation import (
     following,
     geometry,
     images,
+    planning,
     recordings,
 )
 from mutation.mutant import Mutant
@@ -23,4 +24,5 @@ MUTANTS: tuple[Mutant, ...] = (
     *following.MUTANTS,
     *files.MUTANTS,
     *edge.MUTANTS,
+    *planning.MUTANTS,
 )

@@ -96,17 +96,25 @@ _RECORDS = (
 
 _BATCH = (
     Mutant(
+        "sensors-a-late-body-keeps-its-velocity",
+        "sensors/moving.py",
+        "(self.velocity + 0.5 * seconds * self.acceleration) * seconds",
+        "self.velocity * seconds",
+        "sensors that are late by much see the body off its course",
+        ("test_sensors_moving.py",),
+    ),
+    Mutant(
         "sensors-batch-jacobian-without-lens",
         "sensors/batch.py",
-        "M = M @ lens.derivative(ideal)",
-        "M = M @ np.eye(2)",
+        "J = K @ lens.derivative(y) @ J",
+        "J = K @ J",
         "steps of the ascent are wrong by the lens distortion",
     ),
     Mutant(
         "sensors-batch-pixels-without-lens",
         "sensors/batch.py",
-        "xy = lens.apply(ideal)",
-        "xy = ideal",
+        "y = (K @ lens.apply(y)[..., None])",
+        "y = (K @ y[..., None])",
         "features are predicted where a lens without distortion shows them",
     ),
     Mutant(
@@ -147,8 +155,8 @@ _BATCH = (
     Mutant(
         "sensors-batch-jacobian-without-skew",
         "sensors/batch.py",
-        "self._K = K[:, None, :2, :2]",
-        "self._K = K[:, None, :2, :2] * np.eye(2)",
+        "K = self._K[:, None, :2, :2]",
+        "K = self._K[:, None, :2, :2] * np.eye(2)",
         "the Jacobian lacks the skew that the pixels have",
     ),
     Mutant(

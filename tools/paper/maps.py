@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.objective import matched_objective
-from mixpose.objective.matched import FINE_STEPS as FINE
 from paper.measurements import Measurement, measure
 from paper.runs import views
 from paper.sampled import sampled_objectives
@@ -63,8 +62,7 @@ def matched_map(system: System, scenario: Scenario, seed: int) -> Floats:
     """The matched objective over w (rows) and φ (columns)."""
     seen = views(system, scenario, measured(system, scenario, seed))
     body = system.body(scenario)
-    # coarser grids, good for climbing, show their own steps on a flat peak
-    objective = matched_objective(seen, body, [scenario.sigma] * len(seen), steps_per_sigma=FINE)
+    objective = matched_objective(seen, body, [scenario.sigma] * len(seen))
     objective = replace(objective, weights=np.ones_like(objective.weights))
     poses = np.array([[pose(parameters_of_motion(phi, w)) for phi in PHI] for w in W])
     return np.stack([objective.value(row) for row in poses])

@@ -13,7 +13,6 @@ from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, fit_near
 from mixpose.objective import View, matched_objective
-from mixpose.objective.matched import FINE_STEPS
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.records import GridPattern
 from mixpose.rigid import perturb
@@ -113,7 +112,7 @@ def _matched(
 def likeliest_near(seen: Sequence[View], body: Body, T_truth: Floats) -> Floats:
     """The maximum of the likelihood that is reached from the true pose: a yardstick only."""
     sigmas = [view.observation.sigma for view in seen]
-    likelihood = matched_objective(seen, body, sigmas, T_truth, steps_per_sigma=FINE_STEPS)
+    likelihood = matched_objective(seen, body, sigmas)
     options = NewtonOptions(iterations=60, tolerance=1e-11, value_error=1e-4)
     free = np.ones(6, dtype=np.bool_)
     return ascend(likelihood.linearise, perturb, T_truth, free, options).state

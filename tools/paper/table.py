@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
+from paper.pooled import in_order
 from paper.published import PUBLISHED
 from paper.runs import INDEPENDENT_EVERY, Errors, run
 from paper.systems import SCENARIOS, systems
@@ -34,22 +32,12 @@ COLUMNS = (
 NUMBERS = ("φ1 °", "φ2 °", "φ3 °", "w1", "w2", "w3")
 
 
-def collect(runs: int, seed: int) -> list[Errors]:
-    """Errors of all runs, in order, with a progress bar on a terminal."""
-    console = Console(stderr=True)
-    # one thread per process: the work is many small pieces
-    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
-    results: dict[int, Errors] = {}
-    with (
-        Progress(console=console, disable=not console.is_terminal) as progress,
-        ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool,
-    ):
-        task = progress.add_task("runs", total=runs)
-        pending = {pool.submit(run, seed, number): number for number in range(runs)}
-        for future in as_completed(pending):
-            results[pending[future]] = future.result()
-            progress.advance(task)
-    return [results[number] for number in range(runs)]
+def collect(runs: int, seed: int, scheduler: str | None = None) -> list[Errors]:
+    """Errors of all runs, in order, with a progress bar on a terminal.
+
+    They are reckoned here on all cores, or on the cluster of a scheduler.
+    """
+    return in_order(partial(run, seed), range(runs), "runs", scheduler)
 
 
 def rms_table(results: Sequence[Errors]) -> Cells:

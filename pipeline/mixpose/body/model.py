@@ -75,6 +75,8 @@ class Body:
         lie across their normals.
     radii : (N,) float64 or None
         Of spheres or disks, length units; 0 for a point.
+    names : tuple of str
+        What people call the features, those of them that have a name; they come first.
     """
 
     name: str
@@ -83,9 +85,15 @@ class Body:
     gravity: Gravity | None = None
     shape: Shape = "point"
     radii: Floats | None = None
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.features)
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """What each feature (N) is called in messages: its name, else its number from 1."""
+        return self.names + tuple(str(i + 1) for i in range(len(self.names), len(self)))
 
     @cached_property
     def means(self) -> Floats:

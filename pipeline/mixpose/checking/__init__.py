@@ -11,7 +11,7 @@ from __future__ import annotations
 from mixpose.checking.advice import advice, judge
 from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
-from mixpose.checking.recordings import Survey, image_of, survey
+from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
 from mixpose.checking.sensor_keys import key_warnings
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
@@ -26,6 +26,7 @@ __all__ = [
     "key_warnings",
     "look_alikes",
     "noise_of",
+    "numbers_of",
     "placement_lines",
     "placement_warnings",
     "survey",

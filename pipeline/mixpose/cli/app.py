@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from mixpose.cli.app_calibrate import calibrate
+from mixpose.cli.app_design import design
+from mixpose.cli.words import (
+    AllowCode,
+    ConvertFormat,
+    Format,
+    LengthUnit,
+    PosesFile,
+    SessionFile,
+    Start,
+    Step,
+    Stop,
+)
 
 app = typer.Typer(
     name="mixpose",
@@ -16,38 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-SessionFile = Annotated[Path, typer.Argument(metavar="SESSION.toml", help="The session file.")]
-
-
-class Format(StrEnum):
-    """Formats of poses."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-
-
-class LengthUnit(StrEnum):
-    """Units of length."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
-    um = "um"
-
-
-class ConvertFormat(StrEnum):
-    """Formats that poses are converted to."""
-
-    jsonl = "jsonl"
-    csv = "csv"
-    tum = "tum"
-    bop = "bop"
-    ros = "ros"
-    rerun = "rerun"
 
 
 def _version(wanted: bool) -> None:
@@ -71,18 +52,27 @@ def _common(
 def run(
     context: typer.Context,
     sessions: Annotated[
-        list[Path], typer.Argument(metavar="SESSION.toml", help="One session file or several.")
+        list[str],
+        typer.Argument(
+            metavar="SESSION.toml...",
+            help="One session file or several, patterns such as 'day*/session.toml', or text files "
+            "(.txt) with one to a line.",
+        ),
     ],
     output: Annotated[
         Path | None,
         typer.Option(
             "-o",
             "--output",
-            help="Write poses here, not to stdout; with several sessions, the folder for a file "
-            "each, named after the session or, where that is session.toml, after its folder.",
+            help="Write poses here, not to stdout, in the format that the suffix tells. With "
+            "several sessions, a folder in which each gets its own for poses, log and status; what "
+            "is done there already is not done again.",
         ),
     ] = None,
-    format: Annotated[Format, typer.Option(help="Format of the poses.")] = Format.jsonl,
+    format: Annotated[
+        Format | None,
+        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; or jsonl."),
+    ] = None,
     source: Annotated[
         list[str] | None,
         typer.Option(
@@ -90,9 +80,9 @@ def run(
             help="Another recording of a sensor, relative to the working folder; repeatable.",
         ),
     ] = None,
-    start: Annotated[int | None, typer.Option(help="First frame number.")] = None,
-    stop: Annotated[int | None, typer.Option(help="Frame number to stop before.")] = None,
-    step: Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")] = 1,
+    start: Start = None,
+    stop: Stop = None,
+    step: Step = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on after the last frame in the output.")
     ] = False,
@@ -101,24 +91,44 @@ def run(
         Path | None,
         typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
+            "local for one on this machine.",
+        ),
+    ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
-    from mixpose.cli.request import RunRequest  # noqa: PLC0415
+    from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
     sources, debug = tuple(source or ()), bool(context.obj)
-    request = RunRequest(output, format.value, sources, selection, resume, overlay, debug)
-    if len(sessions) > 1:
-        from mixpose.cli.several import run_sessions  # noqa: PLC0415
+    named = None if format is None else format.value
+    request = RunRequest(
+        output,
+        format_of(output, named),
+        sources,
+        selection,
+        resume,
+        overlay,
+        debug,
+        allow_code,
+        scheduler,
+    )
+    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
 
-        raise typer.Exit(run_sessions(sessions, request, workers))
+    if are_many(sessions, request):
+        raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415
     from mixpose.cli.run import run_session  # noqa: PLC0415
 
     if workers > 1:
         warn(f"--workers {workers}: one session is one process, frames follow each other")
-    run_session(sessions[0], request)
+    run_session(Path(sessions[0]), request)
 
 
 @app.command()
@@ -127,11 +137,12 @@ def check(
     quick: Annotated[
         bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
     ] = False,
+    allow_code: AllowCode = False,
 ) -> None:
     """Read every frame before any run: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session, quick=quick)
+    check_session(session, quick=quick, allow_code=allow_code)
 
 
 @app.command()
@@ -151,11 +162,19 @@ def inspect(
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
     ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Pictures of one frame: features found, densities, pose, objective; and what to change."""
     from mixpose.cli.inspect import inspect_frame  # noqa: PLC0415
 
-    inspect_frame(session, frame, output, poses=poses, sources=tuple(source or ()))
+    inspect_frame(
+        session,
+        frame,
+        output,
+        poses=poses,
+        sources=tuple(source or ()),
+        allow_code=allow_code,
+    )
 
 
 @app.command("import")
@@ -165,7 +184,7 @@ def import_(
         typer.Argument(
             metavar="FILE...",
             help="Calibrations of OpenCV, Kalibr, ROS, caliscope, aniposelib, pycalib or COLMAP, "
-            "and at most one body: .csv, .rom, .vsk or .obj.",
+            "and bodies: .csv, .rom, .vsk or .obj.",
         ),
     ],
     output: Annotated[
@@ -297,7 +316,7 @@ def simulate(
 
 @app.command()
 def evaluate(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
@@ -337,6 +356,7 @@ def convert(
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
     ] = None,
+    allow_code: AllowCode = False,
 ) -> None:
     """Write poses in the format of another program."""
     from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
@@ -352,6 +372,7 @@ def convert(
         relative_to=relative_to,
         session=session,
         sources=tuple(source or ()),
+        allow_code=allow_code,
     )
     convert_poses(poses, request)
 
@@ -366,7 +387,7 @@ def schema() -> None:
 
 @app.command()
 def report(
-    poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Estimated poses.")],
+    poses: PosesFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
     truth: Annotated[Path | None, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")] = None,
 ) -> None:
@@ -376,6 +397,7 @@ def report(
     write_report(poses, truth, output)
 
 
+<<<<<<< HEAD
 @app.command()
 def calibrate(
     session: SessionFile,
@@ -436,3 +458,7 @@ def calibrate(
         world=world,
     )
     calibrate_session(session, request)
+=======
+app.command()(calibrate)
+app.command()(design)
+>>>>>>> main

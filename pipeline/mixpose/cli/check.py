@@ -22,6 +22,7 @@ from mixpose.checking import (
     key_warnings,
     look_alikes,
     noise_of,
+    numbers_of,
     placement_lines,
     placement_warnings,
     survey,
@@ -62,7 +63,7 @@ class _Report:
         self.lines, self.warnings = [], []
 
 
-def check_session(path: Path, *, quick: bool = False) -> None:
+def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
     Parameters
@@ -70,6 +71,8 @@ def check_session(path: Path, *, quick: bool = False) -> None:
     path : Path
     quick : bool
         Look at a few frames only instead of all.
+    allow_code : bool
+        Whether functions that the session names may be run.
 
     Raises
     ------
@@ -79,7 +82,7 @@ def check_session(path: Path, *, quick: bool = False) -> None:
         If a recording cannot be opened or its table of times lacks rows, or, after all has been
         printed, if a frame is damaged.
     """
-    session = load_session(path)
+    session = load_session(path, allow_code=allow_code)
     sources = open_sources(session, {})
     for source in sources.values():
         source.check_times(ALL_NUMBERS)
@@ -94,6 +97,7 @@ def check_session(path: Path, *, quick: bool = False) -> None:
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, sources[setup.name], surveys)
+    report.warnings += _pairing_warnings(sources)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
     _say_accuracy(report, sized)
@@ -161,12 +165,21 @@ def _say_missing(report: _Report, name: str, surveys: Mapping[str, Survey]) -> N
     if missing:
         everyone = len(known | own)
         report.say("", f"missing: {_numbers(missing)} of the {everyone} frames of all sensors")
-    pairs = len(own & known)
-    if known and pairs < 0.5 * min(len(own), len(known)):
-        report.warnings.append(
-            f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other sensors: "
-            "frames are paired by the number that their names end in; rename the files"
-        )
+
+
+def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
+    """Sensors whose frames hardly pair with those of others, told by numbers alone."""
+    numbers = {name: found for name, each in sources.items() if (found := numbers_of(each))}
+    warnings = []
+    for name, own in numbers.items():
+        known = set().union(*(each for other, each in numbers.items() if other != name))
+        pairs = len(own & known)
+        if known and pairs < 0.5 * min(len(own), len(known)):
+            warnings.append(
+                f"sensor {name!r}: {pairs} of its {len(own)} frames pair with those of other "
+                "sensors: frames are paired by the number that their names end in; rename the files"
+            )
+    return warnings
 
 
 def _say_features(

@@ -14,7 +14,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mixpose.cli.lines import LineFile
+from mixpose.cli.lines import LineFile, note_path
 from mixpose.cli.notices import say
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
@@ -79,11 +79,6 @@ class Notes:
         self._last = None
         with suppress(OSError):
             self._path.unlink(missing_ok=True)
-
-
-def note_path(poses: Path) -> Path:
-    """Where the note about a poses file lies."""
-    return poses.with_name(f".{poses.name}.state")
 
 
 @dataclass(frozen=True)

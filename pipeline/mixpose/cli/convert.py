@@ -19,6 +19,7 @@ from mixpose.cli.output import (
     refuse_to_overwrite,
     written_paths,
 )
+from mixpose.cli.request import SUFFIXES
 from mixpose.cli.session_of_poses import session_of
 from mixpose.errors import SessionError
 from mixpose.poses.estimates import (
@@ -36,14 +37,7 @@ from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
 from mixpose.whole_files import appearing_whole
 
-_BY_SUFFIX = {
-    ".jsonl": "jsonl",
-    ".csv": "csv",
-    ".tum": "tum",
-    ".yaml": "ros",
-    ".yml": "ros",
-    ".rrd": "rerun",
-}
+_BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun"}
 
 
 @dataclass(frozen=True)
@@ -60,6 +54,7 @@ class ConvertRequest:
     relative_to: str | None
     session: Path | None
     sources: tuple[str, ...]
+    allow_code: bool = False
 
 
 def convert_poses(path: Path, request: ConvertRequest) -> None:
@@ -86,7 +81,14 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
     if name == "rerun":
         from mixpose.cli.rerun import write_rerun  # noqa: PLC0415
 
-        write_rerun(poses, lines, request.output, request.session, request.sources)
+        write_rerun(
+            poses,
+            lines,
+            request.output,
+            request.session,
+            request.sources,
+            allow_code=request.allow_code,
+        )
     else:
         _write(poses, lines, name, request)
     if request.output is not None:
@@ -146,14 +148,15 @@ def _T_sensor_world(poses: PoseFile, request: ConvertRequest) -> Floats:
 def _format(request: ConvertRequest) -> str:
     if request.format is not None:
         return request.format
-    suffix = "" if request.output is None else request.output.suffix.lower()
-    if suffix not in _BY_SUFFIX:
+    name = "" if request.output is None else request.output.name.casefold()
+    found_by_suffix = next((each for end, each in _BY_SUFFIX.items() if name.endswith(end)), None)
+    if found_by_suffix is None:
         found = "no -o" if request.output is None else f"-o {request.output}"
         raise SessionError(
             f"--format: found none, and {found} does not tell; name the format, or a file that "
             f"ends in {', '.join(_BY_SUFFIX)}"
         )
-    return _BY_SUFFIX[suffix]
+    return found_by_suffix
 
 
 def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None:

@@ -35,7 +35,7 @@ def import_files(
     session = load_session(output)  # what was written can be read, or this is a defect
     for warning in (*imported.warnings, *key_warnings(with_image_sizes(session, {}))):
         warn(warning)
-    if imported.body is None:
+    if not imported.bodies:
         warn("no file of a body is among them: [object] is an example, put in your markers")
     count = len(imported.cameras)
     names = ", ".join(camera.name for camera in imported.cameras)

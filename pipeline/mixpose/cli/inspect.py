@@ -22,7 +22,13 @@ from mixpose.session import Session, load_session
 
 
 def inspect_frame(
-    path: Path, number: int | None, folder: Path, *, poses: Path | None, sources: Sequence[str]
+    path: Path,
+    number: int | None,
+    folder: Path,
+    *,
+    poses: Path | None,
+    sources: Sequence[str],
+    allow_code: bool = False,
 ) -> None:
     """Write pictures of one frame into a folder and print what was found in it.
 
@@ -38,6 +44,8 @@ def inspect_frame(
         Poses of a run, in place of estimating this frame on its own.
     sources : sequence of str
         ``NAME=PATH``, recordings in place of the session's.
+    allow_code : bool
+        Whether functions that the session names may be run.
 
     Raises
     ------
@@ -46,7 +54,7 @@ def inspect_frame(
     RecordingError
         If the recording or the poses cannot be read.
     """
-    session = load_session(path)
+    session = load_session(path, allow_code=allow_code)
     require_matplotlib()
     _check_folder(folder, session)
     frame_set = _frame(open_sources(session, named_sources(sources)), number)

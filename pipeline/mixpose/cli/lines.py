@@ -14,6 +14,11 @@ PATIENCE_S = 10.0
 """How long another run, which may be about to end, is waited for."""
 
 
+def note_path(poses: Path) -> Path:
+    """Where the note about a poses file lies."""
+    return poses.with_name(f".{poses.name}.state")
+
+
 class LineFile:
     """What the writers of poses take for a text stream.
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.frames import Source
-    from mixpose.records import Estimate, Status
+    from mixpose.records import DelaySeen, Estimate, Status
     from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
@@ -21,6 +21,8 @@ _OFTEN = 0.2  # of the frames: sensors that take turns do so by no accident
 # of sigma: 0.2 is the most in recordings whose geometry is right, 0.8 with a chessboard whose
 # squares are given as 25 in place of 24 mm
 _FAR_OFF = 0.5
+_SURELY_LATE = 6.0  # standard deviations
+_LATE_S = 5e-4  # less is rarely worth a key
 _REMEMBERED = 10_000  # residuals of a camera: a live source may run for days
 
 
@@ -69,10 +71,16 @@ class Summary:
         self.split_frames = 0
         self.left_out: Counter[tuple[str, str]] = Counter()  # sensors, and why
         self.residuals = {name: deque[float](maxlen=_REMEMBERED) for name in self.sigmas}
+        self.estimated = {setup.name for setup in session.sensors if setup.delay == "estimate"}
+        self.told = {
+            setup.name: setup.delay for setup in session.sensors if setup.delay != "estimate"
+        }
+        self.delays: Mapping[str, DelaySeen] = {}
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
         self.statuses[estimate.status] += 1
+        self.delays = estimate.delays or self.delays
         if estimate.status == "lost":
             return
         reasons = {n: one.why for n, one in estimate.sensors.items() if one.why}
@@ -107,6 +115,8 @@ class Summary:
             return
         for warning in self.warnings():
             warn(warning)
+        for remark in self.late():
+            say(remark)
         if self.statuses["lost"] == sum(self.statuses.values()):
             warn("every frame is lost: try mixpose check, then [start] and [extract]")
         say(f"{self.text()}{where}")
@@ -135,6 +145,21 @@ class Summary:
                 "the calibration or T_sensor_world is wrong, or frames are out of step"
             )
         return found
+
+    def late(self) -> list[str]:
+        """Which sensors are late by how much, as far as a moving body shows it."""
+        remarks = []
+        for name, seen in self.delays.items():
+            late = f"{seen.seconds:.4f} s (give or take {2 * seen.deviation:.4f})"
+            if name in self.estimated:
+                remarks.append(f"sensor {name!r}: delay estimated as {late}")
+            elif abs(seen.seconds) > max(_SURELY_LATE * seen.deviation, _LATE_S):
+                told = self.told.get(name, 0.0) + seen.seconds
+                remarks.append(
+                    f"sensor {name!r} is late by {late}: delay = {told:.4f} in its [[sensor]] "
+                    "takes it off"
+                )
+        return remarks
 
     def _far_off(self, apart: set[str]) -> list[str]:
         """By how much, for each camera, leaving out those that took no part."""

@@ -8,7 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from mixpose.errors import SessionError
 from mixpose.selection import Selection
+
+SUFFIXES = {
+    ".jsonl": "jsonl",
+    ".bop.csv": "bop",
+    ".csv": "csv",
+    ".tum": "tum",
+    ".yaml": "ros",
+    ".yml": "ros",
+}
+"""Formats of poses by how the name of a file ends."""
 
 
 @dataclass(frozen=True)
@@ -22,3 +33,24 @@ class RunRequest:
     resume: bool
     overlay: Path | None = None
     debug: bool = False
+    allow_code: bool = False
+    scheduler: str | None = None
+
+
+def format_of(output: Path | None, named: str | None) -> str:
+    """The format of poses: the one that is named, else that of the file's suffix.
+
+    Raises
+    ------
+    SessionError
+        If no poses can be written to a file of this suffix while they are estimated.
+    """
+    if named is not None:
+        return named
+    name = "" if output is None else output.name.casefold()
+    if name.endswith(".rrd"):
+        raise SessionError(
+            f"-o {output}: poses are not written in this format while they are estimated; write "
+            f".jsonl, and then: mixpose convert POSES.jsonl -o {output}"
+        )
+    return next((each for end, each in SUFFIXES.items() if name.endswith(end)), "jsonl")

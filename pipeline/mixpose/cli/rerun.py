@@ -21,6 +21,8 @@ def write_rerun(
     output: Path | None,
     session_file: Path | None,
     sources: Sequence[str],
+    *,
+    allow_code: bool = False,
 ) -> None:
     """Write poses and the recording of their session as an ``.rrd`` file.
 
@@ -38,7 +40,7 @@ def write_rerun(
             "--format rerun: needs the package rerun-sdk; install it with: "
             "python -m pip install 'mixpose[rerun]'"
         )
-    session = session_of(poses, session_file)
+    session = session_of(poses, session_file, allow_code=allow_code)
     opened = open_sources(session, named_sources(sources))
     for name, source in opened.items():
         if source.kind == "live":

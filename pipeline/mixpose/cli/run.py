@@ -43,7 +43,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     RecordingError
         If the recording cannot be read; frames already estimated stay written.
     """
-    session = load_session(path)
+    session = load_session(path, allow_code=request.allow_code)
     replaced = named_sources(request.sources)
     header = header_of(session, replaced)
     opened = open_sources(session, replaced)

@@ -10,7 +10,7 @@ from mixpose.poses.jsonl import PoseFile
 from mixpose.session import Session, load_session
 
 
-def session_of(poses: PoseFile, named: Path | None) -> Session:
+def session_of(poses: PoseFile, named: Path | None, *, allow_code: bool = False) -> Session:
     """The session that poses were estimated with: the one `named`, or the one of their header.
 
     Raises
@@ -30,7 +30,7 @@ def session_of(poses: PoseFile, named: Path | None) -> Session:
             raise SessionError(
                 f"{poses.path}: its session {found} is not there; add --session SESSION.toml"
             )
-    session = load_session(path)
+    session = load_session(path, allow_code=allow_code)
     if poses.unit not in (None, session.unit):
         raise SessionError(
             f"--session {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"

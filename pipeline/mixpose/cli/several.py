@@ -1,4 +1,4 @@
-"""``mixpose run`` on several recordings: each in a process of its own, some at a time.
+"""``mixpose run`` on many recordings, here or on a cluster: each in its own process and folder.
 
 A process is the same command with one session, so that a recording gives the same poses alone and
 among others, and none can disturb another.
@@ -6,27 +6,93 @@ among others, and none can disturb another.
 
 from __future__ import annotations
 
+import csv
+import glob
+import hashlib
+import json
 import os
-import signal
-import subprocess
-import sys
-import threading
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 
+from mixpose import __version__
 from mixpose.cli.notices import say
+from mixpose.cli.recording_job import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    Job,
+    Outcome,
+    Running,
+    finished,
+    run_job,
+)
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
+from mixpose.executing import Executor, in_threads, on_cluster
+from mixpose.whole_files import appearing_whole
 
 USUAL_STEM = "session"
 """Sessions of this name are told apart by their folders."""
 
-_SUFFIXES = {"bop": ".bop.csv"}
+SUMMARY, TABLE = "summary.json", "summary.csv"
+
+_SUFFIXES = {"bop": ".bop.csv", "ros": ".yaml"}
+_COLUMNS = ("name", "state", "ok", "ambiguous", "lost", "warnings", "seconds", "reason")
+_STATUSES = ("ok", "ambiguous", "lost")
+
+
+def are_many(named: Sequence[str], request: RunRequest) -> bool:
+    """Whether recordings get a folder each: several sessions, a pattern, a list, or a cluster."""
+    first = named[0]
+    pattern = glob.has_magic(first) and not Path(first).exists()
+    return request.scheduler is not None or len(named) > 1 or first.endswith(".txt") or pattern
+
+
+def sessions_of(named: Sequence[str]) -> list[Path]:
+    """The sessions that arguments name: files, patterns, or text files with one to a line.
+
+    Raises
+    ------
+    SessionError
+        If a pattern matches nothing, or a list cannot be read or is empty.
+    """
+    sessions: dict[Path, None] = {}
+    for text in named:
+        path = Path(text)
+        if path.suffix == ".txt":
+            found = _listed(path)
+        elif glob.has_magic(text) and not path.exists():
+            found = [Path(each) for each in sorted(glob.glob(text, recursive=True))]  # noqa: PTH207
+            if not found:
+                raise SessionError(f"{text}: matches no session file")
+        else:
+            found = [path]
+        sessions.update(dict.fromkeys(each.absolute() for each in found))
+    return list(sessions)
+
+
+def _listed(path: Path) -> list[Path]:
+    """The lines of a list; what is not there from the working folder is sought beside the list."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise SessionError(f"{path}: cannot be read: {reason}") from error
+    names = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    if not names:
+        raise SessionError(f"{path}: names no session; allowed: a session file per line")
+    return [each if (each := Path(name)).exists() else path.parent / name for name in names]
 
 
 def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) -> int:
-    """Estimate several recordings and write the poses of each to a file of its own.
+    """Estimate many recordings, and say in the end how each of them went.
+
+    What is done already, with the same session and options, is not done again.
 
     Parameters
     ----------
@@ -34,7 +100,7 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     request : RunRequest
         Its output is a folder, made if it is not there.
     workers : int
-        Most recordings at a time.
+        Most recordings at a time; of a cluster only where it is a local one.
 
     Returns
     -------
@@ -44,129 +110,181 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     Raises
     ------
     SessionError
-        If there is no folder for the poses, two recordings would write to one file, or an option
-        is given that serves a single recording only.
+        If there is no folder for the poses, or an option is given that serves a single recording.
     """
-    if request.sources:
-        raise SessionError(
-            f"--source {request.sources[0]}: found {len(sessions)} sessions, allowed with one only"
-        )
-    if request.overlay is not None:
-        raise SessionError(
-            f"--overlay {request.overlay}: found {len(sessions)} sessions, allowed with one only"
-        )
-    outputs = output_paths(sessions, request)
-    commands = [
-        _command(session, output, request)
-        for session, output in zip(sessions, outputs, strict=True)
-    ]
-    running = _Processes(_threads_each(workers))
-    with ThreadPoolExecutor(workers) as pool:
+    for option, value in (("--source", request.sources), ("--overlay", request.overlay)):
+        if value:
+            shown = value if isinstance(value, Path) else value[0]
+            raise SessionError(
+                f"{option} {shown}: found {len(sessions)} sessions, allowed with one only"
+            )
+    folder = _folder(request.output, len(sessions))
+    jobs = _jobs(sessions, folder, request)
+    before = {k: outcome for k, job in enumerate(jobs) if (outcome := finished(job)) is not None}
+    if before:
+        say(f"{len(before)} of {len(jobs)} recordings are done already")
+    left = [k for k in range(len(jobs)) if k not in before]
+    outcomes = dict(before)
+    try:
+        with _doing(request, workers) as (executor, function):
+            for place, result in executor.run(function, [jobs[k] for k in left]):
+                number = left[place]
+                outcome = _outcome_of(jobs[number], result)
+                outcomes[number] = outcome
+                say(f"{sessions[number]}: {_line(outcome)}")
+    finally:
+        _sweep(folder, list(outcomes.values()))
+        _write_summary(folder, [outcomes[k] for k in sorted(outcomes)], len(jobs))
+    return _say_all(folder, [outcomes[k] for k in sorted(outcomes)])
+
+
+@contextmanager
+def _doing(request: RunRequest, workers: int) -> Iterator[tuple[Executor, partial[Outcome]]]:
+    """What does the jobs, and how."""
+    if request.scheduler is not None:
+        with on_cluster(request.scheduler, workers if workers > 1 else None) as cluster:
+            yield cluster, partial(run_job)
+        return
+    running = Running()
+    share = max((os.cpu_count() or 1) // workers, 1)
+    with in_threads(workers) as threads:
         try:
-            return max(pool.map(running.run, sessions, commands))
+            yield threads, partial(run_job, running=running, threads=share)
         except KeyboardInterrupt:
             running.interrupt()
             raise
 
 
-def output_paths(sessions: Sequence[Path], request: RunRequest) -> list[Path]:
-    """Where the poses of each session go, in a folder that is there afterwards."""
-    folder = request.output
-    if folder is None:
-        raise SessionError(f"-o DIR: missing; {len(sessions)} sessions need a folder for the poses")
-    if folder.exists() and not folder.is_dir():
-        raise SessionError(
-            f"-o {folder}: is a file; {len(sessions)} sessions need a folder for the poses"
-        )
+def _outcome_of(job: Job, result: Outcome | Exception) -> Outcome:
+    """How a job ended, also where its workers were lost again and again."""
+    if isinstance(result, Outcome):
+        return result
+    reason = f"{type(result).__name__}: {' '.join(str(result).split())}"
+    return Outcome(
+        job.name, job.session, job.session_sha256, job.options, job.mixpose, FAILED, 3,
+        reason=reason,
+    )  # fmt: skip
+
+
+def _jobs(sessions: Sequence[Path], folder: Path, request: RunRequest) -> list[Job]:
+    names = names_of(sessions)
     suffix = _SUFFIXES.get(request.format, f".{request.format}")
-    owners: dict[str, Path] = {}
-    for session in sessions:
-        name = (_stem(session) + suffix).casefold()  # some file systems know no capitals
-        if name in owners:
-            raise SessionError(
-                f"{session}: its poses would go to {folder / (_stem(session) + suffix)} like "
-                f"those of {owners[name]}; rename one, or run them into different folders"
-            )
-        owners[name] = session
+    return [
+        Job(
+            session=str(session.absolute()),
+            session_sha256=_sha256(session),
+            folder=str(folder.absolute()),
+            name=name,
+            poses=f"poses{suffix}",
+            options=_options(request),
+            mixpose=__version__,
+            shared=request.scheduler is not None,
+        )
+        for session, name in zip(sessions, names, strict=True)
+    ]
+
+
+def names_of(sessions: Sequence[Path]) -> list[str]:
+    """A name for each session: its own or its folder's, with as many folders as tell it apart."""
+    parts = [
+        [*session.absolute().parent.parts[1:], *([session.stem] * (session.stem != USUAL_STEM))]
+        for session in sessions
+    ]
+    depths = [1] * len(parts)
+    while True:
+        names = ["-".join(part[-depth:]) for part, depth in zip(parts, depths, strict=True)]
+        # some file systems know no capitals
+        counts = Counter(name.casefold() for name in names)
+        twins = [
+            k
+            for k, name in enumerate(names)
+            if counts[name.casefold()] > 1 and depths[k] < len(parts[k])
+        ]
+        if not twins:
+            return [
+                name if counts[name.casefold()] == 1 else f"{name}-{k}"
+                for k, name in enumerate(names)
+            ]
+        for k in twins:
+            depths[k] += 1
+
+
+def _options(request: RunRequest) -> tuple[str, ...]:
+    """Of a run of one session."""
+    chosen = request.selection
+    options = [f"--format={request.format}", f"--step={chosen.step}"]
+    options += [f"--start={chosen.start}"] if chosen.start is not None else []
+    options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
+    options += ["--allow-code"] if request.allow_code else []
+    options += ["--debug"] if request.debug else []
+    return tuple(options)
+
+
+def _sha256(session: Path) -> str:
+    try:
+        return hashlib.sha256(session.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+def _folder(folder: Path | None, count: int) -> Path:
+    if folder is None:
+        raise SessionError(f"-o DIR: missing; {count} sessions need a folder for the poses")
+    if folder.exists() and not folder.is_dir():
+        raise SessionError(f"-o {folder}: is a file; {count} sessions need a folder for the poses")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
-    return [folder / (_stem(session) + suffix) for session in sessions]
+    return folder
 
 
-def _stem(session: Path) -> str:
-    return session.resolve().parent.name if session.stem == USUAL_STEM else session.stem
+def _sweep(folder: Path, outcomes: Sequence[Outcome]) -> None:
+    """Remove what killed workers left of recordings that others did after them."""
+    for outcome in outcomes:
+        if outcome.state == DONE:
+            for left in folder.glob(f".{glob.escape(outcome.name)}.*"):
+                shutil.rmtree(left, ignore_errors=True)
 
 
-def _command(session: Path, output: Path, request: RunRequest) -> list[str]:
-    """The command line of a run of one session."""
-    chosen = request.selection
-    options = [f"--output={output}", f"--format={request.format}", f"--step={chosen.step}"]
-    options += [f"--start={chosen.start}"] if chosen.start is not None else []
-    options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
-    options += ["--resume"] if request.resume else []
-    options += ["--debug"] if request.debug else []
-    return [sys.executable, "-m", "mixpose", "run", *options, "--", str(session)]
+def _line(outcome: Outcome) -> str:
+    """How a recording went."""
+    if outcome.reason is not None:
+        return outcome.reason.removeprefix(f"{outcome.session}: ")
+    count = sum(outcome.frames.values())
+    parts = [f"{outcome.frames[word]} {word}" for word in _STATUSES if outcome.frames.get(word)]
+    text = f"{count} frame{'s' * (count != 1)}: {', '.join(parts) or 'none'}"
+    many = outcome.warnings
+    return f"{text}; {many} warning{'s' * (many != 1)} in its log" if many else text
 
 
-def _threads_each(workers: int) -> dict[str, str]:
-    """Environment in which the processes share the processors."""
-    share = max((os.cpu_count() or 1) // workers, 1)
-    return {"OPENCV_FOR_THREADS_NUM": str(share), **os.environ}
+def _write_summary(folder: Path, outcomes: Sequence[Outcome], asked: int) -> None:
+    states = Counter(outcome.state for outcome in outcomes)
+    summary = {
+        "recordings": asked,
+        "done": states[DONE],
+        "failed": states[FAILED],
+        "not_done": asked - states[DONE] - states[FAILED],
+        "results": [asdict(outcome) for outcome in outcomes],
+    }
+    with appearing_whole(folder / SUMMARY) as part:
+        text = json.dumps(summary, indent=1, ensure_ascii=False)
+        part.write_text(text + "\n", encoding="utf-8")
+    with appearing_whole(folder / TABLE) as part, part.open("w", encoding="utf-8", newline="") as f:
+        table = csv.writer(f, lineterminator="\n")
+        table.writerow(_COLUMNS)
+        for outcome in outcomes:
+            row = asdict(outcome) | {word: outcome.frames.get(word, 0) for word in _STATUSES}
+            table.writerow([row[column] for column in _COLUMNS])
 
 
-class _Processes:
-    """The processes that run, so that an interrupt reaches all of them."""
-
-    def __init__(self, environment: dict[str, str]) -> None:
-        self._environment = environment
-        self._lock = threading.Lock()
-        self._running: set[subprocess.Popen[str]] = set()
-        self._stopped = False
-
-    def run(self, session: Path, command: Sequence[str]) -> int:
-        """Run a command to its end and pass on what it says; 0 if nothing may start any more."""
-        with self._lock:
-            if self._stopped:
-                return 0
-            process = subprocess.Popen(
-                command,
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                encoding="utf-8",
-                errors="replace",
-                # an interrupt from the keyboard comes once, through this process
-                start_new_session=True,
-            )
-            self._running.add(process)
-        with process:
-            assert process.stderr is not None
-            for line in process.stderr:
-                self._pass_on(session, line)
-        with self._lock:
-            self._running.discard(process)
-        return self._status(session, process.returncode)
-
-    def _pass_on(self, session: Path, line: str) -> None:
-        said = line.removeprefix("mixpose: ")
-        if said != line and not said.startswith(f"{session}: "):
-            line = f"mixpose: {session}: {said}"
-        if said != line or not self._stopped:  # one that was still starting ends with a traceback
-            sys.stderr.write(line)
-
-    def _status(self, session: Path, returned: int) -> int:
-        if returned >= 0 or self._stopped:
-            return abs(returned)
-        say(f"{session}: ended by signal {-returned}")
-        return 128 - returned
-
-    def interrupt(self) -> None:
-        """Let every process end after its frame, and no further one start."""
-        with self._lock:
-            self._stopped = True
-            for process in self._running:
-                if sys.platform != "win32":  # there the keyboard reaches all by itself
-                    process.send_signal(signal.SIGINT)
+def _say_all(folder: Path, outcomes: Sequence[Outcome]) -> int:
+    """Say how many are done, and once more which failed; the largest exit status."""
+    failed = [outcome for outcome in outcomes if outcome.state == FAILED]
+    count = f"{len(outcomes)} recording{'s' * (len(outcomes) != 1)}"
+    done = sum(outcome.state == DONE for outcome in outcomes)
+    parts = f"{done} done" + (f", {len(failed)} failed" if failed else "")
+    say(f"{count}: {parts} -> {folder / TABLE}")
+    if any(outcome.state == INTERRUPTED for outcome in outcomes):
+        raise KeyboardInterrupt
+    return max((outcome.exit_status for outcome in outcomes), default=0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mixpose.density.atlas import Atlas, draw
+from mixpose.density.atlas import Atlas
 from mixpose.density.blur import render
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
 from mixpose.density.grid import FAR, FLOOR, Density, Window
@@ -20,7 +20,6 @@ __all__ = [
     "Window",
     "close_pairs",
     "crowding",
-    "draw",
     "features_met",
     "matched_atlas",
     "peak",

@@ -46,7 +46,7 @@ class Factors(NamedTuple):
         return [value, self.left.T @ self.right_slope, self.left_slope.T @ self.right]
 
 
-def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None) -> Factors:
+def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None, total: float) -> Factors:
     """Blur a pattern, normalised, at columns u (U,) and rows v (V,), None for ranges.
 
     Parameters
@@ -55,9 +55,11 @@ def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None) -> Fact
         Not empty.
     sigma : float
         Standard deviation of the blur in sensor units; positive for detections.
+    total : float
+        What the pattern is normalised by, its `mass`.
     """
     if isinstance(pattern, PointPattern):
-        weights = (pattern.weights / pattern.weights.sum()).astype(np.float32)[:, None]
+        weights = (pattern.weights / total).astype(np.float32)[:, None]
         right, right_slope = bell(u, pattern.points[:, 0], sigma)
         if v is None:
             return Factors(weights, np.zeros_like(weights), right, right_slope)
@@ -65,7 +67,7 @@ def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None) -> Fact
         return Factors(left * weights, left_slope * weights, right, right_slope)
     m = len(pattern.origin)
     columns, right, right_slope = _along(pattern, 0, sigma, u)
-    scale = np.float32(pattern.step**m / mass(pattern))
+    scale = np.float32(pattern.step**m / total)
     if v is None:
         one = np.ones((1, 1), dtype=np.float32)
         values: Singles = (pattern.values[:, columns] * scale).astype(np.float32)
@@ -106,12 +108,14 @@ def bell(axis: Floats, centres: Floats, sigma: float) -> tuple[Singles, Singles]
     return values, values * away * np.float32(-1.0 / sigma)
 
 
-def mass(pattern: GridPattern) -> float:
-    """What a grid pattern is normalised by: its integral, of absolute values.
+def mass(pattern: Pattern) -> float:
+    """What a pattern is normalised by: the sum of weights, or the integral of absolute values.
 
     Noise about zero stays as it is, and may outweigh the features; the plain integral might then
     be anything.
     """
+    if isinstance(pattern, PointPattern):
+        return float(pattern.weights.sum())
     absolute = float(np.abs(pattern.values).sum(dtype=np.float64))
     return absolute * pattern.step ** len(pattern.origin)
 
@@ -176,7 +180,7 @@ def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = F
         shape = (*window.shape, 3) if gradient else window.shape
         return Density(np.zeros(shape, dtype=np.float32), window, sigma)
     small, left = reduced(pattern, sigma)
-    made = factors(small, left, window.axis(0), window.axis(1) if m == 2 else None)
+    made = factors(small, left, window.axis(0), window.axis(1) if m == 2 else None, mass(small))
     layers = made.layers(gradient=gradient)
     values = merge(layers[: 1 + m]) if gradient else layers[0]
     return Density(values, window, sigma)

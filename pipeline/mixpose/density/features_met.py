@@ -66,11 +66,14 @@ class FeaturesMet(NamedTuple):
         middle.
     partner : (n,) int
         The feature that one shares its detection with; itself where it shares none.
+    detections : (n,) int
+        The detection that each was met by; -1 for none, and where the pattern has none.
     """
 
     shares: Floats
     offsets: Floats
     partner: NDArray[np.intp]
+    detections: NDArray[np.intp]
 
 
 def features_met(
@@ -101,18 +104,16 @@ def features_met(
     if isinstance(observation.pattern, GridPattern):
         return _residuals(y, weights, variance, sampled, amplitude, rules)
     reach = rules.reach_squared * variance
-    shares, offsets = _nearest(observation.pattern, y, weights, reach)
-    alone = np.arange(len(y))
-    if not rules.merged or np.count_nonzero(shares) == len(shares):
-        return FeaturesMet(shares, offsets, alone)
-    return _run_together(FeaturesMet(shares, offsets, alone), y, weights, reach)
+    found = _nearest(observation.pattern, y, weights, reach)
+    if not rules.merged or np.count_nonzero(found.shares) == len(y):
+        return found
+    return _run_together(found, y, weights, reach)
 
 
-def _nearest(
-    pattern: PointPattern, y: Floats, weights: Floats, reach: float
-) -> tuple[Floats, Floats]:
-    """Shares (n,) and offsets (n, m) to the nearest detections, each taken once."""
+def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: float) -> FeaturesMet:
+    """Features met by the nearest detections, each taken once."""
     shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
+    detections = np.full(len(y), -1)
     away = pattern.points - y[:, None]
     squared = (away * away).sum(axis=-1)
     near_i, near_j = np.nonzero(squared <= reach)
@@ -125,7 +126,8 @@ def _nearest(
             taken.add(j)
             shares[i] = weights[i]
             offsets[i] = away[i, j]
-    return shares, offsets
+            detections[i] = j
+    return FeaturesMet(shares, offsets, np.arange(len(y)), detections)
 
 
 def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) -> FeaturesMet:
@@ -135,6 +137,7 @@ def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) 
     met there: half of each, with the offset of their middle.
     """
     shares, offsets, partner = found.shares.copy(), found.offsets.copy(), found.partner.copy()
+    detections = found.detections.copy()
     single = shares > 0
     for i in np.flatnonzero(shares == 0).tolist():
         seen = np.flatnonzero(single)
@@ -151,8 +154,9 @@ def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) 
         shares[pair] = weights[pair] / 2
         offsets[pair] = middle[k]
         partner[pair] = pair[::-1]
+        detections[pair] = detections[pair[1]]
         single[pair[1]] = False
-    return FeaturesMet(shares, offsets, partner)
+    return FeaturesMet(shares, offsets, partner, detections)
 
 
 def _residuals(
@@ -174,15 +178,16 @@ def _residuals(
     predicted_gradient = -(bells[..., None] * away).sum(axis=1) / variance
     own = sampled[:, 0] - amplitude * (bells.sum(axis=1) - weights * top)
     shares, offsets, alone = np.zeros(len(y)), np.zeros(y.shape), np.arange(len(y))
+    nothing = np.full(len(y), -1)
     # what the better half of the features looks like on its own
     full = float(np.median(np.sort(own)[len(own) // 2 :]))
     if full <= 0:
-        return FeaturesMet(shares, offsets, alone)
+        return FeaturesMet(shares, offsets, alone, nothing)
     shares = np.clip(own / full, 0.0, 1.0)
     shares = np.where(shares > rules.min_share, shares, 0.0) * weights
     pull = sampled[:, 1:] - amplitude * predicted_gradient
     offsets = variance * pull / np.maximum(own, rules.min_share * full)[:, None]
-    return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone)
+    return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone, nothing)
 
 
 def crowding(

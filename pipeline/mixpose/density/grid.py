@@ -130,21 +130,13 @@ def remap(
     values: NDArray[np.float32], map_u: NDArray[np.float32], map_v: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Sample an array bilinearly at n indices: (n, C) or (n,); `FLOOR` outside."""
-    count = len(map_u)
-    channels = values.shape[2:]
+    count, channels = len(map_u), values.shape[2:]
+    width = min(count, _ROW)
     if count == 0:
         return np.zeros((0, *channels), dtype=np.float32)
-    rows = -(-count // _ROW)
-    width = count if rows == 1 else _ROW
-    if rows > 1:
-        padding = rows * width - count
+    if count > width:
+        padding = -count % width
         map_u, map_v = np.pad(map_u, (0, padding)), np.pad(map_v, (0, padding))
-    looked_up = cv2.remap(
-        values,
-        map_u.reshape(rows, width),
-        map_v.reshape(rows, width),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=(FLOOR, FLOOR, FLOOR, FLOOR),
-    )
-    return np.asarray(looked_up, dtype=np.float32).reshape(rows * width, *channels)[:count]
+    maps = map_u.reshape(-1, width), map_v.reshape(-1, width)
+    looked_up = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(looked_up, dtype=np.float32).reshape(-1, *channels)[:count]

@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density.atlas import REACH, Atlas, draw
+from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.overlap import self_overlap
@@ -82,6 +82,13 @@ class Observation:
         if isinstance(self.pattern, PointPattern):
             return len(self.pattern.points)
         return int(self.pattern.values.size)
+
+    @property
+    def weight(self) -> float:
+        """Sum of all weights or values."""
+        pattern = self.pattern
+        values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
+        return float(values.sum())
 
     @property
     def is_sparse(self) -> bool:
@@ -153,13 +160,9 @@ class Observation:
 
 
 def matched_atlas(
-    observations: Sequence[Observation],
-    sigmas: Sequence[float],
-    steps_per_sigma: float,
-    near: Sequence[Floats | None] | None = None,
-    around: float = REACH,
+    observations: Sequence[Observation], sigmas: Sequence[float], steps_per_sigma: float
 ) -> Atlas:
-    """Draw C of several sensors, none of which is empty.
+    """C of several sensors, none of which is empty.
 
     Parameters
     ----------
@@ -167,12 +170,7 @@ def matched_atlas(
     sigmas : sequence of float
         Standard deviation of a feature, per sensor, in sensor units.
     steps_per_sigma : float
-        Cells per standard deviation of C, as `mixpose.density.atlas.draw` has it.
-    near : sequence of (n, m) array or None
-        Places about which alone C is wanted; None: wherever it is not zero.
-    around : float
-        Standard deviations about such places within which grey values are drawn.
+        Cells per standard deviation of C.
     """
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
-    patterns = [observation.pattern for observation in observations]
-    return draw(patterns, blurs, steps_per_sigma, near or [None] * len(patterns), around)
+    return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
-REACH = 7.5
-"""Standard deviations beyond which two features do not overlap: e^-28."""
+REACH = 5.7
+"""Standard deviations beyond which two features do not overlap: e^-16."""
 
 ALL_PAIRS = 48
 """Points up to which all pairs at once are faster than a search for neighbours."""

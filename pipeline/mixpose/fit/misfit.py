@@ -12,12 +12,11 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.objective.matched import FINE_STEPS, look_up_error
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_ROUNDING = look_up_error(FINE_STEPS)
+_ROUNDING = 1 / 512  # of a height: what a body may leave at its features and yet fit
 
 
 @dataclass(frozen=True)

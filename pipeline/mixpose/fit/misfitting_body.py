@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TypeAlias
@@ -10,19 +9,18 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import Body
 from mixpose.fit.free_features import fit_freed
 from mixpose.fit.misfit import MisfitRules, SensorDensity, misfit
-from mixpose.fit.prior import Prior, likelihood_near, most_probable
-from mixpose.objective import MatchedObjective, View, matched_objective, project_body
+from mixpose.fit.prior import Prior, likelihood_at, most_probable
+from mixpose.objective import MatchedObjective, matched_objective
+from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.rigid import transform
 
 Floats: TypeAlias = NDArray[np.float64]
 
 
 def believed(
-    views: Sequence[View],
-    body: Body,
+    objective: MatchedObjective,
     T_world_object: Floats,
     prior: Prior,
     rules: MisfitRules = MisfitRules(),
@@ -31,11 +29,10 @@ def believed(
 
     Parameters
     ----------
-    views : sequence of View
-        All with noise in their cells.
-    body : Body
+    objective : MatchedObjective
+        At σ_ε of sensors with noise in their cells.
     T_world_object : (4, 4) array
-        A maximum of the likelihood.
+        A maximum of the objective.
     prior : Prior
     rules : MisfitRules
 
@@ -45,32 +42,35 @@ def believed(
     bool
         Whether features were freed.
     """
+    body = objective.projection.body
     points = body.nodes.points
-    T = most_probable(views, body, T_world_object, prior)
-    seen = project_body(tuple(view.sensor for view in views), body).project(T[None]).seen
-    if not seen.all() or len(points) != len(body):
+    T = most_probable(objective, T_world_object, prior)
+    if not objective.projection.project(T[None]).seen.all() or len(points) != len(body):
         return T, False
-    near = likelihood_near(views, body, T)
-    here = [
+    densities = [
         SensorDensity(
             view.sensor,
-            partial(_sampled, near.objective, k),
-            float(near.objective.variances[k, 0]),
-            float(near.noise[k]),
+            partial(_sampled, objective, k),
+            float(objective.variances[k, 0]),
+            float(noise),
             view.observation.extent,
         )
-        for k, view in enumerate(views)
+        for k, (view, noise) in enumerate(
+            zip(objective.views, likelihood_at(objective, T).noise, strict=True)
+        )
     ]
-    ratio = misfit(here, transform(T, points), int(prior.free.sum()), rules)
+    ratio = misfit(densities, transform(T, points), int(prior.free.sum()), rules)
     if ratio == 1:
         return T, False
-    everywhere = matched_objective(views, body, [view.observation.sigma for view in views])
-    whole = [replace(one, density=partial(_sampled, everywhere, k)) for k, one in enumerate(here)]
+    sigmas = [view.observation.sigma for view in objective.views]
+    # to look for peaks everywhere
+    rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
+    whole = [replace(one, density=partial(_sampled, rough, k)) for k, one in enumerate(densities)]
     T_freed = fit_freed(whole, points, [T, *prior.points()], prior.free)
     if T_freed is not None:
         return T_freed, True
     # what is left at features is no noise of cells: in a body that does not fit it is as large
-    return most_probable(views, body, T, prior, ratio), False
+    return most_probable(objective, T, prior, ratio), False
 
 
 def _sampled(objective: MatchedObjective, sensor: int, y: Floats) -> Floats:

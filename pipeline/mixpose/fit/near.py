@@ -22,16 +22,19 @@ from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
 from mixpose.objective import MatchedObjective, Objective, View, build_objective, matched_objective
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS, STEPS_PER_SIGMA, value_error
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
+from mixpose.sensors import Motion
 
 Floats: TypeAlias = NDArray[np.float64]
 
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
-# after a step that gains 1e-6, 0.002 σ long, a twentieth of it is left to go: residuals draw it
-SHARP = NewtonOptions(iterations=40, tolerance=1e-6, value_error=value_error(LAST_STEPS))
+# what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
+SHARP = NewtonOptions(
+    iterations=40, tolerance=1e-6, value_error=value_error(STEPS_PER_SIGMA), remaining=5e-7
+)
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
 
 
@@ -62,6 +65,8 @@ class Fit:
         Evaluations at the finest blur.
     freed : bool
         Whether the body did not fit, and the pose was fitted to freed features.
+    motion : Motion or None
+        Of the body, where sensors see it at moments of their own.
     """
 
     T_world_object: Floats
@@ -69,6 +74,7 @@ class Fit:
     converged: bool
     iterations: int
     freed: bool = False
+    motion: Motion | None = None
 
 
 def fit_near(
@@ -96,24 +102,23 @@ def fit_near(
     samples : (N, R, 3) array
         Samples of the body, for the objectives that integrate by sampling.
     finest : MatchedObjective or None
-        At σ_ε, wherever something is seen, where it is at hand.
+        At σ_ε, where it is at hand.
     rules : FitRules
     """
     free = free_mask(options)
     matched = options.objective == "matched"
-    sparse = all(view.observation.is_sparse for view in views)
     ascent = None
-    if matched and sparse and not has_likelihood(views):
-        sigmas = [view.observation.sigma for view in views]
-        finest = finest or matched_objective(views, body, sigmas, steps_per_sigma=LAST_STEPS)
+    if matched:
+        finest = finest or matched_objective(views, body, [v.observation.sigma for v in views])
+    if finest and not has_likelihood(views):
         here = finest.linearise(T_start)
         if here.value >= rules.near * len(views):
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     T, is_freed = ascent.state, False
-    if matched and has_likelihood(views):
-        T, is_freed = believed(views, body, T, Prior(T_start, uncertainty, free), rules.misfit)
+    if finest and has_likelihood(views):
+        T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
 
 
@@ -139,6 +144,6 @@ def _through_blurs(
         objective: Objective | None = finest if last else None
         if objective is None:
             name, near = options.objective, ascent.state
-            objective = build_objective(name, views, body, samples, sigmas, near, last)
+            objective = build_objective(name, views, body, samples, sigmas, near)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     return ascent

@@ -18,20 +18,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import Body
-from mixpose.density.atlas import REACH
-from mixpose.objective import MatchedObjective, Quadratic, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, ZOOM, ZOOM_STEPS, value_error
+from mixpose.objective import MatchedObjective, Quadratic, View
+from mixpose.objective.matched import FINE_STEPS, value_error
 from mixpose.optimise import NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 
 Floats: TypeAlias = NDArray[np.float64]
-
-Scale: TypeAlias = tuple[float, float]
-
-COARSE: Scale = (STEPS_PER_SIGMA, REACH)
-FINE: Scale = (FINE_STEPS, REACH)
-CLOSE: Scale = (ZOOM_STEPS, ZOOM)
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
@@ -70,7 +62,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Log-likelihood of densities with noise in every cell, made around a pose.
+    """Log-likelihood of densities with noise in every cell.
 
     Attributes
     ----------
@@ -101,27 +93,22 @@ def has_likelihood(views: Sequence[View]) -> bool:
     return all(view.observation.cell is not None for view in views)
 
 
-def likelihood_near(
-    views: Sequence[View],
-    body: Body,
-    T_world_object: Floats,
-    *,
-    scale: Scale = FINE,
-    misfit: float = 1.0,
+def likelihood_at(
+    objective: MatchedObjective, T_world_object: Floats, misfit: float = 1.0
 ) -> Likelihood:
-    """Make the log-likelihood at σ_ε around a pose; what that pose leaves is taken for noise.
+    """The log-likelihood; what is left at a pose (4, 4) is taken for noise.
 
-    `misfit` is a factor on the variance of the noise: χ² per degree of freedom of a body that does
-    not fit.  `scale` says how finely densities are drawn.
+    Parameters
+    ----------
+    objective : MatchedObjective
+        At σ_ε of sensors with noise in their cells.
+    T_world_object : (4, 4) array
+    misfit : float
+        A factor on the variance of the noise: χ² per degree of freedom of a body that does not fit.
     """
-    sigmas = [view.observation.sigma for view in views]
-    steps, around = scale
-    objective = matched_objective(
-        views, body, sigmas, T_world_object, steps_per_sigma=steps, around=around
-    )
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
-    cells = np.array([view.observation.cells for view in views])
+    cells = np.array([view.observation.cells for view in objective.views])
     noise = cell_variances(objective.energies[:, 0], shares, cells)
     weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]
     return Likelihood(replace(objective, weights=weights), shares, noise)
@@ -144,39 +131,26 @@ def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) ->
 
 
 def most_probable(
-    views: Sequence[View],
-    body: Body,
-    T_world_object: Floats,
-    prior: Prior,
-    misfit: float = 1.0,
+    objective: MatchedObjective, T_world_object: Floats, prior: Prior, misfit: float = 1.0
 ) -> Floats:
-    """Maximise likelihood and prior.
+    """The pose (4, 4) that maximises likelihood and prior.
 
     Parameters
     ----------
-    views : sequence of View
-        All with noise in their cells.
-    body : Body
+    objective : MatchedObjective
+        As `likelihood_at` has it, and `misfit`.
     T_world_object : (4, 4) array
-        A maximum of the likelihood.
+        A maximum of the objective.
     prior : Prior
-    misfit : float
-        As `likelihood_near` has it.
-
-    Returns
-    -------
-    (4, 4) array
     """
     T = T_world_object
-    likelihood = likelihood_near(views, body, T, misfit=misfit)
+    likelihood = likelihood_at(objective, T, misfit)
     if not likelihood.is_alone:
-        wide = likelihood_near(views, body, T, scale=COARSE, misfit=misfit)
-        T = _highest(wide, prior, [T, *prior.points()], _ROUGH)
-        likelihood = likelihood_near(views, body, T, misfit=misfit)
+        T = _highest(likelihood, prior, [T, *prior.points()], _ROUGH)
+        likelihood = likelihood_at(objective, T, misfit)
     T = _highest(likelihood, prior, [T], _NATS)
-    # once more, drawn close to the maximum and with the noise that it leaves
-    likelihood = likelihood_near(views, body, T, scale=CLOSE, misfit=misfit)
-    return _highest(likelihood, prior, [T], _NATS)
+    # once more with the noise that the maximum leaves
+    return _highest(likelihood_at(objective, T, misfit), prior, [T], _NATS)
 
 
 def _highest(likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float) -> Floats:

@@ -8,5 +8,15 @@ from mixpose.frames.opening import open_source
 from mixpose.frames.pairing import pair
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import ALL_NUMBERS, Source, SourceSpec
+from mixpose.frames.stamps import paired_by_stamp
 
-__all__ = ["ALL_NUMBERS", "Source", "SourceSpec", "open_source", "pair", "prefetch", "read_image"]
+__all__ = [
+    "ALL_NUMBERS",
+    "Source",
+    "SourceSpec",
+    "open_source",
+    "pair",
+    "paired_by_stamp",
+    "prefetch",
+    "read_image",
+]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -12,6 +13,9 @@ from mixpose.errors import RecordingError
 
 # As many digits as a file name may have.
 _LARGEST_NUMBER = 10**255
+
+# Characters: a profile of a million bins.
+_LONGEST_LINE = 16_000_000
 
 
 def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -30,7 +34,9 @@ def csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     width = None
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, skipinitialspace=True)
+            # a line that is longer comes in pieces, and has not as many cells as the first
+            pieces = iter(partial(file.readline, _LONGEST_LINE), "")
+            reader = csv.reader(pieces, skipinitialspace=True)
             for cells in reader:
                 if not cells or not (cells[0] or any(map(str.strip, cells))):
                     continue

@@ -16,15 +16,20 @@ from mixpose.errors import RecordingError
 from mixpose.frames.quiet import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
+from mixpose.limits import MOST_PIXELS
 from mixpose.records import Image, RawFrame
 
 _RASTERS = {".bmp", ".dib", ".pbm", ".pfm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
 _PICTURES = {".avif", ".exr", ".hdr", ".jp2", ".jpe", ".jpeg", ".jpg", ".webp"}
 IMAGE_SUFFIXES = frozenset(_RASTERS | _PICTURES)
 
+_TOO_LARGE = f"found more pixels than are allowed, {MOST_PIXELS}"
+
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _PIECE = 4096  # bytes; zlib lets go of the lock from 5 kB on
 _JPEG_START = b"\xff\xd8\xff"
+# Nanoseconds since 1970 from 1973 to 2262, as long as an int64 holds them: no camera counts so far.
+_FIRST_STAMP, _LAST_STAMP = 10**17, 2**63
 _START_OF_SCAN = 0xDA
 _END_OF_IMAGE = b"\xff\xd9"
 
@@ -41,6 +46,10 @@ class ImageSequence:
         Size of every image in px; None means that of the first one read.
     clock : callable or None
         Gives the time of a frame number.
+    is_stamped : bool
+        Whether the numbers are times in nanoseconds, which the clock goes by.
+    has_fps : bool
+        Whether the session states a rate.
     """
 
     kind: ClassVar[SourceKind] = "images"
@@ -50,6 +59,8 @@ class ImageSequence:
     numbers: tuple[int, ...]
     resolution: tuple[int, int] | None
     clock: Clock | None
+    is_stamped: bool = False
+    has_fps: bool = False
 
     @property
     def length(self) -> int:
@@ -71,6 +82,11 @@ class ImageSequence:
 
     def caution(self) -> str | None:
         """What is odd about the numbers: a file or two among numbered ones took them from all."""
+        if self.is_stamped and self.has_fps:
+            return (
+                "the names of its images end in nanoseconds, which are taken for their times, and "
+                "not fps; drop fps, or name a table of times"
+            )
         if self.length < 3 or self.numbers != tuple(range(self.length)):
             return None
         ends = [re.search(r"[0-9]+$", path.stem) for path in self.paths]
@@ -119,9 +135,20 @@ def open_images(spec: SourceSpec, paths: Sequence[Path], clock: Clock | None) ->
     """Images in the given order as a source; they are numbered by `frame_numbers`."""
     numbers = frame_numbers(paths)
     order = sorted(range(len(paths)), key=numbers.__getitem__)
+    is_stamped = spec.times is None and all(_FIRST_STAMP <= n < _LAST_STAMP for n in numbers)
     return ImageSequence(
-        tuple(paths[i] for i in order), tuple(numbers[i] for i in order), spec.resolution, clock
+        tuple(paths[i] for i in order),
+        tuple(numbers[i] for i in order),
+        spec.resolution,
+        _time_of_stamp if is_stamped else clock,
+        is_stamped,
+        spec.fps is not None,
     )
+
+
+def _time_of_stamp(stamp: int) -> float:
+    """Nanoseconds as seconds."""
+    return stamp // 10**9 + stamp % 10**9 * 1e-9
 
 
 def frame_numbers(paths: Sequence[Path]) -> list[int]:
@@ -173,7 +200,10 @@ def read_image(path: Path) -> Image:
             np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
         )
     except cv2.error as error:
-        raise RecordingError(f"{path}: cannot be decoded: {error.err}") from error
+        reason = _TOO_LARGE if "PIXELS" in str(error) else f"cannot be decoded: {error.err}"
+        raise RecordingError(f"{path}: {reason}") from error
+    if image is not None and image.size > MOST_PIXELS:
+        raise RecordingError(f"{path}: {_TOO_LARGE}")
     if image is None:
         raise RecordingError(
             f"{path}: no image, damaged or cut short; allowed is what OpenCV reads"

@@ -16,6 +16,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.csv_rows import csv_rows, finite
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
+from mixpose.limits import MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
 
@@ -109,6 +110,8 @@ def open_profiles(spec: SourceSpec, path: Path, clock: Clock | None) -> RangePro
         bins = _map_npy(path)[2]
     else:
         bins = len(next(csv_rows(path), (0, []))[1])
+    if bins > MOST_BINS:
+        raise RecordingError(f"{path}: found {bins} bins in a profile, allowed are {MOST_BINS}")
     return RangeProfiles(path, range_min, bin_size, clock, bins)
 
 

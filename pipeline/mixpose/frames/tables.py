@@ -7,7 +7,7 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
+from itertools import groupby, islice
 from operator import itemgetter
 from pathlib import Path
 from typing import ClassVar, NoReturn, TypeAlias
@@ -18,6 +18,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames.csv_rows import csv_rows, finite, header, whole
 from mixpose.frames.source import SensorKind, SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, FrameTimes, require_times
+from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
 _COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
@@ -97,9 +98,9 @@ class DetectionTable:
     def check_times(self, wanted: range) -> None:
         """See that each frame in the range has a time; reads the table once more."""
         if isinstance(self.clock, FrameTimes):
-            require_times(self.clock, (number for number in self._numbers() if number in wanted))
+            require_times(self.clock, (number for number in self.numbers() if number in wanted))
 
-    def _numbers(self) -> list[int]:
+    def numbers(self) -> list[int]:
         """Frame numbers, ascending, up to the first row that cannot be read."""
         if not self._is_numbered:
             return list(range(self.length))
@@ -119,7 +120,13 @@ class DetectionTable:
         wanted = selection(start, stop, step, self.first)
         rows: Iterator[_Row] = self._rows()
         if not self._contents.in_order:
-            rows = iter(sorted(rows, key=itemgetter(0)))
+            unsorted = list(islice(rows, MOST_UNSORTED_ROWS + 1))
+            if len(unsorted) > MOST_UNSORTED_ROWS:
+                raise RecordingError(
+                    f"{self.path}: found more than {MOST_UNSORTED_ROWS} rows, which are not in the "
+                    "order of their frames; sort them, then they may be any number"
+                )
+            rows = iter(sorted(unsorted, key=itemgetter(0)))
         for place, (key, group) in enumerate(groupby(rows, key=itemgetter(0))):
             number = int(key) if self._is_numbered else place
             if number >= wanted.stop:
@@ -129,7 +136,12 @@ class DetectionTable:
 
     def _frame(self, number: int, rows: Iterator[_Row]) -> RawFrame:
         """Convert the rows of one frame."""
-        group = list(rows)
+        group = list(islice(rows, MOST_DETECTIONS + 1))
+        if len(group) > MOST_DETECTIONS:
+            raise RecordingError(
+                f"{self.path}, line {group[-1][1]}: found more than {MOST_DETECTIONS} detections "
+                f"in frame {number}, as many are allowed; leave out what cannot be a feature"
+            )
         try:
             values = np.array([[float(cell) for cell in cells] for _, _, cells in group])
         except ValueError:

@@ -16,6 +16,7 @@ from mixpose.frames.capture import NotOpenedError, grab, is_stream, opened, retr
 from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
+from mixpose.limits import MOST_PIXELS
 from mixpose.records import RawFrame
 
 
@@ -180,6 +181,10 @@ def open_video(spec: SourceSpec, address: str, clock: Clock | None) -> Video:
         raise RecordingError(
             f"{address}: found {width}x{height} pixels, allowed is "
             f"{spec.resolution[0]}x{spec.resolution[1]} like the sensor's resolution"
+        )
+    if width * height > MOST_PIXELS:
+        raise RecordingError(
+            f"{address}: found {width}x{height} pixels, allowed are {MOST_PIXELS} together"
         )
     promised = int(count) if math.isfinite(count) and count >= 1 else None
     try:

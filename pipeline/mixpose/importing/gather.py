@@ -28,8 +28,8 @@ class Imported:
     unit : {"m", "cm", "mm", "um"}
     cameras : tuple of CalibratedCamera
         Names are unique; translations are in `unit`.
-    body : Path or None
-        A file of markers.
+    bodies : tuple of Path
+        Files of markers.
     files : tuple of Path
         All that was read.
     remarks : tuple of str
@@ -40,14 +40,14 @@ class Imported:
 
     unit: Unit
     cameras: tuple[CalibratedCamera, ...]
-    body: Path | None
+    bodies: tuple[Path, ...]
     files: tuple[Path, ...]
     remarks: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
 def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
-    """Read calibration files and, at most, one file of a body.
+    """Read calibration files and files of bodies.
 
     Parameters
     ----------
@@ -64,8 +64,6 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
         In one line, if a file cannot be read or files contradict each other.
     """
     bodies = [path for path in paths if path.suffix.lower() in _TABLES]
-    if len(bodies) > 1:
-        raise SessionError(f"{bodies[1]}: is a second body; allowed: one, {bodies[0]} is the first")
     try:
         for body in bodies:
             read_marker_file(body, unit)
@@ -95,7 +93,7 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
     return Imported(
         unit=unit,
         cameras=tuple(cameras),
-        body=bodies[0] if bodies else None,
+        bodies=tuple(bodies),
         files=tuple(paths),
         remarks=tuple(remarks),
         warnings=tuple(warnings),

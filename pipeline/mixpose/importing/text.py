@@ -22,31 +22,40 @@ def session_text(imported: Imported, output: Path) -> str:
     ----------
     imported : Imported
     output : Path
-        Where the text will be: the path of the body is relative to it.
+        Where the text will be: paths of bodies are relative to it.
     """
     names = ", ".join(path.name for path in imported.files)
     head = [f"# made by mixpose import from {names}"]
     head += [f"# {remark}" for remark in imported.remarks]
-    parts = ["\n".join([*head, f'unit = "{imported.unit}"']), _object(imported, output)]
+    parts = ["\n".join([*head, f'unit = "{imported.unit}"']), *_objects(imported, output)]
     parts += [_sensor(camera) for camera in imported.cameras]
     return "\n\n".join(parts) + "\n"
 
 
-def _object(imported: Imported, output: Path) -> str:
-    if imported.body is not None:
-        try:
-            relative = os.path.relpath(imported.body.resolve(), output.resolve().parent)
-        except ValueError:  # on another drive
-            relative = str(imported.body.resolve())
-        name = imported.body.stem
-        path = Path(relative).as_posix()
-        return f"[object]\nname = {json.dumps(name)}\nfile = {json.dumps(path)}"
-    scale = 1e-3 / _METRES[imported.unit]
-    points = [[float(f"{value * scale:g}") for value in point] for point in _EXAMPLE_MM]
-    return (
-        '# an example: put in the places of your markers, or file = "markers.csv"\n'
-        f'[object]\nname = "example"\npoints = {points}'
-    )
+def _objects(imported: Imported, output: Path) -> list[str]:
+    if not imported.bodies:
+        scale = 1e-3 / _METRES[imported.unit]
+        points = [[float(f"{value * scale:g}") for value in point] for point in _EXAMPLE_MM]
+        return [
+            '# an example: put in the places of your markers, or file = "markers.csv"\n'
+            f'[object]\nname = "example"\npoints = {points}'
+        ]
+    heading = "[object]" if len(imported.bodies) == 1 else "[[object]]"
+    stems = [path.stem for path in imported.bodies]
+    texts = []
+    for k, path in enumerate(imported.bodies):
+        name = stems[k] if stems.count(stems[k]) == 1 else f"{stems[k]}_{k + 1}"
+        file = json.dumps(_relative(path, output), ensure_ascii=False)
+        texts.append(f"{heading}\nname = {json.dumps(name, ensure_ascii=False)}\nfile = {file}")
+    return texts
+
+
+def _relative(path: Path, output: Path) -> str:
+    """A path as the session file is to name it."""
+    try:
+        return Path(os.path.relpath(path.resolve(), output.resolve().parent)).as_posix()
+    except ValueError:  # on another drive
+        return path.resolve().as_posix()
 
 
 def _sensor(camera: CalibratedCamera) -> str:

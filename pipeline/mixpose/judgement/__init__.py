@@ -20,7 +20,7 @@ from mixpose.judgement.evidence import (
     odds_of,
     paid_by_count,
 )
-from mixpose.judgement.expected_covariance import expected_covariance
+from mixpose.judgement.expected_covariance import expected_covariance, invert_information
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
 from mixpose.judgement.noise import Noise, NoiseModel
 
@@ -42,6 +42,7 @@ __all__ = [
     "expected_covariance",
     "flat_prior",
     "insert",
+    "invert_information",
     "is_possible",
     "is_sure",
     "judge",

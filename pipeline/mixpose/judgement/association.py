@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
@@ -45,6 +45,10 @@ class Association:
         Observed features per unit of the sensor's coordinates, around the prediction.
     count : float
         Number of observed features.
+    places : (n, m) float64
+        Where they are predicted.
+    detections : (n,) int
+        The observed features by which they were met; -1 for none.
     merged : int
         Features that were detected as one with another.
     surplus : float
@@ -64,6 +68,8 @@ class Association:
     count: float
     merged: int = 0
     surplus: float = 0.0
+    places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    detections: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     @cached_property
     def met(self) -> float:
@@ -122,20 +128,22 @@ def associate(
     float
         The objective at the pose.
     """
-    at, sampled, matched, _ = objective.match(T_world_object[None])
+    at, sampled, over = objective.match(T_world_object[None])
     node_weights = objective.projection.body.nodes.weights
-    found = []
+    found, value = [], 0.0
     for k, view in enumerate(objective.views):
         m, observation = int(objective.projection.dimensions[k]), view.observation
         variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
         features = np.flatnonzero(at.seen[k, 0])
         y, weights = at.y[k, 0, features, :m], at.weights[k, 0, features]
         J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
-        product, norm = float(matched.product[k, 0]), float(matched.norm[k, 0])
+        product, norm = float(weights @ C[:, 0]), float(over.norm[k, 0])
+        value += float(objective.weights[k, 0]) / energy * product**2 / norm
         shares, offsets, merged = np.zeros(len(y)), np.zeros(y.shape), 0
+        detections = np.full(len(y), -1)
         if product > 0:
             met = features_met(observation, y, weights, variance, C, product / norm, rules)
-            shares, offsets = met.shares, met.offsets
+            shares, offsets, detections = met.shares, met.offsets, met.detections
             paired = met.partner != np.arange(len(y))
             merged = int(np.count_nonzero(paired)) // 2
             J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
@@ -156,9 +164,10 @@ def associate(
                 sigma=sigma,
                 crowd=crowd,
                 count=count,
+                places=y,
+                detections=detections,
                 merged=merged,
                 surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
             )
         )
-    explained = matched.product**2 / matched.norm
-    return found, float((objective.weights / objective.energies * explained).sum())
+    return found, value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mixpose.objective.base import Objective, Quadratic, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
-from mixpose.objective.matched import MatchedObjective, matched_objective
+from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 from mixpose.objective.projection import BodyProjection, Projected, pose_jacobian, project_body
 
@@ -18,6 +18,7 @@ __all__ = [
     "PaperObjective",
     "Projected",
     "Quadratic",
+    "SharedDensities",
     "View",
     "build_objective",
     "matched_objective",

@@ -31,12 +31,21 @@ class View:
     observation : Observation
     delay : float
         Seconds by which the sensor's frame was taken later than the common time.
+    readout : float
+        Seconds from the first row to the last; the frame's time is that of the middle row.
+    unsure : float or None
+        Standard deviation of a delay that is estimated; None where it is told.
+    estimated : float
+        Of the delay, what was estimated.
     """
 
     name: str
     sensor: Sensor
     observation: Observation
     delay: float = 0.0
+    readout: float = 0.0
+    unsure: float | None = None
+    estimated: float = 0.0
 
 
 class Quadratic(NamedTuple):

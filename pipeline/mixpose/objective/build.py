@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Objective, View
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, matched_objective
+from mixpose.objective.matched import matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 
 Floats: TypeAlias = NDArray[np.float64]
 ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
-Builder: TypeAlias = Callable[
-    [Sequence[View], Body, Floats, Sequence[float], Floats, bool], Objective
-]
+Builder: TypeAlias = Callable[[Sequence[View], Body, Floats, Sequence[float], Floats], Objective]
 
 
 def _matched(
@@ -27,10 +25,8 @@ def _matched(
     samples: Floats,
     sigmas: Sequence[float],
     near: Floats,
-    fine: bool,
 ) -> Objective:
-    steps = FINE_STEPS if fine else STEPS_PER_SIGMA
-    return matched_objective(views, body, sigmas, near, steps_per_sigma=steps)
+    return matched_objective(views, body, sigmas)
 
 
 def _sampled(
@@ -40,7 +36,6 @@ def _sampled(
     samples: Floats,
     sigmas: Sequence[float],
     near: Floats,
-    fine: bool,
 ) -> Objective:
     terms = sampled_terms(views, samples, sigmas, near)
     return kind(terms, samples, body.world_offsets(samples.shape[1]))
@@ -60,7 +55,6 @@ def build_objective(
     samples: Floats,
     sigmas: Sequence[float],
     near: Floats,
-    fine: bool = False,
 ) -> Objective:
     """Build an objective of the pose at one level of blur.
 
@@ -75,8 +69,6 @@ def build_objective(
     sigmas : sequence of float
         Standard deviation of a feature at this level, per view, in sensor units.
     near : (4, 4) array
-        Pose around whose projection densities are made.
-    fine : bool
-        Whether the matched objective draws its densities finely, for the last digits.
+        Pose around whose projection sampled densities are made.
     """
-    return OBJECTIVES[name](views, body, samples, sigmas, near, fine)
+    return OBJECTIVES[name](views, body, samples, sigmas, near)

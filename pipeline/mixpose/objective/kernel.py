@@ -27,29 +27,10 @@ from mixpose.objective.projection import Projected
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_NEGLIGIBLE = -28.0  # exponent below which two features do not overlap: 1e-12
+_NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
 _FEW = 24  # features up to which all pairs are looked at first
+_NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 _NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
-
-
-class Matched(NamedTuple):
-    """Inner products of observed and predicted densities, per sensor and pose (L, H).
-
-    Attributes
-    ----------
-    product : (L, H) float64
-        c = ⟨g, h⟩.
-    norm : (L, H) float64
-        n = ⟨h, h⟩; 1 where a sensor sees no feature.
-    """
-
-    product: Floats
-    norm: Floats
-
-    @property
-    def amplitude(self) -> Floats:
-        """The factor a (L, H) with which h meets g best."""
-        return self.product / self.norm
 
 
 class Slopes(NamedTuple):
@@ -91,23 +72,20 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
         v, and the peak of a Gaussian of that variance.
     """
     norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
-    if _are_apart(y, variances):
-        norm[norm == 0] = 1.0
-        return Overlaps(norm, _NO_PAIRS, norm, norm)
-    pairs = _pairs(y, variances)
-    away = y[:, :, pairs[:, 0]] - y[:, :, pairs[:, 1]]
-    exponents = (away * away).sum(axis=3) * (-0.5 / variances)[..., None]
-    products = weights[:, :, pairs[:, 0]] * weights[:, :, pairs[:, 1]]
-    near = (exponents > _NEGLIGIBLE) & (products > 0)
-    overlapping = near.any(axis=(0, 1))
-    if not overlapping.all():
-        pairs, away = pairs[overlapping], away[:, :, overlapping]
-        exponents, products = exponents[..., overlapping], products[..., overlapping]
+    pairs = _NO_PAIRS if _are_apart(y, variances) else _pairs(y, variances)
     if not len(pairs):
-        return Overlaps(np.where(norm > 0, norm, 1.0), pairs, exponents, away)
+        return Overlaps(np.maximum(norm, _NONE), pairs, norm, norm)
+    i, j = pairs[:, 0], pairs[:, 1]
+    away = y[:, :, i] - y[:, :, j]
+    exponents = np.einsum("lhpm,lhpm->lhp", away, away) * (-0.5 / variances)[..., None]
+    products = weights[:, :, i] * weights[:, :, j]
+    near = ((exponents > _NEGLIGIBLE) & (products > 0)).any(axis=(0, 1))
+    if not near.all():
+        pairs, away = pairs[near], away[:, :, near]
+        exponents, products = exponents[..., near], products[..., near]
     bells = products * np.exp(exponents) * tops[..., None]
-    norm = norm + 2 * bells.sum(axis=2)
-    return Overlaps(np.where(norm > 0, norm, 1.0), pairs, bells, away)
+    norm += 2 * bells.sum(axis=2)
+    return Overlaps(np.maximum(norm, _NONE), pairs, bells, away)
 
 
 def _are_apart(y: Floats, variances: Floats) -> bool:
@@ -127,17 +105,11 @@ def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     if n <= ALL_PAIRS:
         return close_pairs(y[0, 0], 1.0)
     each = [
-        close_pairs(y[k, h], float(v))
+        np.sort(close_pairs(y[k, h], float(v)), axis=1)
         for k, v in enumerate(variances[:, 0])
         for h in range(y.shape[1])
     ]
-    codes = np.unique(np.concatenate([np.sort(one, axis=1) @ [n, 1] for one in each]))
-    return np.stack(np.divmod(codes, n), axis=1)
-
-
-def inner_products(C: Floats, over: Overlaps) -> Matched:
-    """⟨g, h⟩ and ⟨h, h⟩ from weighted densities C (L, H, n) at the predicted features."""
-    return Matched(C @ np.ones(C.shape[2]), over.norm)
+    return each[0] if len(each) == 1 else np.unique(np.concatenate(each), axis=0)
 
 
 def slopes(
@@ -154,14 +126,15 @@ def slopes(
     variances, tops, scales : (L, 1) array
         v, N(0; 0, v), and the factor s of each sensor.
     """
+    L, H, n = at.weights.shape
+    J = at.J.reshape(L, H, 2 * n, 6)
     C = sampled[..., 0] * at.weights
-    pull = sampled[..., 1:] * at.weights[..., None]
-    by_feature = (pull[..., None, :] @ at.J)[..., 0, :]
-    matched = inner_products(C, over)
-    amplitude = matched.amplitude
+    pull = (sampled[..., 1:] * at.weights[..., None]).reshape(L, H, 1, 2 * n)
+    rest = (pull @ J)[:, :, 0]
+    product = C.sum(axis=2)
+    amplitude = product / over.norm
     strength = 2 * scales * amplitude
-    value = (scales * matched.product * amplitude).sum(axis=0)
-    rest = np.ones(C.shape[2]) @ by_feature
+    value = (scales * product * amplitude).sum(axis=0)
     if len(over.pairs):
         half, gram = _pair_terms(at, over, variances, tops)
         gradient = (strength[..., None] * (rest - amplitude[..., None] * half)).sum(axis=0)
@@ -169,30 +142,23 @@ def slopes(
         level = (2 * scales * amplitude**2)[..., None, None]
         return Slopes(value, gradient, (level * (gram - outer)).sum(axis=0))
     drawn = (strength / variances)[..., None] * C
-    curvature = _by_pose(at.J).swapaxes(1, 2) @ _by_pose(drawn[..., None, None] * at.J)
-    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature)
-
-
-def _by_pose(rows: Floats) -> Floats:
-    """Rows of all sensors and features (H, K, 6), of arrays (L, H, ..., 6)."""
-    return rows.swapaxes(0, 1).reshape(rows.shape[1], -1, 6)
+    curvature = J.swapaxes(2, 3) @ (drawn[..., None, None] * at.J).reshape(L, H, 2 * n, 6)
+    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature.sum(axis=0))
 
 
 def _pair_terms(
     at: Projected, over: Overlaps, variances: Floats, tops: Floats
 ) -> tuple[Floats, Floats]:
     """⟨h, ∂h⟩ (L, H, 6) and ⟨∂h, ∂hᵀ⟩ (L, H, 6, 6)."""
-    L, H, n = at.weights.shape
     v = variances[..., None]
-    weighted = (at.J * at.weights[..., None, None]).reshape(L, H, 2 * n, 6)
-    gram = weighted.swapaxes(2, 3) @ weighted * (tops / variances)[..., None, None]
-    i, j = over.pairs[:, 0], over.pairs[:, 1]
-    J_i, J_j = at.J[:, :, i], at.J[:, :, j]
-    along_i, along_j = ((over.away[..., None] * each).sum(axis=3) for each in (J_i, J_j))
-    scaled = over.bells[..., None] / v[..., None]
-    half = -(scaled * (along_i - along_j)).sum(axis=2)
-    cross = _gram(scaled[..., None] * J_i, J_j)
-    cross -= (scaled / v[..., None] * along_i).swapaxes(2, 3) @ along_j
+    own = at.J * at.weights[..., None, None]
+    gram = _gram(own, own) * (tops / variances)[..., None, None]
+    J_i, J_j = at.J[:, :, over.pairs[:, 0]], at.J[:, :, over.pairs[:, 1]]
+    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", over.away, each) for each in (J_i, J_j))
+    scaled = over.bells / v
+    half = -(scaled[:, :, None] @ (along_i - along_j))[:, :, 0]
+    cross = _gram(scaled[..., None, None] * J_i, J_j)
+    cross -= ((scaled / v)[..., None] * along_i).swapaxes(2, 3) @ along_j
     return half, gram + cross + cross.swapaxes(2, 3)
 
 

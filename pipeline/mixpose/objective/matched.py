@@ -21,33 +21,25 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
-from mixpose.density.atlas import REACH
 from mixpose.objective.base import Quadratic, View
-from mixpose.objective.kernel import Matched, Overlaps, Slopes, inner_products, overlaps, slopes
+from mixpose.objective.kernel import Overlaps, Slopes, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, Projected, project_body
 
 Floats: TypeAlias = NDArray[np.float64]
 
-STEPS_PER_SIGMA = 3.0
-"""Cells per standard deviation of C: places are 5e-4 standard deviations off at most."""
-
-LAST_STEPS = 5.0
-"""The same at σ_ε, where estimates end: places are 4e-4 standard deviations off at most, a part of
+STEPS_PER_SIGMA = 4.0
+"""Cells per standard deviation of C: places are 4e-4 standard deviations off at most, a part of
 what the best centres of blobs err by."""
 
-FINE_STEPS = 8.0
-"""The same where grey values are judged, which have no detection noise."""
-
-ZOOM_STEPS, ZOOM = 256.0, 0.0625
-"""The same for the last digits, and how far around features, in standard deviations of C: where
-features overlap, gradients are looked up beside their zeros and err by the square of a cell."""
+FINE_STEPS = 48.0
+"""The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
 
 def look_up_error(steps_per_sigma: float) -> float:
-    """Of a height, what looking it up linearly errs by along one axis: 1/8n²."""
-    return 1 / (8 * steps_per_sigma**2)
+    """Of a height, what looking it up errs by along an axis: √3/216 n⁻³ of the third derivative."""
+    return 0.011 / steps_per_sigma**3
 
 
 def value_error(steps_per_sigma: float) -> float:
@@ -98,18 +90,20 @@ class MatchedObjective:
         """
         parts = []
         for some in self._blocks(poses):
-            at, _, matched, _ = self.match(some)
-            norm = matched.norm
+            at, sampled, over = self.match(some)
+            norm = over.norm
             if whole:
                 hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
                 norm = norm + self.tops * (hidden**2).sum(axis=2)
-            parts.append(self.weights / self.energies * matched.product**2 / norm)
+            product = (sampled[..., 0] * at.weights).sum(axis=2)
+            parts.append(self.weights / self.energies * product**2 / norm)
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
 
-    def match(self, poses: Floats) -> tuple[Projected, Floats, Matched, Overlaps]:
-        """The predicted features at poses (H, 4, 4), C at them, and the inner products."""
-        at, sampled, over = self._predicted(poses)
-        return at, sampled, inner_products(sampled[..., 0] * at.weights, over), over
+    def match(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
+        """The predicted features at poses (H, 4, 4), C with its gradient there, and ⟨h, h⟩."""
+        at = self.projection.project(poses)
+        sampled = self.atlas.look_up(at.y)
+        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
@@ -118,13 +112,8 @@ class MatchedObjective:
         parts = [self._slopes(some) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _predicted(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
-        at = self.projection.project(poses)
-        sampled = self.atlas.look_up(at.y)
-        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
-
     def _slopes(self, poses: Floats) -> Slopes:
-        at, sampled, over = self._predicted(poses)
+        at, sampled, over = self.match(poses)
         scales = self.weights / self.energies
         return slopes(at, sampled, over, self.variances, self.tops, scales)
 
@@ -139,21 +128,36 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
-def steps_at(view: View, sigma: float) -> float:
-    """Cells per standard deviation with which a sensor's density is drawn at a blur."""
-    if sigma > view.observation.sigma:
-        return STEPS_PER_SIGMA
-    return LAST_STEPS if view.observation.cell is None else FINE_STEPS
+@dataclass(frozen=True, eq=False)
+class SharedDensities:
+    """C of all sensors at σ_ε, drawn once for several bodies.
+
+    Attributes
+    ----------
+    atlas : Atlas
+    totals : tuple of float
+        Weight of all that was drawn, per sensor.
+    """
+
+    atlas: Atlas
+    totals: tuple[float, ...]
+
+    @classmethod
+    def drawn(cls, views: Sequence[View]) -> SharedDensities:
+        """Draw views of detections, none of which is empty."""
+        observations = [view.observation for view in views]
+        sigmas = [one.sigma for one in observations]
+        totals = tuple(one.weight for one in observations)
+        return cls(matched_atlas(observations, sigmas, STEPS_PER_SIGMA), totals)
 
 
 def matched_objective(
     views: Sequence[View],
     body: Body,
     sigmas: Sequence[float],
-    near: Floats | None = None,
     *,
-    steps_per_sigma: float = STEPS_PER_SIGMA,
-    around: float = REACH,
+    steps_per_sigma: float | None = None,
+    shared: SharedDensities | None = None,
 ) -> MatchedObjective:
     """Build the matched objective at given blurs.
 
@@ -164,30 +168,36 @@ def matched_objective(
     body : Body
     sigmas : sequence of float
         Standard deviation of a feature at this level, per view, in sensor units.
-    near : (4, 4) array or None
-        Densities are wanted only around the projection of this pose; None: anywhere.
-    steps_per_sigma : float
-        Cells per standard deviation of C.
-    around : float
-        Standard deviations of C about the projection within which grey values are drawn.
+    steps_per_sigma : float or None
+        Cells per standard deviation of C; None: fine for grey values at σ_ε.
+    shared : SharedDensities or None
+        Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
+        own detections, and others only where they are out of its reach.
     """
+    if steps_per_sigma is None:
+        at_last = all(
+            view.observation.cell is not None and sigma <= view.observation.sigma
+            for view, sigma in zip(views, sigmas, strict=True)
+        )
+        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
-    places: list[Floats | None] = [None] * len(views)
-    if near is not None:
-        at = projection.project(near[None])
-        dimensions = projection.dimensions.tolist()
-        places = [y[0][seen[0]][:, :m] for y, seen, m in zip(at.y, at.seen, dimensions)]
     energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
     variances = 2 * np.square(sigmas)
     tops = np.array([peak(v, m) for v, m in zip(variances, projection.dimensions)])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
+    if shared is None:
+        atlas = matched_atlas(observations, sigmas, steps_per_sigma)
+    else:
+        atlas = shared.atlas
+        parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
+        energies = energies * np.square(parts)
     return MatchedObjective(
         views=tuple(views),
         projection=projection,
-        atlas=matched_atlas(observations, sigmas, steps_per_sigma, places, around),
+        atlas=atlas,
         variances=variances[:, None],
         tops=tops[:, None],
         energies=energies[:, None],

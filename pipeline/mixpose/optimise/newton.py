@@ -62,12 +62,16 @@ class NewtonOptions:
         Relative error of values, as from interpolation.  Gains below it cannot be seen in the
         value; there a step is good when less gain is left after it: the zero of the gradient is
         sought, which interpolation does not move.
+    remaining : float
+        The step that is expected to leave less than this share of the value to be gained is the
+        last, too: gains shrink by about the same factor from step to step.
     """
 
     iterations: int = 30
     tolerance: float = 1e-12
     damping: float = 1e-4
     value_error: float = 0.0
+    remaining: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -118,17 +122,20 @@ def ascend(
     inner = None if free.all() else _Inner(free, np.ix_(free, free))
     state, here, damping = start, at_start or model(start), options.damping
     step, gain = _step(here, inner, damping)
+    before = 0.0
     for iteration in range(1, options.iterations):
-        if gain <= options.tolerance * abs(here.value):
+        size = abs(here.value)
+        if gain <= options.tolerance * size or gain**2 <= options.remaining * size * before:
             # so near, the model is right: its last step is taken unseen
             return Ascent(move(state, step), here.value + gain, True, iteration)
         candidate = move(state, step)
         there = model(candidate)
         next_damping = max(damping / 10, 1e-9)
         next_step, next_gain = _step(there, inner, next_damping)
-        close = gain <= options.value_error * abs(here.value)
+        close = gain <= options.value_error * size
         if there.value > here.value or (close and next_gain < gain):
-            state, here, damping, step, gain = candidate, there, next_damping, next_step, next_gain
+            before, gain, step = gain, next_gain, next_step
+            state, here, damping = candidate, there, next_damping
             continue
         damping = max(10 * damping, _HELD_BACK)
         if damping > _STUCK:

@@ -112,14 +112,14 @@ def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
     expected = finding.expectation
     if expected is None:
         return lines + _about_number(finding, body, scene)
-    lines += _about_missing(finding, expected, image, scene)
+    lines += _about_missing(finding, expected, image, scene, body)
     if options.method == "blobs":
         lines += _about_extra(finding, expected, image, scene)
     return lines
 
 
 def _about_missing(
-    finding: Finding, expected: Expectation, image: Image, scene: Foreground
+    finding: Finding, expected: Expectation, image: Image, scene: Foreground, body: Body
 ) -> list[str]:
     """Why expected features were not met, and what would find them."""
     options = finding.setup.extract
@@ -128,27 +128,28 @@ def _about_missing(
     lines = []
     if found := missing["nothing"]:
         lines.append(
-            f"not met and dark there: {_some(found)}; hidden, out of light, or the pose is wrong"
+            f"not met and dark there: {_some(found, body)}; hidden, out of light, or the pose is "
+            "wrong"
         )
     if found := missing["faint"]:
         level = _between(min(found.values()), raw)
         lines.append(
-            f"not met, fainter than the threshold: {_some(found)}; "
+            f"not met, fainter than the threshold: {_some(found, body)}; "
             f"{_looser(options, level, raw, image)}"
         )
     if found := missing["small"]:
         lines.append(
-            f"not met, too small: {_some(found)}; lower min_area = {options.min_area:g} to "
+            f"not met, too small: {_some(found, body)}; lower min_area = {options.min_area:g} to "
             f"{min(found.values()):g}, or {_direction(options, lower=True)}"
         )
     if found := missing["large"]:
         lines.append(
-            f"not met, too large: {_some(found)}; raise max_area = {options.max_area:g} to "
+            f"not met, too large: {_some(found, body)}; raise max_area = {options.max_area:g} to "
             f"{max(found.values()):g}"
         )
     if found := missing["other"]:
         lines.append(
-            f"not met though bright there: {_some(found)}; they run into something else, are "
+            f"not met though bright there: {_some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
             f"{_direction(options, lower=False)}"
         )
@@ -256,7 +257,7 @@ def _about_others(finding: Finding, body: Body) -> list[str]:
     else:
         lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
         few, many = bool(lost), bool(expected.unexplained.any())
-        missing = f"not met: {_some(lost)}" if lost else ""
+        missing = f"not met: {_some(lost, body)}" if lost else ""
         extra = f"{int(expected.unexplained.sum())} found belong to no feature"
     lower = raised = f"{options.method} does not tell them"
     if options.method in ("corners", "log"):
@@ -284,7 +285,8 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
         return lines
     lost = np.flatnonzero(expected.seen & ~expected.met).tolist()
     if lost:
-        lines.append(f"not met: {_some(lost)}; not in the table, or farther off than sigma allows")
+        names = _some(lost, body)
+        lines.append(f"not met: {names}; not in the table, or farther off than sigma allows")
     extra = int(expected.unexplained.sum())
     if extra:
         lines.append(f"{extra} in the table belong to no feature; clutter is allowed for")
@@ -364,9 +366,9 @@ def _direction(options: ExtractOptions, *, lower: bool) -> str:
     return f"{'lower' if down else 'raise'} threshold = {now:g}"
 
 
-def _some(features: Iterable[int]) -> str:
-    """Numbers of features, for people."""
+def _some(features: Iterable[int], body: Body) -> str:
+    """What features are called, for people."""
     features = list(features)
-    shown = ", ".join(str(i) for i in features[:_LISTED])
+    shown = ", ".join(body.labels[i] for i in features[:_LISTED])
     more = len(features) - _LISTED
     return f"feature{'s' * (len(features) != 1)} {shown}" + (f" and {more} more" * (more > 0))

@@ -13,7 +13,6 @@ from mixpose.body import Body
 from mixpose.density import AssociationRules
 from mixpose.judgement import Association, associate
 from mixpose.objective import View, matched_objective
-from mixpose.objective.matched import FINE_STEPS
 from mixpose.pictures.overlay import projected_features
 from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
@@ -153,7 +152,6 @@ def _association(view: View, body: Body, T: Floats) -> Association | None:
     """The pose against the sensor's density; None where the sensor has nothing of either."""
     if view.observation.is_empty:
         return None
-    sigmas = [view.observation.sigma]
-    objective = matched_objective([view], body, sigmas, T, steps_per_sigma=FINE_STEPS)
+    objective = matched_objective([view], body, [view.observation.sigma])
     found = associate(objective, T, AssociationRules())[0][0]
     return found if len(found.features) else None

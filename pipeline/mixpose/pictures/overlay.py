@@ -195,7 +195,7 @@ def _draw_features(
         ring(picture, place, radius, colour)
         if len(body) <= _MOST_NUMBERS:
             beside = (place[0] + 1.2 * radius, place[1] - 0.9 * radius)
-            words(picture, str(i), beside, colour, size=0.8)
+            words(picture, body.labels[i], beside, colour, size=0.8)
 
 
 def mark_radius(picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part) -> float:

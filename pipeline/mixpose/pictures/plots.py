@@ -203,7 +203,7 @@ def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate)
         axes.errorbar(
             r, 1.08, xerr=spread[i], fmt="v", ms=5, color=_EXPECTED, capsize=2, label=label
         )
-        axes.text(r, 1.2, str(i), color=_EXPECTED, ha="center", fontsize=8)
+        axes.text(r, 1.2, body.labels[i], color=_EXPECTED, ha="center", fontsize=8)
 
 
 def _span(finding: Finding) -> tuple[float, float]:

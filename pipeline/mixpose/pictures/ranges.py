@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -79,7 +80,9 @@ def draw_ranges(
     if T_world_object is not None:
         colour = STATUS_COLOURS[status or "ok"]
         spread = half_widths_95(sensor, body, T_world_object, covariance)
-        _draw_expected(picture, across(expected), spread * width / (high - low), colour)
+        _draw_expected(
+            picture, across(expected), spread * width / (high - low), body.labels, colour
+        )
     return picture
 
 
@@ -150,8 +153,10 @@ def _draw_bar(picture: Picture, u: float, top: float, base: float, colour: Colou
     polyline(picture, np.array([[u, top * height], [u, base * height]]), colour, width=2)
 
 
-def _draw_expected(picture: Picture, places: Floats, spread: Floats, colour: Colour) -> None:
-    """Triangles that point at the expected ranges, numbers above, and 95 % where wide enough."""
+def _draw_expected(
+    picture: Picture, places: Floats, spread: Floats, labels: Sequence[str], colour: Colour
+) -> None:
+    """Triangles that point at the expected ranges, names above, and 95 % where wide enough."""
     height = picture.shape[0]
     tip, half = (_TOP - 0.02) * height, 5.0 * stroke(picture)
     previous = -np.inf
@@ -165,5 +170,5 @@ def _draw_expected(picture: Picture, places: Floats, spread: Floats, colour: Col
             ends = np.array([[u - spread[i], tip], [u + spread[i], tip]])
             polyline(picture, ends, WHITE)
         if u - previous > 3 * half:  # else numbers would lie upon each other
-            words(picture, str(i), (u - 4, tip - 2.2 * half), colour, size=0.8)
+            words(picture, labels[i], (u - 4, tip - 2.2 * half), colour, size=0.8)
             previous = u

@@ -15,7 +15,6 @@ from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.objective.base import region_of_interest
-from mixpose.objective.matched import steps_at
 from mixpose.pictures.canvas import (
     WHITE,
     Colour,
@@ -111,8 +110,7 @@ def densities_picture(
     part, size = _fitted(box, room)
     panels = []
     for sigma in sigmas:
-        steps = steps_at(view, sigma)
-        drawn = matched_objective([view], body, [sigma], T, steps_per_sigma=steps)
+        drawn = matched_objective([view], body, [sigma])
         values = _sampled(drawn, sigma, part, size)
         share = np.clip(values / max(float(values.max()), 1e-30), 0, 1)
         grey = np.round(255 * np.sqrt(share)).astype(np.uint8)

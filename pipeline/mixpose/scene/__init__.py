@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
-from mixpose.scene.scene import Member, Outcome, Scene
+from mixpose.scene.members import Member
+from mixpose.scene.rules import SceneRules
+from mixpose.scene.scene import Outcome, Scene
 
-__all__ = ["Member", "Outcome", "Scene"]
+__all__ = ["Member", "Outcome", "Scene", "SceneRules"]

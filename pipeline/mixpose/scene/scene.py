@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from mixpose.judgement import Judged, Verdict
 from mixpose.objective import View
-from mixpose.records import Estimate, label_of
-from mixpose.tracking import Track, Tracker
-
-
-@dataclass(frozen=True)
-class Member:
-    """One body of a scene.
-
-    Attributes
-    ----------
-    tracker : Tracker
-    instance : int or None
-        Which of identical ones; None where there is one only.
-    """
-
-    tracker: Tracker
-    instance: int | None = None
-
-    @property
-    def label(self) -> str:
-        """The body in one word."""
-        return label_of(self.tracker.body.name, self.instance)
+from mixpose.records import Estimate
+from mixpose.scene.identity import identify
+from mixpose.scene.joint import Joint
+from mixpose.scene.members import Member, groups
+from mixpose.scene.rules import SceneRules
+from mixpose.tracking import Track
+from mixpose.tracking.likelihood import FrameData
 
 
 class Outcome(NamedTuple):
@@ -43,6 +29,7 @@ class Scene:
     """All bodies that one recording shows, in the order of their pose lines."""
 
     members: tuple[Member, ...]
+    rules: SceneRules = SceneRules()
 
     def begin(self) -> tuple[Track, ...]:
         """The tracks before the first frame."""
@@ -62,8 +49,75 @@ class Scene:
         views : sequence of View
             All sensors with a frame.
         """
-        outcomes = []
-        for member, track in zip(self.members, tracks, strict=True):
+        if len(self.members) == 1:
+            member, track = self.members[0], tracks[0]
             after, estimate = member.tracker.advance(track, frame, time_s, views)
-            outcomes.append(Outcome(after, replace(estimate, instance=member.instance)))
-        return outcomes
+            return [Outcome(after, replace(estimate, instance=member.instance))]
+        joint = Joint(self.members, tracks, frame, time_s, views, self.rules)
+        joint.solve()
+        found = [self._decided(k, joint.data[k], joint.ranked[k]) for k in range(len(self.members))]
+        for group in groups(self.members):
+            self._identify(group, found, joint.data)
+        return [
+            self._outcome(k, found[k], joint.data[k], frame, time_s, views)
+            for k in range(len(self.members))
+        ]
+
+    def _decided(self, k: int, data: FrameData, ranked: Sequence[Judged]) -> Decided:
+        return Decided(self.members[k].tracker.verdict(data, ranked), ranked)
+
+    def _identify(
+        self, group: Sequence[int], found: list[Decided], data: Mapping[int, FrameData]
+    ) -> None:
+        """Give the poses of identical bodies to those that they belong to, with doubts."""
+        poses = {
+            k: found[k].verdict.best.T_world_object  # type: ignore[union-attr]
+            for k in group
+            if found[k].verdict.best is not None
+        }
+        rules = self.members[group[0]].tracker.rules.acceptance
+        told = identify(group, poses, data, rules.rival, self.rules.forgotten)
+        by_finder = {k: found[k] for k in group}
+        spare = [by_finder[k] for k in group if k not in told.poses.values()]
+        for k in group:
+            found[k] = by_finder[told.poses[k]] if k in told.poses else spare.pop(0)
+        for k, rivals in told.exchanged.items():
+            others = [(by_finder[finder].verdict.best, odds) for finder, odds in rivals]
+            found[k] = found[k].doubted([(one, odds) for one, odds in others if one is not None])
+
+    def _outcome(
+        self,
+        k: int,
+        found: Decided,
+        data: FrameData,
+        frame: int,
+        time_s: float | None,
+        views: Sequence[View],
+    ) -> Outcome:
+        member, tracker = self.members[k], self.members[k].tracker
+        told = found.told or found.verdict
+        estimate = tracker.estimate(frame, time_s, views, told, found.ranked)
+        after = tracker.followed(data, frame, time_s, found.verdict)
+        after = replace(after, doubted=found.verdict.status != "ok")
+        return Outcome(after, replace(estimate, instance=member.instance))
+
+
+class Decided(NamedTuple):
+    """A body's verdict by itself; what is told of it where others cast doubt; all its poses."""
+
+    verdict: Verdict
+    ranked: Sequence[Judged]
+    told: Verdict | None = None
+
+    def doubted(self, rivals: Sequence[tuple[Judged, float]]) -> Decided:
+        """The same, told to be ambiguous with poses that it may have instead, and their odds."""
+        best = self.verdict.best
+        if best is None:
+            return self
+        # odds that it has none, as its pose is another's, stand beside the poses
+        total = sum(weight for _, weight in self.verdict.kept) + sum(odds for _, odds in rivals)
+        kept = [*self.verdict.kept, *((one, odds) for one, odds in rivals if one is not best)]
+        kept = [(one, weight / total) for one, weight in kept]
+        first = next(pair for pair in kept if pair[0] is best)
+        kept = [first, *sorted((p for p in kept if p is not first), key=lambda p: -p[1])]
+        return self._replace(told=Verdict("ambiguous", best, kept))

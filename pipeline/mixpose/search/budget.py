@@ -95,9 +95,7 @@ class SearchBudget:
         32,
         "features by which guesses descend: the final plan takes all; 100/40 absent 2 times faster",
     )
-    survivors: tuple[int, ...] = constant(
-        (150, 150, 150), "guesses left after each blur of a plan; fewer lose 1 % of 5/1/5"
-    )
+    survivors: int = constant(150, "guesses left after each blur; fewer lose 1 % of 5/1/5")
     beyond_doubt: float = constant(
         8.0,
         "evidence in nats from which no other kind of guess is made: a frame is ok from 7; of 900 "
@@ -121,19 +119,15 @@ class SearchBudget:
         "power of that blur, steps and survivors of each stage: 3 ranges 6/0/0 99 of 100",
     )
     descent_plan: tuple[tuple[float, int], ...] = constant(
-        ((1.5, 2), (0.75, 1), (0.4, 2)),
-        "blurs in σ_ε and steps: clutter beside a feature draws less; from 3 on, 8/4/8 loses 1 %",
+        ((1.0, 2), (0.4, 2)),
+        "blurs in σ_ε and steps: clutter beside a feature draws less; one more at 1.5 finds no "
+        "more, and takes a quarter longer where two cameras see little else",
     )
     wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)),
         "the same where not all sensors are cameras",
     )
-    final_plan: tuple[tuple[float, int], ...] = constant(
-        ((1.0, 2),), "the same for the best, where detections err by as much as σ_ε"
-    )
-    finalists: int = constant(
-        16, "poses refined by the final plan, and rivals of a pose beyond doubt"
-    )
+    finalists: int = constant(16, "guesses refined as rivals of a pose beyond doubt")
     improvement: float = constant(1.1, "factor in detections explained for another such look")
     checked: int = constant(3, "guesses refined at once to see whether others are needed")
     descent: DescentOptions = DescentOptions()
@@ -144,5 +138,14 @@ class SearchBudget:
 THOROUGH = SearchBudget()
 """Everything is tried."""
 
-LIVE = SearchBudget(max_guesses=4000, chunk=1024, shortlist=16, min_shortlist=8, finalists=4)
-"""For each frame of a live stream: 4,000 guesses and the rest of the last batch."""
+LIVE = SearchBudget(
+    max_guesses=2500,
+    chunk=1024,
+    shortlist=8,
+    min_shortlist=6,
+    finalists=4,
+    max_rays=12,
+    subsample=6,
+    descent_features=16,
+)
+"""For each frame of a live stream: 2,500 guesses and the rest of the last batch."""

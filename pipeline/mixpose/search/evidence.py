@@ -27,8 +27,8 @@ def evidence(
     poses: Floats,
     free: NDArray[np.bool_],
     gate: float,
-) -> Floats:
-    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count.
+) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses against clutter, paid by count, and shares (H,) of the body met.
 
     Parameters
     ----------
@@ -41,16 +41,18 @@ def evidence(
         Within which a detection is met, in σ_ε.
     """
     sightings = [_sighting(one, body, poses, gate) for one in detections if len(one.points)]
-    squares, coordinates = np.zeros((2, len(poses)))
+    squares, coordinates, met = np.zeros((3, len(poses)))
     for one in sightings:
         squares += (one.offsets**2).sum(axis=(1, 2))
-        coordinates += one.offsets.shape[2] * one.shares.sum(axis=1)
+        found = one.shares.sum(axis=1)
+        coordinates += one.offsets.shape[2] * found
+        met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(sightings)
     spare = np.maximum(coordinates - free.sum(), 0.0)
     degrees = _NOISE.typical_degrees
     variance = degrees * _NOISE.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
     odds = odds_of(sightings, variance, 2 * body.radius, _DETECTION)
-    return paid_by_count(odds, sightings, free)
+    return paid_by_count(odds, sightings, free), met
 
 
 def _sighting(seen: SensorDetections, body: Body, poses: Floats, gate: float) -> Sighting:

@@ -122,16 +122,19 @@ def _places(point: Floats, near: _NearRays, distances: Floats, i: int) -> _Place
 
 def _agreeing(places: _Places, distances: Floats, most: int) -> tuple[Indices, Indices]:
     """Pairs of places of two features and two rays that are best the right distance apart."""
-    x = places.points
-    squares = (x * x).sum(axis=1)
-    apart = np.sqrt(np.maximum(squares[:, None] + squares[None] - 2 * x @ x.T, 0.0))
-    wanted = distances[np.ix_(places.feature, places.feature)]
-    error = np.sqrt(0.5) * (places.error[:, None] + places.error[None])
-    off = np.abs(apart - wanted)
-    good = (off <= error) & (wanted > 0)
-    good &= places.ray[:, None] != places.ray[None]
-    a, b = np.nonzero(np.triu(good, 1))
+    x = (places.points - places.points[:1]).astype(np.float32)
+    squares, error = (x * x).sum(axis=1), (np.sqrt(0.5) * places.error).astype(np.float32)
+    off = -2 * x @ x.T
+    off += squares
+    off += squares[:, None]
+    np.sqrt(np.maximum(off, 0, out=off), out=off)
+    off -= distances.astype(np.float32)[np.ix_(places.feature, places.feature)]
+    np.abs(off, out=off)
+    off -= error
+    a, b = np.nonzero(off <= error[:, None])
+    apart = (a < b) & (places.ray[a] != places.ray[b]) & (places.feature[a] != places.feature[b])
+    a, b = a[apart], b[apart]
     if len(a) > most:
-        best = np.argpartition(off[a, b], most)[:most]
+        best = np.argpartition(off[a, b] + error[b], most)[:most]
         a, b = a[best], b[best]
     return a, b

@@ -18,17 +18,14 @@ class Candidate:
     Attributes
     ----------
     T_world_object : (4, 4) float64
-    score : float
-        Matched objective at the finest blur, summed over views, every detection counting alike:
-        (k/n)² per view with k of n features met exactly.
     evidence : float
-        What candidates are ranked by: logarithm of the odds that this is not chance; with
-        ranges among the sensors, the score.
+        What candidates are ranked by: logarithm of the odds that this is not chance; with ranges
+        among the sensors, the matched objective at the finest blur, summed over views, every
+        detection counting alike.
     """
 
     T_world_object: Floats
-    score: float
-    evidence: float = 0.0
+    evidence: float
 
 
 @dataclass(frozen=True)

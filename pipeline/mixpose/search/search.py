@@ -102,7 +102,7 @@ class _Run:
         if few is not body:
             self._quick_descent = Descent(detections, few, constraint.free, budget.descent)
         self._poses = np.zeros((0, 4, 4))
-        self._ranks = np.zeros(0)
+        self._ranks, self._met = np.zeros(0), np.zeros(0)
         self.report = SearchReport()
 
     def find(self, state: SearchState) -> SearchState:
@@ -118,8 +118,6 @@ class _Run:
         if slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
             self._keep(self._descended(self._shortlist(iter([slips]))))
-        best = np.argsort(-self._ranks, kind="stable")[: budget.finalists]
-        self._keep(self._refined(self._descent, self._poses[best], budget.final_plan))
         return after
 
     def _sharp(self, state: SearchState) -> SearchState:
@@ -160,22 +158,20 @@ class _Run:
         kept = first_of_each(
             self._body, self._poses, self._ranks, count, self._budget.descent.alike
         )
-        values = self._descent.objective().shares(self._poses[kept]).sum(axis=0)
-        return [
-            Candidate(self._poses[k], float(value), float(self._ranks[k]))
-            for k, value in zip(kept, values, strict=True)
-        ]
+        return [Candidate(self._poses[k], float(self._ranks[k])) for k in kept]
 
     def _keep(self, poses: Floats) -> None:
-        self._ranks = np.append(self._ranks, self._rank(poses))
+        ranks, met = self._judged(poses)
         self._poses = np.concatenate([self._poses, poses])
+        self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
 
-    def _rank(self, poses: Floats) -> Floats:
-        """Evidence where all sensors are cameras, else the score."""
+    def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Evidence where all sensors are cameras, else the score; and the share of the body met."""
         if self._by_evidence:
             free, gate = self._constraint.free, self._budget.gate
             return evidence(self._detections, self._body, poses, free, gate)
-        return np.asarray(self._descent.objective().shares(poses).sum(axis=0))
+        shares = self._descent.objective().shares(poses)
+        return shares.sum(axis=0), np.sqrt(shares).mean(axis=0)
 
     def _is_settled(self) -> bool:
         """Whether no other kind of guess is needed.
@@ -192,10 +188,7 @@ class _Run:
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
-        if not len(self._poses):
-            return 0.0
-        best = self._poses[self._ranks.argmax()]
-        return float(np.sqrt(self._descent.objective().shares(best[None])).mean())
+        return float(self._met[self._ranks.argmax()]) if len(self._ranks) else 0.0
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
@@ -206,11 +199,8 @@ class _Run:
     def _refined(
         self, descent: Descent, poses: Floats, plan: Sequence[tuple[float, int]]
     ) -> Floats:
-        count = len(self._detections)
-        stages = [
-            Stage((factor,) * count, steps, left)
-            for (factor, steps), left in zip(plan, self._budget.survivors)
-        ]
+        count, most = len(self._detections), self._budget.survivors
+        stages = [Stage((factor,) * count, steps, most) for factor, steps in plan]
         return descent.refine(poses, stages) if len(poses) else poses
 
     def _blunt(self) -> Floats:
@@ -266,7 +256,7 @@ class _Run:
         budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._rank(guesses).max() < 0:
+        if self._judged(guesses)[0].max() < 0:
             return False
         self._keep(self._descended(guesses))
         return self._ranks.max() > budget.beyond_doubt and self._is_settled()

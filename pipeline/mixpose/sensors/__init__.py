@@ -10,6 +10,7 @@ from mixpose.sensors.batch import SensorBatch, side_by_side
 from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
+from mixpose.sensors.moving import Motion, RollingSensor, in_motion, moments
 from mixpose.sensors.parallel import ParallelBeam
 from mixpose.sensors.pinhole import PinholeCamera
 from mixpose.sensors.rays import Rays
@@ -25,12 +26,16 @@ __all__ = [
     "OUTSIDE",
     "SENSOR_MODELS",
     "FisheyeCamera",
+    "Motion",
     "ParallelBeam",
     "PinholeCamera",
     "RangeSensor",
     "Rays",
+    "RollingSensor",
     "Sensor",
     "SensorBatch",
     "facing",
+    "in_motion",
+    "moments",
     "side_by_side",
 ]

@@ -82,17 +82,16 @@ class PinholeBatch:
     """Pinhole cameras without tilted sensors: one product projects the points into all."""
 
     def __init__(self, cameras: Sequence[PinholeCamera]) -> None:
-        T = np.array([camera.T_sensor_world for camera in cameras])
         self._count = len(cameras)
-        self._rows = T[:, :3, :3].reshape(-1, 3)
-        self._upper_rows, self._last_row = T[:, None, :2, :3], T[:, None, 2:3, :3]
-        self._t = T[:, :3, 3, None]
-        K = np.array([camera.camera_matrix for camera in cameras])
-        self._K = K[:, None, :2, :2]
-        self._K_transposed = K[:, :2, :2].swapaxes(1, 2).copy()
-        self._centre = K[:, None, :2, 2]
+        self._K = np.array([camera.camera_matrix for camera in cameras])
         self._middle, self._half = _images(cameras)
         self._lens = _lenses(cameras)
+        # straight to pixels, or to what lenses distort
+        P = np.array([camera.T_sensor_world for camera in cameras])[:, :3]
+        if self._lens is None:
+            P = self._K @ P
+        self._rows, self._t = P[..., :3].reshape(-1, 3), P[..., 3:]
+        self._upper_rows, self._last_row = P[:, None, :2, :3], P[:, None, 2:, :3]
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
         """As `SensorBatch.linearise`."""
@@ -103,25 +102,25 @@ class PinholeBatch:
         points += self._t
         depth = points[:, 2]
         in_front = depth > NEAREST
-        everything = np.count_nonzero(in_front) == in_front.size
-        inverse_depth = 1.0 / (depth if everything else np.where(in_front, depth, 1.0))
-        xy = (points[:, :2] * inverse_depth[:, None]).swapaxes(1, 2)
-        M = self._K * inverse_depth[..., None, None]
+        if np.count_nonzero(in_front) < in_front.size:
+            depth = np.where(in_front, depth, 1.0)
+        inverse_depth = 1.0 / depth
+        y = (points[:, :2] * inverse_depth[:, None]).swapaxes(1, 2)
         lens = self._lens
-        ideal = xy
         if lens is not None:
-            in_front &= (xy * xy).sum(axis=2) < lens.radius_limit**2
+            in_front &= (y * y).sum(axis=2) < lens.radius_limit**2
             # polynomials of huge radii overflow; hidden points are overwritten anyway
-            ideal = np.where(in_front[..., None], xy, 0.0)
-            xy = lens.apply(ideal)
-            M = M @ lens.derivative(ideal)
-        y = xy @ self._K_transposed
-        y += self._centre
-        J = M @ (self._upper_rows - ideal[..., None] * self._last_row)
+            y = np.where(in_front[..., None], y, 0.0)
+        J = self._upper_rows - y[..., None] * self._last_row
+        J *= inverse_depth[..., None, None]
+        if lens is not None:
+            K = self._K[:, None, :2, :2]
+            J = K @ lens.derivative(y) @ J
+            y = (K @ lens.apply(y)[..., None])[..., 0] + self._K[:, None, :2, 2]
         inside = np.abs(y - self._middle) <= self._half
         if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
             return y, J, in_front
-        return _hidden(y, J, in_front & inside.all(axis=2))
+        return _hidden(np.ascontiguousarray(y), J, in_front & inside.all(axis=2))
 
 
 def _hidden(y: Floats, J: Floats, visible: Mask) -> tuple[Floats, Floats, Mask]:

@@ -7,6 +7,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from mixpose.limits import MOST_PIXELS
 from mixpose.rigid import Floats
 from mixpose.session.messages import BadKeyError, found
 
@@ -83,5 +84,9 @@ def resolution(value: Any) -> tuple[int, int]:
     match value:
         case [int(width), int(height)] if not any(isinstance(n, bool) for n in value):
             if 0 < width <= _WIDEST and 0 < height <= _WIDEST:
-                return width, height
+                if width * height <= MOST_PIXELS:
+                    return width, height
+                raise BadKeyError(
+                    f"found {width} x {height} pixels; allowed: at most {MOST_PIXELS} together"
+                )
     raise BadKeyError(found(value, RESOLUTION_FORM))

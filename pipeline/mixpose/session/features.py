@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
+from mixpose.body.features import SEGMENT_NODES
+from mixpose.limits import MOST_FEATURES
 from mixpose.rigid import Floats
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.marker_files import read_marker_file
@@ -42,6 +44,13 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     points = np.zeros((0, 3)) if markers is None else markers.points
     segments = np.zeros((0, 2, 3)) if table.segments is None else table.segments
     count = len(points) + len(segments)
+    nodes = len(points) + SEGMENT_NODES * len(segments)
+    if nodes > MOST_FEATURES:
+        raise BadKeyError(
+            f"found {len(points)} points and {len(segments)} segments; allowed: {MOST_FEATURES} "
+            f"together, a segment counting as {SEGMENT_NODES}",
+            "file" if table.file is not None else "points",
+        )
     if count < FEWEST_FEATURES:
         key = "file" if table.file is not None else "points"
         if table.segments is not None:
@@ -70,7 +79,16 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
         features.append(SegmentFeature(a, b, C, kind))
     normals = _normals(_stated_normals(table, markers, count), count)
     radii = _radii(table, normals, len(points), count)
-    return Body(table.name, tuple(features), normals, _gravity(table), table.shape, radii)
+    gravity, names = _gravity(table), _names(markers)
+    return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names)
+
+
+def _names(markers: Markers | None) -> tuple[str, ...]:
+    """What people call the points; nothing where some have no name, or two the same."""
+    if markers is None:
+        return ()
+    names = tuple(" ".join(name.split()) for name in markers.names)
+    return names if all(names) and len({*names}) == len(names) == len(markers.points) else ()
 
 
 def _radii(table: ObjectTable, normals: Floats | None, points: int, count: int) -> Floats | None:

@@ -9,8 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.fit import EstimatorOptions
+from mixpose.limits import MOST_SAMPLES
 from mixpose.rigid import TWIST_NAMES
 from mixpose.session.features import build_body
 from mixpose.session.messages import BadKeyError, one_line, one_of, under
@@ -22,7 +24,7 @@ from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.validation import validate
 
 
-def load_session(path: str | Path) -> Session:
+def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read a session file and the calibration and marker files that it names.
 
     Recordings are not opened.
@@ -31,6 +33,9 @@ def load_session(path: str | Path) -> Session:
     ----------
     path : str or Path
         A TOML file; paths in it are relative to it.
+    allow_code : bool
+        Whether functions that the file names (``method = "module:function"``) may be run when
+        features are extracted; reading a session runs none.
 
     Returns
     -------
@@ -48,7 +53,8 @@ def load_session(path: str | Path) -> Session:
     try:
         content = read_bytes(path)
         data = _parse(as_text(content))
-        return _build(path, hashlib.sha256(content).hexdigest(), data)
+        session = _build(path, hashlib.sha256(content).hexdigest(), data)
+        return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
         raise SessionError(one_line(path, problem.key, problem.text, data)) from problem
     except RecursionError as error:
@@ -69,6 +75,7 @@ def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:
     objects = _objects(table, path.parent)
     with under("estimator"):
         estimator = _estimator(table.estimator, objects)
+    _check_samples(estimator.samples, [one.body for one in objects])
     return Session(
         path=path,
         sha256=sha256,
@@ -125,6 +132,18 @@ def _start(table: StartTable | None) -> Start | None:
             "T_world_object",
         )
     return Start(T_world_object, table.rotation_deg, table.distance)
+
+
+def _check_samples(samples: int, bodies: Sequence[Body]) -> None:
+    """See that the samples of all features fit into memory."""
+    for body in bodies:
+        if not body.is_exact and len(body) * samples > MOST_SAMPLES:
+            raise BadKeyError(
+                f"found {samples} for {len(body)} features of {body.name}; allowed: "
+                f"{MOST_SAMPLES} together",
+                "estimator",
+                "samples",
+            )
 
 
 def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> EstimatorOptions:

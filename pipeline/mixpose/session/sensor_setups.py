@@ -64,6 +64,13 @@ def build_sensors(
                     "name",
                 )
             setups.append(_build_sensor(table, defaults, folder, unit))
+    if all(setup.delay == "estimate" for setup in setups):
+        with under("sensor", len(setups) - 1):
+            raise BadKeyError(
+                'found "estimate" for every sensor; allowed: for all but one, as delays are known '
+                "against another sensor only",
+                "delay",
+            )
     return tuple(setups)
 
 
@@ -119,6 +126,8 @@ def _build_sensor(
             _check_profile(table)
             # the far end of a profile is known only when its bins are counted
             sensor = RangeSensor(table.position, table.range_bias)
+    if getattr(table, "readout", 0.0) and resolution is None:
+        raise BadKeyError("stands without resolution; allowed: with [width, height]", "readout")
     with under("extract"):
         extract = merge_extract(defaults, table.extract)
         _check_widths(extract, table)

@@ -133,6 +133,8 @@ class Session:
     estimator : EstimatorOptions
     sensors : tuple of SensorSetup
         In the order of the file, at least one.
+    allow_code : bool
+        Whether functions that the file names may be run.
     count : int
         How many there are of the first body.
     others : tuple of ObjectSetup
@@ -146,6 +148,7 @@ class Session:
     start: Start | None
     estimator: EstimatorOptions
     sensors: tuple[SensorSetup, ...]
+    allow_code: bool = False
     count: int = 1
     others: tuple[ObjectSetup, ...] = ()
 

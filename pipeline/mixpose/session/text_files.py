@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mixpose.limits import MOST_BYTES
 from mixpose.session.messages import BadKeyError
 
 
@@ -13,16 +14,23 @@ def read_bytes(path: Path) -> bytes:
     Raises
     ------
     BadKeyError
-        If there is no such file or it cannot be read.
+        If there is no such file, it is larger than any session needs, or it cannot be read.
     """
     try:
-        return path.read_bytes()
+        is_other = path.exists() and not path.is_file()
+        size = path.stat().st_size
+        content = path.read_bytes() if not is_other and size <= MOST_BYTES else b""
     except FileNotFoundError as error:
         raise BadKeyError(f"no such file: {path}") from error
     except OSError as error:
         raise BadKeyError(f"cannot read {path}: {error.strerror or error}") from error
     except ValueError as error:  # a zero byte in the name
         raise BadKeyError(f"not a file name: {str(path)!r}") from error
+    if is_other:
+        raise BadKeyError(f"cannot read {path}: found no file; allowed: no folder, pipe or device")
+    if size > MOST_BYTES:
+        raise BadKeyError(f"{path} has {size} bytes; allowed: at most {MOST_BYTES}")
+    return content
 
 
 def as_text(content: bytes) -> str:

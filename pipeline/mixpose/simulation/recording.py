@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from mixpose.rigid import from_rotation_vector, inverse
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import central_pose, pivot_of
 from mixpose.simulation.channels import Channel, check_setup, plan_channel
+from mixpose.simulation.companions import Companion, moved, plan_companions
 from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.naming import plan_files
@@ -47,6 +48,7 @@ class _Plan:
     fps: float
     motion: Motion
     channels: tuple[Channel, ...]
+    companions: tuple[Companion, ...] = ()
 
 
 def simulate(
@@ -104,6 +106,9 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         setups = _as_they_stand(session.sensors, options)
         cameras = [setup.sensor for setup in setups if setup.sensor.dimension == 2]
         scenery = plan_scenery(session.body, motion, cameras, options)
+        companions = plan_companions(session, motion, options)
+        actors = (*(one.actor for one in companions), *scenery.actors)
+        scenery = replace(scenery, actors=actors)
         channels = tuple(
             plan_channel(
                 setup,
@@ -120,7 +125,7 @@ def _plan(session: Session, options: SimulationOptions) -> _Plan:
         )
     except SessionError as error:  # which key is known there, which file here
         raise SessionError(f"{session.path}: {error}") from error
-    return _Plan(session, options, copied, numbers, fps, motion, channels)
+    return _Plan(session, options, copied, numbers, fps, motion, channels, companions)
 
 
 def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -> list[float]:
@@ -134,7 +139,7 @@ def _steps(session: Session, kinds: Sequence[str], options: SimulationOptions) -
     last = max(len(session.sensors) - 1, 1)
     steps = []
     for i, (setup, kind) in enumerate(zip(session.sensors, kinds, strict=True)):
-        tells = setup.times is not None or kind == "detections"
+        tells = setup.times is not None or (kind == "detections" and setup.fps is None)
         if options.out_of_step and not tells:
             raise SessionError(
                 f"sensor {setup.name!r}: times: missing; sensors that are out of step need a table "
@@ -241,7 +246,8 @@ def _record(plan: _Plan, folder: Path, progress: Progress | None) -> None:
             moment = (number - plan.numbers[0]) / plan.fps
             T = np.round(plan.motion.poses(np.array(moment)), _DECIMALS) + 0.0
             if _record_frame(plan, writers, number, T, moment):
-                truth.write(_line(_pose(plan, number, T)))
+                for pose in _poses(plan, number, T, moved(plan.companions, moment, _DECIMALS)):
+                    truth.write(_line(pose))
             if progress is not None:
                 progress(done)
 
@@ -307,15 +313,21 @@ def _header(plan: _Plan) -> dict[str, Any]:
     }
 
 
-def _pose(plan: _Plan, number: int, T_world_object: Floats) -> dict[str, Any]:
-    return {
-        "type": "pose",
-        "frame": number,
-        "time_s": round(_time(plan, number), 6),
-        "object": plan.session.body.name,
-        "status": "ok",
-        "T_world_object": T_world_object.tolist(),
-    }
+def _poses(
+    plan: _Plan, number: int, T_first: Floats, others: Sequence[Floats]
+) -> Iterator[dict[str, Any]]:
+    """The lines of a frame, in the order of the session's bodies."""
+    names = [(one.body.name, i) for one in plan.session.objects for i in one.instances]
+    for (name, instance), T in zip(names, [T_first, *others], strict=True):
+        yield {
+            "type": "pose",
+            "frame": number,
+            "time_s": round(_time(plan, number), 6),
+            "object": name,
+            **({} if instance is None else {"instance": instance}),
+            "status": "ok",
+            "T_world_object": T.tolist(),
+        }
 
 
 def _line(values: dict[str, Any]) -> str:

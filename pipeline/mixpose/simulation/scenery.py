@@ -51,6 +51,8 @@ class Actor:
         Reflection of the world in which they are seen.
     is_image : bool
         Whether they are a mirror image of the body, and gone when it is.
+    is_body : bool
+        Whether they are another body of the session: solid, and hidden by others now and then.
     """
 
     body: Body
@@ -58,6 +60,7 @@ class Actor:
     levels: Floats
     mirror: Floats | None = None
     is_image: bool = False
+    is_body: bool = False
 
 
 @dataclass(frozen=True)

@@ -104,8 +104,10 @@ def _modules(session: Session) -> dict[str, Path]:
 
 def _places(data: dict[str, Any]) -> Iterator[_Place]:
     """Where a session file holds paths."""
-    if "file" in data["object"]:
-        yield data["object"], "file", "file", "object"
+    objects = data["object"] if isinstance(data["object"], list) else [data["object"]]
+    for one in objects:
+        if "file" in one:
+            yield one, "file", "file", "object" if len(objects) == 1 else one["name"]
     for sensor in data["sensor"]:
         name = sensor["name"]
         if isinstance(sensor.get("source"), list):

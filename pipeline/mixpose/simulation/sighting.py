@@ -6,7 +6,7 @@ are put in.  Images, profiles and tables of detections are all made from this.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body, SegmentFeature
 from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats
+from mixpose.rigid import transform
 from mixpose.sensors import Sensor
 from mixpose.sensors.base import Mask
 from mixpose.simulation.options import SimulationOptions
@@ -26,6 +27,7 @@ from mixpose.simulation.scenery import PoseAt, Scenery
 from mixpose.simulation.shutter import PoseAfter, Shutter
 
 _DIMMEST = 0.3  # of the mean brightness: a feature is never drawn dark
+_CORE = 0.45  # of a body's radius: what others are hidden behind
 _PIECES = 32  # in which a line's image is measured
 
 
@@ -131,6 +133,8 @@ def look(
     spots.owners += range(count, count + len(false))
     seen = facing(view.sensor, body, T_world_object) & ~_hidden(count, options, rng)
     seen &= not is_away
+    solid = _solid(view, body, T_world_object, time_s, is_away=is_away)
+    seen &= ~hidden_behind(view.sensor, transform(T_world_object, body.means), solid[1:])
     after = pose_after or (lambda _: T_world_object)
     for i in np.flatnonzero(seen).tolist():
         spots.add(view, body, i, i, after, view.levels[i], None if offsets is None else offsets[i])
@@ -139,12 +143,54 @@ def look(
             continue
         later = _later(actor.pose, time_s)
         faced = facing(view.sensor, actor.body, later(0.0), actor.mirror)
+        if actor.is_body:
+            T = later(0.0)
+            others = [one for one in solid if one[2] is not actor]
+            faced &= ~hidden_behind(view.sensor, transform(T, actor.body.means), others)
+            faced &= ~_hidden(len(actor.body), options, rng)
         for i in np.flatnonzero(faced).tolist():
             owner = count + len(false) + i
             spots.add(view, actor.body, i, owner, later, actor.levels[i], None, actor.mirror)
     late = time_s + view.shutter.late_s
     covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
     return spots.sighting(tuple(one for one in covers if len(one)))
+
+
+def _solid(
+    view: View, body: Body, T_world_object: Floats, time_s: float, *, is_away: bool
+) -> list[tuple[Floats, float, object]]:
+    """Cores of the session's bodies, the first one first: middle, radius, and whose it is.
+
+    A session of one body hides nothing behind it.
+    """
+    actors = [actor for actor in view.scenery.actors if actor.is_body]
+    if not actors:
+        return []
+    posed = [(body, T_world_object, None), *((a.body, a.pose(time_s), a) for a in actors)]
+    return [
+        (
+            transform(T, one.means.mean(axis=0)[None])[0],
+            0.0 if whose is None and is_away else _CORE * one.radius,
+            whose,
+        )
+        for one, T, whose in posed
+    ]
+
+
+def hidden_behind(
+    sensor: Sensor, points: Floats, others: Sequence[tuple[Floats, float, object]]
+) -> Mask:
+    """Which points (n, 3) the core of a body stands before."""
+    hidden = np.zeros(len(points), dtype=np.bool_)
+    towards = sensor.towards(points)
+    lengths = np.linalg.norm(towards, axis=1)
+    units = towards / lengths[:, None]
+    for middle, radius, _ in others:
+        arms = middle - points
+        along = (arms * units).sum(axis=1)
+        across = np.linalg.norm(arms - along[:, None] * units, axis=1)
+        hidden |= (across < radius) & (along > 0)
+    return hidden
 
 
 def _later(pose: PoseAt, time_s: float) -> PoseAfter:

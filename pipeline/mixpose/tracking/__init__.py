@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mixpose.tracking.delays import UNKNOWN_S
 from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.single_frame import estimate_pose
@@ -9,6 +10,7 @@ from mixpose.tracking.track import Prediction, Track, predict
 from mixpose.tracking.tracker import Tracker
 
 __all__ = [
+    "UNKNOWN_S",
     "Expectation",
     "Prediction",
     "Rules",

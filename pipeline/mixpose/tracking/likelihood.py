@@ -16,15 +16,33 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
-from mixpose.judgement import Judged, Prior, associate, flat_prior, judge, nearest_alike
-from mixpose.objective import MatchedObjective, View, matched_objective
-from mixpose.objective.matched import FINE_STEPS, LAST_STEPS
+from mixpose.judgement import (
+    Association,
+    Judged,
+    Prior,
+    associate,
+    flat_prior,
+    judge,
+    nearest_alike,
+)
+from mixpose.objective import (
+    MatchedObjective,
+    SharedDensities,
+    View,
+    matched_objective,
+    project_body,
+)
 from mixpose.records import SensorReport
+from mixpose.rigid import twist_between
 from mixpose.search import SearchState
+from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
+from mixpose.tracking.course import Expected, unknown
+from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion
+from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Prediction, Track, prior_of
+from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -76,7 +94,13 @@ class SearchLog:
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it; `log` is written by the proposer that searches."""
+    """A frame, and what is known before it.
+
+    `log` is written by the proposer that searches.  `elapsed` is the time since the last pose,
+    seconds, None where it is not known.  Where views see the body in motion as of the common time,
+    `still` is the frame with the sensors as they stand.
+    `shared` are the densities of a whole scene, where the views hold what is left for this body.
+    """
 
     views: Sequence[View]
     body: Body
@@ -87,7 +111,10 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    shared: SharedDensities | None = None
     log: SearchLog = field(default_factory=SearchLog)
+    elapsed: float | None = None
+    still: FrameData | None = None
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -106,31 +133,84 @@ class FrameData:
             self.rules.judgement.detection,
         )
 
-    def at_sigma(
-        self, near: Floats | None = None, *, narrowed: float = 1.0, fine: bool = False
-    ) -> MatchedObjective:
-        """The matched objective at σ_ε, or at a share of it."""
+    @cached_property
+    def finest(self) -> MatchedObjective:
+        """The matched objective at σ_ε."""
+        if self.still is not None:  # densities do not move with the sensors
+            views = tuple(self.views)
+            projection = project_body(tuple(view.sensor for view in views), self.body)
+            return replace(self.still.finest, views=views, projection=projection)
+        if self.shared is None:
+            return self.at_sigma()
+        sigmas = [view.observation.sigma for view in self.views]
+        return matched_objective(self.views, self.body, sigmas, shared=self.shared)
+
+    def at_sigma(self, *, narrowed: float = 1.0) -> MatchedObjective:
+        """The matched objective at a share of σ_ε."""
         sigmas = [narrowed * view.observation.sigma for view in self.views]
-        steps = FINE_STEPS if fine else LAST_STEPS
-        return matched_objective(self.views, self.body, sigmas, near, steps_per_sigma=steps)
+        return matched_objective(self.views, self.body, sigmas)
 
     def without(self, names: Mapping[str, str]) -> FrameData:
         """The frame without some sensors."""
         if not names:
             return self
         views = [view for view in self.views if view.name not in names]
-        return replace(self, views=views)
+        still = self.still.without(names) if self.still else None
+        return replace(self, views=views, still=still, shared=None)
 
-    @cached_property
-    def finest(self) -> MatchedObjective | None:
-        """The objective at σ_ε everywhere; None where it is drawn around a pose only."""
-        sparse = all(view.observation.is_sparse for view in self.views)
-        detected = any(view.observation.cell is None for view in self.views)
-        return self.at_sigma() if sparse and detected else None
+    def in_motion(self, motion: Motion) -> FrameData:
+        """The frame as of the common time, of a body that moves."""
+        still = self.still or self
+        return replace(still, views=seen_in_motion(still.views, motion), still=still)
 
-    def objective_near(self, T_world_object: Floats) -> MatchedObjective:
-        """The objective at σ_ε around a pose."""
-        return self.finest or self.at_sigma(T_world_object, fine=True)
+    def expected(self, T_world_object: Floats) -> Expected:
+        """The velocity that the frames before let expect of a pose."""
+        rules, track = self.rules, self.track
+        nothing = unknown(self.body.radius, rules.course)
+        if not self.elapsed or not track.branches or self.elapsed > rules.course.longest_s:
+            return nothing
+        course = nearest_branch(track, T_world_object, self.body).course
+        if course is None:
+            return nothing
+        T = nearest_alike(T_world_object, self.body, course.T_world_object)
+        expected = course.expected(T, self.elapsed, rules.course)
+        is_far = (np.abs(expected.velocity) > nothing.deviation).any()
+        return nothing if is_far else expected
+
+    def steady(self, T_world_object: Floats) -> Expected:
+        """The velocity at a pose, by the last two steps alone."""
+        nothing = unknown(self.body.radius, self.rules.course)
+        branch = (
+            nearest_branch(self.track, T_world_object, self.body) if self.track.branches else None
+        )
+        if branch is None or branch.velocity is None or not self.elapsed:
+            return nothing
+        T = nearest_alike(T_world_object, self.body, branch.T_world_object)
+        mean = twist_between(branch.T_world_object, T) / self.elapsed
+        velocity = mean + (mean - branch.velocity) / 2
+        return Expected(velocity, np.full(6, 1.5 / self.elapsed), nothing.deviation, np.zeros(6))
+
+    def motion(self, T_world_object: Floats) -> Motion:
+        """How the body is expected to move at a pose."""
+        expected = self.expected(T_world_object)
+        return Motion(T_world_object, expected.velocity, expected.acceleration)
+
+    def offsets(
+        self, T_world_object: Floats, found: Sequence[Association] | None = None
+    ) -> Offsets:
+        """How far off features are met at a pose, and when they were seen."""
+        if found is None:
+            rules = self.rules.judgement.association
+            found, _ = associate(self.finest, T_world_object, rules)
+        names = {view.name: k for k, view in enumerate(self.views)}
+        chosen = [names[one.name] for one in found]
+        views = [(self.still or self).views[k] for k in chosen]
+        places = [np.zeros((len(one.features), 1)) for one in found]
+        if any(view.readout for view in views):
+            sensors = tuple(self.views[k].sensor for k in chosen)
+            y = project_body(sensors, self.body).project(T_world_object[None]).y[:, 0]
+            places = [at[one.features] for at, one in zip(y, found, strict=True)]
+        return offsets_of(found, views, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,28 +228,38 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs."""
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        data = self.data.without(start.left_out)
-        return fit_near(
-            data.views,
-            data.body,
-            start.T_world_object,
-            start.uncertainty,
-            data.options,
-            data.samples,
-            finest=data.finest,
-            rules=data.rules.fit,
-        )
+        data, uncertainty = self.data.without(start.left_out), start.uncertainty
+
+        def climb(seen: FrameData, T_start: Floats) -> Fit:
+            return fit_near(
+                seen.views,
+                seen.body,
+                T_start,
+                uncertainty,
+                seen.options,
+                seen.samples,
+                finest=seen.finest,
+                rules=seen.rules.fit,
+            )
+
+        if is_timed(data.views):
+            return fit_in_motion(data, start.T_world_object, climb)
+        return climb(data, start.T_world_object)
 
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        motion = fit.motion
+        if is_timed(data.views):
+            motion = motion or data.motion(T)
+            data = data.in_motion(motion)
         rules, others = data.rules.judgement, []
         if start.left_out:
-            found, _ = associate(self.data.objective_near(T), T, rules.association)
+            found, _ = associate(self.data.finest, T, rules.association)
             others = [one for one in found if one.name in start.left_out]
         judged = judge(
-            data.objective_near(T),
+            data.finest,
             T,
             data.free,
             before=data.track.noise,
@@ -181,6 +271,8 @@ class MatchedLikelihood:
             one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
             for one in others
         }
+        if motion is not None:
+            judged = with_motion_unknown(judged, data, motion)
         return replace(
             judged,
             sensors=judged.sensors | reports,
@@ -220,7 +312,7 @@ class AssociationLikelihood:
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by the sum over all associations."""
         data, T = self.data, fit.T_world_object
-        judged = judge(data.objective_near(T), T, data.free, rules=data.rules.judgement)
+        judged = judge(data.finest, T, data.free, rules=data.rules.judgement)
         anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
             judged,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
+from mixpose.tracking.course import CourseRules
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.proposal_rules import ProposalRules
 from mixpose.tracking.range_rules import RangeRules
@@ -20,6 +21,7 @@ class Rules:
     judgement: JudgementRules = JudgementRules()
     acceptance: AcceptanceRules = AcceptanceRules()
     motion: MotionRules = MotionRules()
+    course: CourseRules = CourseRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
     search: SearchBudget = THOROUGH

@@ -13,6 +13,8 @@ from mixpose.body import Body
 from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_alike
 from mixpose.rigid import perturb, twist_between
 from mixpose.search import SearchState
+from mixpose.tracking.course import Course, CourseRules
+from mixpose.tracking.delays import DelayEvidence
 from mixpose.tracking.motion import MotionRules, RandomWalk
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -34,8 +36,8 @@ class Branch:
     spread : (6,) float64 or None
         Standard deviations of the pose itself, where they are as large as its motion: then the
         next frame takes it as a prior, and no velocity is believed.
-    steady : (6,) float64 or None
-        Mean of the last two velocities: less of a pose's own error is in it.
+    course : Course or None
+        From which its velocity at a moment is known; None where nobody asks for that.
     """
 
     T_world_object: Floats
@@ -43,7 +45,7 @@ class Branch:
     velocity: Floats | None
     uncertainty: Floats
     spread: Floats | None = None
-    steady: Floats | None = None
+    course: Course | None = None
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,10 @@ class Track:
         By sensor, of the last frame with a pose.
     search : SearchState
         Where a search with a budget goes on while nothing convinces.
+    delays : DelayEvidence
+        How late sensors are, as far as it was seen.
+    doubted : bool
+        Whether another body of the scene may have what the last pose meets.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -98,6 +104,8 @@ class Track:
     walk: RandomWalk | None = None
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
+    delays: DelayEvidence = field(default_factory=DelayEvidence)
+    doubted: bool = False
 
     def missed(self, search: SearchState) -> Track:
         """The track after a frame without a pose."""
@@ -172,11 +180,15 @@ def prior_of(
 
 
 class Found(NamedTuple):
-    """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior."""
+    """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior.
+
+    `deviation` are its standard deviations (6,), None where nobody asks for velocities at moments.
+    """
 
     T_world_object: Floats
     weight: float
     spread: Floats | None = None
+    deviation: Floats | None = None
 
 
 def follow(
@@ -188,6 +200,7 @@ def follow(
     noise: Noise,
     tallies: Mapping[str, SensorTally],
     rules: MotionRules,
+    course_rules: CourseRules = CourseRules(),
 ) -> Track:
     """The track after a frame with poses.
 
@@ -205,13 +218,14 @@ def follow(
     tallies
         Of the best pose, as `Track` has them.
     rules : MotionRules
+    course_rules : CourseRules
     """
     elapsed = elapsed_since(track, frame, time_s)
     branches: list[Branch] = []
     walk = track.walk
-    for T, weight, spread in found:
-        velocity, steady, uncertainty = None, None, rules.unsteady * rules.steady(body)
-        parent = _parent(track, T, body)
+    for T, weight, spread, deviation in found:
+        velocity, uncertainty = None, rules.unsteady * rules.steady(body)
+        parent = nearest_branch(track, T, body) if track.branches else None
         if spread is not None and parent is not None and elapsed > 0:
             if not branches and track.frame is not None:
                 moved = twist_between(parent.T_world_object, T)
@@ -221,12 +235,18 @@ def follow(
             moved = twist_between(parent.T_world_object, T)
             if track.misses <= rules.coasting:
                 velocity = moved / elapsed
-                steady = velocity if parent.velocity is None else (velocity + parent.velocity) / 2
                 change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
                 uncertainty = np.maximum(_per_kind(half), rules.steady(body))
-        branches.append(Branch(T, weight, velocity, uncertainty, spread, steady))
-    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies)
+        course = None
+        if deviation is not None:
+            before = parent.course if parent is not None else None
+            if before is not None and 0 < elapsed <= course_rules.longest_s:
+                course = before.followed(T, deviation, elapsed, course_rules)
+            else:
+                course = Course.begun(T, deviation, body.radius, course_rules)
+        branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
+    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
@@ -236,10 +256,8 @@ def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
     return float(frame - (track.frame or 0))
 
 
-def _parent(track: Track, T: Floats, body: Body) -> Branch | None:
+def nearest_branch(track: Track, T: Floats, body: Body) -> Branch:
     """The branch that a pose goes on from: the nearest."""
-    if not track.branches:
-        return None
     away = [
         np.linalg.norm(twist_between(branch.T_world_object, T) / np.repeat([body.radius, 1.0], 3))
         for branch in track.branches

@@ -19,7 +19,7 @@ from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.judgement import Judged, Verdict, decide, insert
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, SensorReport
-from mixpose.tracking.delays import in_step
+from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.reflection import is_reflection
@@ -27,6 +27,8 @@ from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
 Floats: TypeAlias = NDArray[np.float64]
+
+SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
 
 
 @dataclass(frozen=True)
@@ -116,36 +118,39 @@ class Tracker:
         Track, Estimate
             The track for the next frame, and the frame's estimate without its latency.
         """
-        usable = [view for view in views if not view.observation.is_empty]
-        usable = in_step(usable, track, frame, time_s, self.rules.motion)
-        data = self.data(track, frame, time_s, usable)
-        ranked = self.ranked(data) if usable else []
+        data = self.data(track, frame, time_s, views)
+        ranked = self.ranked(data)
+        verdict = self.verdict(data, ranked)
+        followed = self.followed(data, frame, time_s, verdict)
+        return followed, self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
+
+    def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
+        """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
         if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
             verdict = replace(verdict, status="ambiguous")
-        told = verdict.best or (ranked[0] if ranked else None)
-        estimate = self._estimate(frame, time_s, views, verdict, told)
-        if verdict.best is None:
-            return track.missed(data.log.state), estimate
-        return self._followed(track, frame, time_s, verdict, verdict.best), estimate
+        return verdict
 
-    def ranked(self, data: FrameData) -> list[Judged]:
+    def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
         Parameters
         ----------
         data : FrameData
-            With at least one view, none of which saw nothing.
+        quickly : bool
+            Whether to look where the body is expected only.
         """
-        likelihood = likelihood_of(data)
         ranked: list[Judged] = []
+        if not data.views:
+            return ranked
+        likelihood = likelihood_of(data)
 
         def consider(start: Start, name: str) -> Judged:
             judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=name)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)
             return judged
 
-        for propose in self.proposers:
+        for propose in self.proposers[:1] if quickly else self.proposers:
             for start in propose(data, ranked):
                 judged = consider(start, propose.__name__)
                 for refine in self.refinements:
@@ -153,16 +158,45 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def _estimate(
+    def refitted(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
+        """The same poses, fitted to other views and judged by them, most evident first."""
+        found: list[Judged] = []
+        if data.views:
+            likelihood = likelihood_of(data)
+            close = data.start_uncertainty / data.rules.proposals.narrowing**2
+            for one in ranked:
+                left_out = {n: report.why for n, report in one.sensors.items() if report.why}
+                start = Start(one.T_world_object, close, left_out=left_out)
+                judged = likelihood.judge(likelihood.fit(start), start)
+                judged = replace(judged, proposer=one.proposer)
+                insert(found, judged, self.body, self.free, self.rules.acceptance)
+        return found
+
+    def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
+        """The same poses, judged by other views, most evident first."""
+        if not data.views:
+            return []
+        likelihood = likelihood_of(data)
+        found = []
+        for one in ranked:
+            left_out = {n: report.why for n, report in one.sensors.items() if report.why}
+            start = Start(one.T_world_object, left_out=left_out)
+            judged = likelihood.judge(likelihood.fit(start), start)
+            found.append(replace(judged, proposer=one.proposer))
+        return sorted(found, key=lambda one: -one.log_evidence)
+
+    def estimate(
         self,
         frame: int,
         time_s: float | None,
         views: Sequence[View],
         verdict: Verdict,
-        told: Judged | None,
+        ranked: Sequence[Judged],
+        delays: DelayEvidence = DelayEvidence(),
     ) -> Estimate:
         """The estimate of a frame, with reports of the best pose, believed or not."""
         best = verdict.best
+        told = best or (ranked[0] if ranked else None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
         return Estimate(
@@ -176,19 +210,41 @@ class Tracker:
             sensors=reports | (told.sensors if told else {}),
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
+            delays=delays.seconds(),
         )
 
-    def _followed(
-        self, track: Track, frame: int, time_s: float | None, verdict: Verdict, best: Judged
+    def followed(
+        self, data: FrameData, frame: int, time_s: float | None, verdict: Verdict
     ) -> Track:
-        """The track after a frame with poses."""
+        """The track after a frame."""
+        track, best = data.track, verdict.best
+        if best is None:
+            return track.missed(data.log.state)
         found = [
-            Found(one.T_world_object, weight, one.spread if self.options.fuse else None)
+            Found(
+                one.T_world_object,
+                weight,
+                one.spread if self.options.fuse else None,
+                np.sqrt(np.diagonal(one.covariance)) if is_timed(data.views) else None,
+            )
             for one, weight in verdict.kept
         ]
         noise = best.noise if verdict.status == "ok" else track.noise
         motion = self.rules.motion
-        return follow(track, self.body, found, frame, time_s, noise, _tallies(best), motion)
+        followed = follow(
+            track,
+            self.body,
+            found,
+            frame,
+            time_s,
+            noise,
+            _tallies(best),
+            motion,
+            self.rules.course,
+        )
+        if verdict.status != "ok":
+            return followed
+        return replace(followed, delays=_delays(data, best, frame))
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
@@ -198,8 +254,15 @@ class Tracker:
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
         """A frame, and what is known before it; arguments as of `advance`."""
+        views = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
-        return FrameData(
+        elapsed = None
+        if time_s is not None and track.time_s is not None:
+            elapsed = time_s - track.time_s
+        views = believed(track.delays.applied(views), elapsed)
+        if time_s is None:
+            views = [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        data = FrameData(
             views=views,
             body=self.body,
             options=self.options,
@@ -209,7 +272,28 @@ class Tracker:
             T_reference=predictions[0].T_world_object if predictions else self.T_start,
             start_uncertainty=self.start_uncertainty,
             rules=self.rules,
+            elapsed=elapsed,
         )
+        if predictions and is_timed(views):
+            return data.in_motion(data.motion(predictions[0].T_world_object))
+        return data
+
+
+def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
+    """What the frames so far say of how late sensors are, with this one."""
+    before, T = data.track.delays, best.T_world_object
+    used = [one for one in best.associations if best.sensors[one.name].used]
+    timed = is_timed(data.views)
+    if len(used) < 2 or not data.elapsed or (frame % SOME_FRAMES and not timed):
+        return before
+    expected = data.expected(T) if timed else data.steady(T)
+    if not expected.gain.any():
+        return before
+    seen = data.offsets(T, used)
+    names = [one.name for one in used]
+    views = [view for view in data.views if view.name in names]
+    rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
+    return before.joined(seen, views, expected, max(rest, LEAST_VARIANCE))
 
 
 def _tallies(judged: Judged) -> dict[str, SensorTally]:

@@ -43,12 +43,12 @@ def read_marker_file(path: Path, unit: Unit) -> Markers:
     suffix = path.suffix.lower()
     if suffix in (".yaml", ".yml", ".json", ".xml", ".stl"):
         raise BadKeyError(found(path.name, _ALLOWED))
+    content = read_bytes(path)
     if suffix not in READERS:
         with in_file(path.name):
-            if read_bytes(path).startswith(NDI_MARK):
+            if content.startswith(NDI_MARK):
                 raise BadKeyError("is an NDI body: rename it, to end in .rom")
         return read_markers(path)
-    content = read_bytes(path)
     read, stated = READERS[suffix]
     with in_file(path.name):
         markers = read(content)

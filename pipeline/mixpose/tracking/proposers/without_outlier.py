@@ -26,5 +26,5 @@ def without_outlier(data: FrameData, likelihood: Likelihood, judged: Judged) -> 
         return []  # features of grey values cannot be made narrower
     step = step_without_loosest(judged.associations, data.free, rules)
     T = perturb(judged.T_world_object, step)
-    objective = data.at_sigma(T, narrowed=rules.narrow)
+    objective = data.at_sigma(narrowed=rules.narrow)
     return [Start(ascend(objective.linearise, perturb, T, data.free, SHARP).state)]

@@ -1,0 +1,52 @@
+"""What people type: ``mixpose calibrate``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mixpose.cli.words import SessionFile
+
+
+def calibrate(
+    session: SessionFile,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="CALIBRATED.toml", help="The calibrated session."),
+    ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="POSES.jsonl", help="Known poses of the body; else none is known."),
+    ] = None,
+    free: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR:WHAT",
+            help="What is sought: pose, focal, principal_point, distortion, delay, drift, "
+            "position, range_bias, of a sensor or, without its name, of all; or body, the marker "
+            "coordinates. Repeatable. Else the poses of all cameras but the first and the "
+            "positions of range sensors.",
+        ),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """Calibrate sensors from a recording of the body, without matching markers."""
+    from mixpose.cli.calibrate import (  # noqa: PLC0415
+        CalibrateRequest,
+        calibrate_session,
+        parse_free,
+    )
+
+    request = CalibrateRequest(
+        output=output,
+        poses=poses,
+        free=parse_free(free or ()),
+        sources=tuple(source or ()),
+        report=None,
+    )
+    calibrate_session(session, request)

@@ -1,0 +1,76 @@
+"""``mixpose design``: its options, and what is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def design(
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SESSION.toml", help="One system or several; others are held to the first."
+        ),
+    ],
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="POSES.jsonl", help="Judge at these poses, not over a volume."),
+    ] = None,
+    count: Annotated[
+        int, typer.Option(min=1, max=2000, help="Number of poses in the volume.")
+    ] = 24,
+    volume: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Sides of the box around [start] or the middle of the view; else twice the "
+            "body's radius.",
+        ),
+    ] = None,
+    turn: Annotated[
+        float | None,
+        typer.Option(help="Turn the body by up to so many degrees; else 20 about [start], or 180."),
+    ] = None,
+    tip: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Judge a point of the body, in its coordinates."),
+    ] = None,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR=NUMBER",
+            help="What features err by, px or length; SYSTEM:SENSOR=NUMBER for one system, * for "
+            "every sensor; else 0.2 of sigma for cameras, sigma for ranges.",
+        ),
+    ] = None,
+    monte_carlo: Annotated[
+        int, typer.Option(min=0, help="Simulate and estimate so many frames of each system.")
+    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same study.")] = 0,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Markers of two bodies lie alike within this; else 10 % of the radius."),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write all numbers here.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
+) -> None:
+    """Predict the accuracy of planned systems, side by side, and what would improve them."""
+    from mixpose.cli.design import DesignRequest, design_sessions  # noqa: PLC0415
+
+    request = DesignRequest(
+        poses=poses,
+        count=count,
+        volume=volume,
+        turn=turn,
+        tip=tip,
+        noise=tuple(noise or ()),
+        runs=monte_carlo,
+        seed=seed,
+        tolerance=tolerance,
+        json=json,
+        plot=plot,
+    )
+    design_sessions(sessions, request)

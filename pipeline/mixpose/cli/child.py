@@ -1,0 +1,35 @@
+"""The command line of a process that ends when the one which started it does.
+
+Its standard input is a pipe that nobody writes to: when it ends, whoever held the other end is
+gone, killed perhaps, and what this process would go on to write could meet its successor's.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+
+_GRACE_S = 5.0  # to finish what is open, as after an interrupt
+
+
+def end_with_parent() -> None:
+    """Watch standard input in a thread, and interrupt this process when it ends."""
+    threading.Thread(target=_watch, daemon=True).start()
+
+
+def _watch() -> None:
+    while os.read(sys.stdin.fileno(), 1):
+        pass
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(_GRACE_S)
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    from mixpose.cli import main
+
+    main()

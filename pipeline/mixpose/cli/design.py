@@ -1,0 +1,148 @@
+"""``mixpose design``: what planned systems will achieve."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.checking import with_image_sizes
+from mixpose.cli.notices import say
+from mixpose.design import Request, spread_poses, study
+from mixpose.design.texts import study_json, study_text
+from mixpose.errors import SessionError
+from mixpose.poses.jsonl import read_poses
+from mixpose.rigid import Floats
+from mixpose.session import Session, load_session
+from mixpose.whole_files import appearing_whole
+
+_MOST_POSES = 2000
+
+
+@dataclass(frozen=True)
+class DesignRequest:
+    """Options of the command, as typed."""
+
+    poses: Path | None
+    count: int
+    volume: str | None
+    turn: float | None
+    tip: str | None
+    noise: tuple[str, ...]
+    runs: int
+    seed: int
+    tolerance: float | None
+    json: Path | None
+    plot: Path | None
+
+
+def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
+    """Print a study of the systems of several session files.
+
+    Raises
+    ------
+    SessionError
+    """
+    sessions = [with_image_sizes(load_session(path), {}) for path in paths]
+    for path, session in zip(paths, sessions, strict=True):
+        if session.unit != sessions[0].unit:
+            raise SessionError(
+                f"{path}: unit: found {session.unit!r}; allowed: {sessions[0].unit!r}, as of "
+                f"{paths[0]}, to compare them"
+            )
+    if asked.plot is not None:
+        from mixpose.design.plot import require_plots  # noqa: PLC0415
+
+        require_plots(asked.plot)
+    names = _names(paths)
+    request = Request(
+        poses=_poses(sessions[0], asked),
+        tip=None if asked.tip is None else _three("--tip", asked.tip),
+        noises=_noises(asked.noise, sessions, names),
+        runs=asked.runs,
+        seed=asked.seed,
+        tolerance=asked.tolerance,
+    )
+    told = say if sys.stderr.isatty() else _silent
+    found = study(list(zip(names, sessions, strict=True)), request, told)
+    sys.stdout.write(study_text(found))
+    if asked.json is not None:
+        with appearing_whole(asked.json) as draft:
+            draft.write_text(json.dumps(study_json(found), indent=1) + "\n", encoding="utf-8")
+    if asked.plot is not None:
+        from mixpose.design.plot import draw_study  # noqa: PLC0415
+
+        with appearing_whole(asked.plot) as draft:
+            draw_study(found, draft)
+
+
+def _silent(text: str) -> None:
+    pass
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """A short name for each session: its own, or that of its folder."""
+    stems = [path.resolve().parent.name if path.stem == "session" else path.stem for path in paths]
+    return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
+
+
+def _poses(session: Session, asked: DesignRequest) -> Floats:
+    if asked.poses is None:
+        volume = None if asked.volume is None else _three("--volume", asked.volume)
+        if volume is not None and (volume < 0).any():
+            raise SessionError(f"--volume: found {asked.volume}; allowed: three lengths from 0")
+        return spread_poses(
+            session, asked.count, volume=volume, turn_deg=asked.turn, seed=asked.seed
+        )
+    read = read_poses(asked.poses)
+    poses = [pose.T_world_object for pose in read.poses if pose.T_world_object is not None]
+    if not poses:
+        raise SessionError(f"--poses {asked.poses}: holds no pose")
+    if len(poses) > _MOST_POSES:
+        poses = [poses[int(k)] for k in np.linspace(0, len(poses) - 1, _MOST_POSES)]
+    return np.array(poses)
+
+
+def _three(option: str, text: str) -> Floats:
+    try:
+        values = np.array([float(cell) for cell in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if values.shape != (3,) or not (np.abs(values) < 1e9).all():
+        raise SessionError(f"{option}: found {text!r}; allowed: three numbers as 0,0,-100")
+    return values
+
+
+def _noises(
+    given: Sequence[str], sessions: Sequence[Session], names: Sequence[str]
+) -> dict[tuple[int | None, str], float]:
+    """``SENSOR=NUMBER`` for all systems, ``SYSTEM:SENSOR=NUMBER`` for one; ``*`` is any sensor."""
+    noises: dict[tuple[int | None, str], float] = {}
+    for text in given:
+        place, _, number = text.rpartition("=")
+        system, _, sensor = place.rpartition(":")
+        try:
+            value = float(number)
+        except ValueError:
+            value = 0.0
+        if not (place and 0 < value < 1e9):
+            raise SessionError(
+                f"--noise: found {text!r}; allowed: SENSOR=NUMBER or SYSTEM:SENSOR=NUMBER, in px "
+                "or lengths, greater than 0"
+            )
+        if system and system not in names:
+            raise SessionError(f"--noise: found no system {system!r}; systems: {', '.join(names)}")
+        matched = False
+        for k, (name, session) in enumerate(zip(names, sessions, strict=True)):
+            for setup in session.sensors:
+                if system in ("", name) and sensor in ("*", setup.name):
+                    noises[k, setup.name] = value
+                    matched = True
+        if not matched:
+            known = sorted({setup.name for session in sessions for setup in session.sensors})
+            raise SessionError(f"--noise: found no sensor {sensor!r}; sensors: {', '.join(known)}")
+    return noises

@@ -1,0 +1,277 @@
+"""One recording of many: run in a process of its own, in a folder that appears when it is whole.
+
+The folder holds the poses, what was said (`LOG`) and how it ended (`STATUS`).  While it is made
+its name begins with a dot.  A recording that two workers come to do gives one folder: the first to
+be whole stays.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from mixpose.cli.lines import note_path
+
+STATUS = "status.json"
+LOG = "log.txt"
+DONE, FAILED, INTERRUPTED = "done", "failed", "interrupted"
+
+_COUNTS = re.compile(r"^mixpose: \d+ frames?: (.*?)(?: -> .*)?$")
+_INTERRUPTED_STATUS = 130
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done; text only, as it may travel to another machine.
+
+    Attributes
+    ----------
+    session : str
+        Absolute path.
+    session_sha256 : str
+        Of its bytes; empty where it cannot be read.
+    folder, name : str
+        Absolute path of the folder of all recordings, and the name of this one's in it.
+    poses : str
+        Name of the file with the poses.
+    options : tuple of str
+        Of ``mixpose run``.
+    mixpose : str
+        Version.
+    shared : bool
+        Whether another worker may come to do the same.
+    """
+
+    session: str
+    session_sha256: str
+    folder: str
+    name: str
+    poses: str
+    options: tuple[str, ...]
+    mixpose: str
+    shared: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a recording ended: what its status file holds.
+
+    Attributes
+    ----------
+    state : {"done", "failed", "interrupted"}
+    exit_status : int
+        Of ``mixpose run``.
+    frames : mapping of str to int
+        By status of their poses.
+    warnings : int
+        In the log.
+    reason : str or None
+        Why it failed: the last line of the log.
+    seconds : float
+    host : str
+    """
+
+    name: str
+    session: str
+    session_sha256: str
+    options: tuple[str, ...]
+    mixpose: str
+    state: str
+    exit_status: int
+    frames: Mapping[str, int] = field(default_factory=dict)
+    warnings: int = 0
+    reason: str | None = None
+    seconds: float = 0.0
+    host: str = ""
+
+
+class Running:
+    """The processes that run, so that an interrupt reaches all of them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self.stopped = False
+
+    def run(self, command: list[str], folder: Path, log: Path, threads: int) -> int:
+        """Run a command to its end; an interrupted one's status if none may start any more."""
+        with self._lock, log.open("ab") as stream:
+            if self.stopped:
+                return _INTERRUPTED_STATUS
+            process = subprocess.Popen(
+                command,
+                cwd=folder,
+                env={"OPENCV_FOR_THREADS_NUM": str(threads), **os.environ},
+                stdin=subprocess.PIPE,  # ends with this process, see `mixpose.cli.child`
+                stdout=subprocess.DEVNULL,
+                stderr=stream,
+                # an interrupt from the keyboard comes once, through this process
+                start_new_session=True,
+            )
+            self._running.add(process)
+        try:
+            return process.wait()
+        finally:
+            with self._lock:
+                self._running.discard(process)
+            if process.poll() is None:
+                process.kill()
+            assert process.stdin is not None
+            process.stdin.close()
+
+    def interrupt(self) -> None:
+        """Let every process end after its frame, and no further one start."""
+        with self._lock:
+            self.stopped = True
+            for process in self._running:
+                if sys.platform != "win32":  # there the keyboard reaches all by itself
+                    process.send_signal(signal.SIGINT)
+
+
+def finished(job: Job) -> Outcome | None:
+    """How a job ended before, if it is done and nothing about it has changed."""
+    try:
+        said = json.loads((Path(job.folder) / job.name / STATUS).read_bytes())
+        outcome = Outcome(**{**said, "options": tuple(said["options"])})
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    same = (outcome.session_sha256, outcome.options, outcome.mixpose, outcome.state)
+    return outcome if same == (job.session_sha256, job.options, job.mixpose, DONE) else None
+
+
+def run_job(job: Job, running: Running | None = None, threads: int = 1) -> Outcome:
+    """Do a job, if it is not done yet.
+
+    Parameters
+    ----------
+    job : Job
+    running : Running or None
+        What an interrupt reaches the process through.
+    threads : int
+        Of OpenCV.
+    """
+    before = finished(job)
+    if before is not None:
+        return before
+    missing = _not_shared(job)
+    if missing is not None:
+        return missing
+    token = uuid.uuid4().hex if job.shared else "unfinished"
+    part = Path(job.folder) / f".{job.name}.{token}"
+    try:
+        outcome = _run_in(part, job, running or Running(), threads)
+        if outcome.state != INTERRUPTED:
+            outcome = _put_in_place(part, job, outcome)
+    except OSError as error:
+        reason = f"{error.filename or part}: cannot be written: {error.strerror}"
+        outcome = replace(_outcome(job, FAILED, 2), reason=reason)
+    finally:
+        if job.shared:
+            shutil.rmtree(part, ignore_errors=True)
+    return outcome
+
+
+def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
+    part.mkdir(exist_ok=True)
+    log, poses = part / LOG, part / job.poses
+    command = [sys.executable, "-m", "mixpose.cli.child", "run", *job.options]
+    command += [f"--output={job.poses}"]
+    command += ["--resume"] if poses.suffix == ".jsonl" and poses.exists() else []
+    log.write_bytes(b"")
+    began = time.monotonic()
+    status = running.run([*command, "--", job.session], part, log, threads)
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    if status < 0 and not running.stopped:
+        lines.append(f"mixpose: ended by signal {-status}")
+    interrupted = status == _INTERRUPTED_STATUS or running.stopped
+    state = DONE if status == 0 else INTERRUPTED if interrupted else FAILED
+    outcome = replace(
+        _outcome(job, state, 128 - status if status < 0 else status),
+        frames=_frames(lines),
+        warnings=sum(line.startswith("mixpose: warning: ") for line in lines),
+        reason=None
+        if status == 0
+        else (lines or ["it said nothing"])[-1].removeprefix("mixpose: "),
+        seconds=round(time.monotonic() - began, 3),
+    )
+    if state == DONE:  # nothing is left to go on with
+        note_path(poses).unlink(missing_ok=True)
+    text = json.dumps(asdict(outcome), indent=1, ensure_ascii=False)
+    (part / STATUS).write_text(text + "\n", encoding="utf-8")
+    return outcome
+
+
+def _reason(lines: list[str]) -> str:
+    """What was said last."""
+    return (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
+
+
+def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
+    """Give a whole folder its name, unless another worker was faster."""
+    place = Path(job.folder) / job.name
+    while True:
+        before = finished(job)
+        if before is not None:
+            shutil.rmtree(part, ignore_errors=True)
+            return before
+        old = place.with_name(f".{job.name}.{uuid.uuid4().hex}")
+        with suppress(FileNotFoundError):
+            place.rename(old)  # of another session, or failed
+        try:
+            part.rename(place)
+        except OSError:
+            if not place.exists():
+                raise
+            continue
+        finally:
+            shutil.rmtree(old, ignore_errors=True)
+        return outcome
+
+
+def _not_shared(job: Job) -> Outcome | None:
+    """What to say where this machine does not see the folders of the one that asked."""
+    for path in (Path(job.session), Path(job.folder)):
+        if not path.exists():
+            reason = f"{path}: no such file"
+            if job.shared:
+                reason = (
+                    f"{path}: not there on worker {socket.gethostname()}; sessions, recordings and "
+                    "-o must lie in a folder that all workers see under the same name"
+                )
+            return replace(_outcome(job, FAILED, 2), reason=reason)
+    return None
+
+
+def _outcome(job: Job, state: str, exit_status: int) -> Outcome:
+    return Outcome(
+        name=job.name,
+        session=job.session,
+        session_sha256=job.session_sha256,
+        options=job.options,
+        mixpose=job.mixpose,
+        state=state,
+        exit_status=exit_status,
+        host=socket.gethostname(),
+    )
+
+
+def _frames(lines: list[str]) -> dict[str, int]:
+    """Frames by status, as the run said in the end."""
+    said = [found for line in lines if (found := _COUNTS.match(line))]
+    if not said:
+        return {}
+    pairs = (part.split(" ", 1) for part in said[-1].group(1).split(", "))
+    return {status: int(count) for count, status in pairs}

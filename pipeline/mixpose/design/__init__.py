@@ -1,0 +1,34 @@
+"""What planned systems will achieve: predicted accuracy, confirmed by simulation, and advice."""
+
+from __future__ import annotations
+
+from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
+from mixpose.design.confirmation import Confirmation, confirm
+from mixpose.design.congruence import Congruence, congruent_subsets
+from mixpose.design.equality import noise_to_equal
+from mixpose.design.poses import spread_poses
+from mixpose.design.prediction import Plan, Prediction, plan_of, predict
+from mixpose.design.study import Request, Study, study
+from mixpose.design.summary import Summary, summarise
+
+__all__ = [
+    "Confirmation",
+    "Congruence",
+    "MarkerMove",
+    "NewSensor",
+    "Plan",
+    "Prediction",
+    "Request",
+    "Study",
+    "Summary",
+    "best_marker_move",
+    "best_new_sensor",
+    "confirm",
+    "congruent_subsets",
+    "noise_to_equal",
+    "plan_of",
+    "predict",
+    "spread_poses",
+    "study",
+    "summarise",
+]

@@ -1,0 +1,148 @@
+"""Which marker to move, and where to put one more sensor, to gain most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from mixpose.body import Body, PointFeature
+from mixpose.design.prediction import Plan
+from mixpose.rigid import Floats, from_parts
+from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+
+ErrorOf: TypeAlias = Callable[[Plan], float]
+
+_STEP = 0.25  # of the body's radius
+_PLACES = 60  # for one more sensor, all around
+
+
+@dataclass(frozen=True)
+class MarkerMove:
+    """A marker that is moved.
+
+    Attributes
+    ----------
+    marker : int
+        From 0.
+    shift : (3,) float64
+        In the object's frame.
+    error : float
+        What is left then.
+    """
+
+    marker: int
+    shift: Floats
+    error: float
+
+
+@dataclass(frozen=True)
+class NewSensor:
+    """One more sensor, of a kind that is there.
+
+    Attributes
+    ----------
+    like : str
+        The sensor that it is a copy of.
+    sensor : Sensor
+    error : float
+        What is left then.
+    """
+
+    like: str
+    sensor: Sensor
+    error: float
+
+
+def best_marker_move(plan: Plan, error_of: ErrorOf) -> MarkerMove | None:
+    """The marker whose move by a quarter of the body's radius leaves the least error.
+
+    Returns None where no move helps, or features are no points.
+    """
+    if not all(isinstance(feature, PointFeature) for feature in plan.body.features):
+        return None
+    best: MarkerMove | None = None
+    least = error_of(plan)
+    for marker in range(len(plan.body)):
+        for direction in _directions(26):
+            shift = _STEP * plan.body.radius * direction
+            error = error_of(replace(plan, body=_moved(plan.body, marker, shift)))
+            if error < least:
+                best, least = MarkerMove(marker, shift, error), error
+    return best
+
+
+def best_new_sensor(plan: Plan, error_of: ErrorOf, middle: Floats) -> NewSensor | None:
+    """Where a copy of one of the sensors leaves the least error: all around, as far away as it.
+
+    Parameters
+    ----------
+    plan : Plan
+    error_of : callable
+    middle : (3,) array
+        Of the volume, in the world: what the sensor looks at.
+
+    Returns
+    -------
+    NewSensor or None
+        None where no place helps.
+    """
+    best: NewSensor | None = None
+    least = error_of(plan)
+    kinds: dict[tuple[type, float], int] = {}
+    for k, sensor in enumerate(plan.sensors):
+        kinds.setdefault((type(sensor), plan.noises[k]), k)
+    for k in kinds.values():
+        for direction in _directions(_PLACES):
+            copy = _placed(plan.sensors[k], middle, direction)
+            if copy is None:
+                continue
+            more = replace(
+                plan,
+                names=(*plan.names, "new"),
+                sensors=(*plan.sensors, copy),
+                noises=(*plan.noises, plan.noises[k]),
+                sigmas=(*plan.sigmas, plan.sigmas[k]),
+            )
+            error = error_of(more)
+            if error < least:
+                best, least = NewSensor(plan.names[k], copy, error), error
+    return best
+
+
+def _moved(body: Body, marker: int, shift: Floats) -> Body:
+    features = list(body.features)
+    feature = features[marker]
+    assert isinstance(feature, PointFeature), "others are not moved"
+    features[marker] = replace(feature, position=np.asarray(feature.position) + shift)
+    return replace(body, features=tuple(features))
+
+
+def _directions(count: int) -> Floats:
+    """Unit vectors (count, 3) evenly around, by the golden angle."""
+    k = np.arange(count) + 0.5
+    height = 1 - 2 * k / count
+    around = np.pi * (1 + np.sqrt(5)) * k
+    across = np.sqrt(1 - height**2)
+    return np.array([across * np.cos(around), across * np.sin(around), height]).T
+
+
+def _placed(sensor: Sensor, middle: Floats, direction: Floats) -> Sensor | None:
+    """A copy that stands in a direction from the middle, as far from it as the original."""
+    if isinstance(sensor, RangeSensor):
+        away = np.linalg.norm(sensor.position - middle)
+        return replace(sensor, position=middle + away * direction)
+    if not isinstance(sensor, PinholeCamera | FisheyeCamera | ParallelBeam):
+        return None
+    depth = float(sensor.T_sensor_world[2, :3] @ middle + sensor.T_sensor_world[2, 3])
+    down = np.array([0.0, 0.0, -1.0]) if abs(direction[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    forward = -direction
+    right = np.cross(down, forward)
+    right /= np.linalg.norm(right)
+    R = np.array([right, np.cross(forward, right), forward])
+    seen_at = sensor.T_sensor_world[:3, :3] @ middle + sensor.T_sensor_world[:3, 3]
+    if not isinstance(sensor, ParallelBeam):
+        seen_at = np.array([0.0, 0.0, abs(depth)])
+    return replace(sensor, T_sensor_world=from_parts(R, seen_at - R @ middle))

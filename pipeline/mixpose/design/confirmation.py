@@ -1,0 +1,183 @@
+"""A prediction held against simulated recordings that are estimated as any other."""
+
+from __future__ import annotations
+
+import csv
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.design.prediction import Plan, Prediction, at_tip, predict
+from mixpose.design.written import plan_text
+from mixpose.rigid import Floats, inverse, twist_between
+from mixpose.runner import run
+from mixpose.session import Session, load_session
+from mixpose.simulation import SimulationOptions, simulate
+
+_FEWEST_FRAMES = 50  # at a pose, which takes a session and a recording of its own
+_MOST_POSES = 8
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Errors of simulated frames beside those that were predicted.
+
+    Attributes
+    ----------
+    frames : int
+        Estimated, lost ones included.
+    statuses : dict of str to int
+    ratios : (6,) float64
+        Root mean square error over the predicted one, per direction; NaN where held or open.
+    overall : float
+        The same over all directions at once: of errors in units of their covariance.
+    chance : float
+        What `overall` is off 1 by through chance alone, one standard deviation.
+    predicted, found : (3,) float64
+        Position, rotation (radians) and tip: root mean squares over the frames.
+    """
+
+    frames: int
+    statuses: dict[str, int]
+    ratios: Floats
+    overall: float
+    chance: float
+    predicted: Floats
+    found: Floats
+
+
+def confirm(
+    session: Session,
+    plan: Plan,
+    poses: Floats,
+    runs: int,
+    *,
+    tip: Floats,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Confirmation:
+    """Simulate frames of a body that stands still at some of the poses, and estimate them.
+
+    Parameters
+    ----------
+    session : Session
+    plan : Plan
+        Its system, perhaps with other noises.
+    poses : (P, 4, 4) array
+        At which everything is determined.
+    runs : int
+        Frames in all.
+    tip : (3,) array
+    seed : int
+    progress : callable
+        Takes the number of frames so far.
+    """
+    count = min(len(poses), _MOST_POSES, max(1, runs // _FEWEST_FRAMES))
+    chosen = poses[np.linspace(0, len(poses) - 1, count).astype(int)]
+    prediction = predict(plan, chosen)
+    statuses: Counter[str] = Counter()
+    errors: list[Floats] = []
+    which: list[int] = []
+    for k, T in enumerate(chosen):
+        frames = runs // count + (k < runs % count)
+        if frames == 0:
+            continue
+        found = _errors_at(session, plan, T, frames, seed + k, statuses)
+        errors += found
+        which += [k] * len(found)
+        progress(sum(statuses.values()))
+    return _compared(plan, prediction, np.array(errors).reshape(-1, 6), which, tip, statuses)
+
+
+def _errors_at(
+    session: Session, plan: Plan, T: Floats, frames: int, seed: int, statuses: Counter[str]
+) -> list[Floats]:
+    """Twists (6,) from the truth to the estimate, modulo the body's symmetries."""
+    least = {
+        m: min((n for n, one in zip(plan.noises, plan.sensors) if one.dimension == m), default=0.0)
+        for m in (1, 2)
+    }
+    options = SimulationOptions(
+        frames=frames,
+        seed=seed,
+        amplitude_translation=0.0,
+        amplitude_rotation_deg=0.0,
+        pixel_noise=least[2],
+        range_noise=least[1],
+        deform=bool(plan.body.spread or plan.body.gravity),
+    )
+    alike = T @ plan.body.symmetries
+    errors = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "session.toml"
+        path.write_text(plan_text(session, plan, T), encoding="utf-8")
+        recording = Path(folder) / "recording"
+        simulate(load_session(path), recording, options)
+        rng = np.random.default_rng([seed, frames])
+        for name, sensor, noise in zip(plan.names, plan.sensors, plan.noises, strict=True):
+            more = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
+            if more > 0:
+                _made_noisier(recording / f"{name}.csv", more, rng)
+        for estimate in run(load_session(recording / "session.toml")):
+            statuses[estimate.status] += 1
+            if estimate.T_world_object is None:
+                continue
+            twists = twist_between(alike, np.broadcast_to(estimate.T_world_object, alike.shape))
+            nearest = int(np.linalg.norm(twists[:, 3:], axis=1).argmin())
+            # errors of a pose that looks the same, taken back to the pose itself
+            same = estimate.T_world_object @ inverse(plan.body.symmetries[nearest])
+            errors.append(twist_between(T, same))
+    return errors
+
+
+def _made_noisier(table: Path, noise: float, rng: np.random.Generator) -> None:
+    """Add noise to the coordinates of a table; `simulate` has one noise for all cameras."""
+    with table.open(encoding="utf-8", newline="") as stream:
+        header, *rows = csv.reader(stream)
+    columns = [header.index(name) for name in ("u", "v", "range") if name in header]
+    for row in rows:
+        for column in columns:
+            row[column] = repr(float(row[column]) + noise * rng.standard_normal())
+    with table.open("w", encoding="utf-8", newline="") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([header, *rows])
+
+
+def _compared(
+    plan: Plan,
+    prediction: Prediction,
+    errors: Floats,
+    which: list[int],
+    tip: Floats,
+    statuses: Counter[str],
+) -> Confirmation:
+    covariances = prediction.covariances[which]
+    free = np.flatnonzero(plan.free)
+    variances = np.einsum("nii->ni", covariances)
+    ratios = np.full(6, np.nan)
+    if len(errors):
+        ratios[free] = np.sqrt((errors[:, free] ** 2 / variances[:, free]).mean(axis=0))
+    inner = covariances[:, free][:, :, free]
+    squares = np.einsum(
+        "ni,ni->n", errors[:, free], np.linalg.solve(inner, errors[:, free, None])[..., 0]
+    )
+    tips = np.einsum("nii->n", at_tip(prediction, tip)[which])
+    arms = (prediction.poses[:, :3, :3] @ tip)[which]
+    moved = errors[:, :3] + np.cross(errors[:, 3:], arms)
+    return Confirmation(
+        frames=sum(statuses.values()),
+        statuses=dict(statuses),
+        ratios=ratios,
+        overall=float(np.sqrt(squares.mean() / len(free))) if len(errors) else math.nan,
+        chance=1 / math.sqrt(2 * max(len(errors), 1) * len(free)),
+        predicted=np.sqrt(
+            [variances[:, :3].sum(1).mean(), variances[:, 3:].sum(1).mean(), tips.mean()]
+        ),
+        found=np.sqrt(
+            [(part**2).sum(axis=1).mean() for part in (errors[:, :3], errors[:, 3:], moved)]
+        ),
+    )

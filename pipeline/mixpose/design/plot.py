@@ -1,0 +1,91 @@
+"""A study in one picture: deviations side by side, and where in the volume errors are large."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mixpose.design.study import Study
+from mixpose.errors import SessionError
+from mixpose.rigid import TWIST_NAMES, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def require_plots(path: Path) -> None:
+    """See that a picture can be drawn, before anything is computed for it.
+
+    Raises
+    ------
+    SessionError
+        If matplotlib is not installed, or does not write such files.
+    """
+    if path.suffix.lower() not in _SUFFIXES:
+        raise SessionError(f"--plot {path}: found {path.suffix!r}; allowed: {', '.join(_SUFFIXES)}")
+    try:
+        import matplotlib.figure  # noqa: F401, PLC0415
+    except ImportError as error:
+        raise SessionError(
+            "design: --plot needs matplotlib, which is not installed; pip install 'mixpose[plots]'"
+        ) from error
+
+
+def draw_study(study: Study, path: Path) -> None:
+    """Write a picture of a study."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415 - heavy, and an extra
+
+    count = len(study.systems)
+    figure = Figure(figsize=(11, 3.2 * (1 + count)), layout="constrained")
+    FigureCanvasAgg(figure)
+    rows: Any = figure.subfigures(1 + count, 1)
+    _bars(list(rows[0].subplots(1, 2)), study)
+    largest = max(
+        (float(s.summary.tip[np.isfinite(s.summary.tip)].max(initial=0.0)) for s in study.systems),
+        default=1.0,
+    )
+    for row, system in zip(rows[1:], study.systems, strict=True):
+        row.suptitle(f"{system.name}: error of the tip over the volume")
+        axes = list(row.subplots(1, 3))
+        _maps(axes, study, system.summary.tip, largest)
+    figure.savefig(path)
+
+
+def _bars(axes: list[Axes], study: Study) -> None:
+    width = 0.8 / len(study.systems)
+    for axis, directions, scale, unit in (
+        (axes[0], range(3), 1.0, study.unit),
+        (axes[1], range(3, 6), 180 / np.pi, "deg"),
+    ):
+        for k, system in enumerate(study.systems):
+            values = system.summary.deviations[:, list(directions)] * scale
+            values = np.where(np.isfinite(values), values, np.nan)
+            if np.isnan(values).all():
+                continue
+            middle = np.nanmedian(values, axis=0)
+            worst = np.nanmax(values, axis=0)
+            places = np.arange(3) + (k - (len(study.systems) - 1) / 2) * width
+            axis.bar(places, middle, width, label=system.name, color=f"C{k}")
+            axis.plot(places, worst, "_", color="black", markersize=12)
+        axis.set_xticks(range(3), [TWIST_NAMES[d] for d in directions])
+        axis.set_ylabel(f"deviation, {unit}: median, worst")
+    axes[0].legend()
+
+
+def _maps(axes: list[Axes], study: Study, errors: Floats, largest: float) -> None:
+    places = study.request.poses[:, :3, 3]
+    known = np.isfinite(errors)
+    for axis, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
+        axis.plot(places[~known, i], places[~known, j], "x", color="0.5")
+        points = axis.scatter(
+            places[known, i], places[known, j], c=errors[known], vmin=0, vmax=largest or 1.0
+        )
+        axis.set_xlabel(f"{TWIST_NAMES[i]}, {study.unit}")
+        axis.set_ylabel(f"{TWIST_NAMES[j]}, {study.unit}")
+        axis.set_aspect("equal", adjustable="datalim")
+    axes[0].figure.colorbar(points, ax=axes, label=study.unit)

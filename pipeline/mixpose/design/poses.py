@@ -1,0 +1,80 @@
+"""Poses to judge a planned system at: a box of positions, orientations around a first one."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from mixpose.errors import SessionError
+from mixpose.rigid import Floats, from_parts
+from mixpose.session import Session
+from mixpose.simulation.central_pose import central_pose, pivot_of
+
+ALL_TURNS = 180.0
+TURN_AROUND_START = 20.0  # degrees, where the session says how the body is turned
+
+
+def spread_poses(
+    session: Session,
+    count: int,
+    *,
+    volume: Floats | None = None,
+    turn_deg: float | None = None,
+    seed: int = 0,
+) -> Floats:
+    """Poses T_world_object spread evenly over a volume; the first is its middle.
+
+    Parameters
+    ----------
+    session : Session
+        Every camera with a resolution.  The middle is its ``[start]``, else where its sensors
+        look together.
+    count : int
+        P.
+    volume : (3,) array, optional
+        Sides of the box that the body's middle is in, along the world's axes; left out, twice the
+        body's radius.
+    turn_deg : float, optional
+        Largest angle from the orientation of the middle, up to 180; left out, 20 around a
+        ``[start]`` and else 180.
+    seed : int
+
+    Returns
+    -------
+    (P, 4, 4) float64
+
+    Raises
+    ------
+    SessionError
+        If no place is in view of a sensor.
+    """
+    centre = central_pose(session, seed)
+    body = session.body
+    sides = np.full(3, 2 * body.radius) if volume is None else np.asarray(volume)
+    if turn_deg is None:
+        turn_deg = ALL_TURNS if session.start is None else TURN_AROUND_START
+    if not 0 <= turn_deg <= ALL_TURNS:
+        raise SessionError(f"--turn: found {turn_deg:g}; allowed: degrees from 0 to 180")
+    drawn = qmc.Halton(6, rng=np.random.default_rng(seed)).random(count)
+    pivot = pivot_of(body)
+    middle = centre[:3, :3] @ pivot + centre[:3, 3]
+    places = middle + (drawn[:, :3] - 0.5) * sides
+    rotations = _turns(drawn[:, 3:], turn_deg) @ centre[:3, :3]
+    poses = from_parts(rotations, places - rotations @ pivot)
+    poses[0] = centre
+    return poses
+
+
+def _turns(drawn: Floats, turn_deg: float) -> Floats:
+    """Rotations (P, 3, 3) out of numbers (P, 3) from 0 to 1, evenly over all within an angle."""
+    if turn_deg >= ALL_TURNS:
+        u, v, w = drawn[:, 0], 2 * np.pi * drawn[:, 1], 2 * np.pi * drawn[:, 2]
+        a, b = np.sqrt(1 - u), np.sqrt(u)
+        quaternions = np.array([a * np.sin(v), a * np.cos(v), b * np.sin(w), b * np.cos(w)]).T
+        return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+    height, around = 2 * drawn[:, 0] - 1, 2 * np.pi * drawn[:, 1]
+    across = np.sqrt(1 - height**2)
+    axes = np.array([across * np.cos(around), across * np.sin(around), height]).T
+    angles = np.radians(turn_deg) * np.cbrt(drawn[:, 2])
+    return np.asarray(Rotation.from_rotvec(axes * angles[:, None]).as_matrix())

@@ -1,0 +1,166 @@
+"""Covariance of poses before anything is measured: detections and markers that err.
+
+With the Jacobian J_li of feature i in sensor l by the pose, its Jacobian A_li by the feature's own
+place, and the weights W_li that a run gives it, a least-squares fit errs by
+
+    H⁻¹ (Σ_l Σ_i J_liᵀ W_li σ_l² W_li J_li + Σ_i G_i Σ_i G_iᵀ) H⁻¹,
+    H = Σ_l Σ_i J_liᵀ W_li J_li,    G_i = Σ_l J_liᵀ W_li A_li .
+
+W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹ with the sensor's `sigma` s_l; what features err by, σ_l, may be
+something else.  A marker that is off its place is off in all sensors alike, which is why its terms
+are summed over sensors before they are squared.  Where s_l is in proportion to σ_l and markers are
+exact it is the inverse information.  For points that are measured in three directions alike it is
+the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.checking import noise_of
+from mixpose.fit import free_mask
+from mixpose.judgement import invert_information
+from mixpose.objective import pose_jacobian
+from mixpose.rigid import Floats, transform
+from mixpose.sensors import Sensor, facing
+from mixpose.session import Session
+
+Mask: TypeAlias = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A system: sensors with what each of their features errs by, and a body.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the sensors.
+    sensors : tuple of Sensor
+    noises : tuple of float
+        Standard deviation of a measured feature along each coordinate, px or length units.
+    sigmas : tuple of float
+        σ_ε of the sensors, by which a run weighs them against each other.
+    body : Body
+        Spreads of its features are errors of markers.
+    free : (6,) bool
+        Directions that are estimated.
+    """
+
+    names: tuple[str, ...]
+    sensors: tuple[Sensor, ...]
+    noises: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    body: Body
+    free: Mask
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What is expected at P poses.
+
+    Attributes
+    ----------
+    poses : (P, 4, 4) float64
+        T_world_object.
+    covariances : (P, 6, 6) float64
+        In the axes of `mixpose.rigid`; infinite on the diagonal where sensors leave a direction
+        open, zero where it is not free.
+    seen : (P, L, N) bool
+        Features that are in view of a sensor and face it.
+    """
+
+    poses: Floats
+    covariances: Floats
+    seen: Mask
+
+
+def plan_of(session: Session, noises: dict[str, float] | None = None) -> Plan:
+    """The system of a session.
+
+    Parameters
+    ----------
+    session : Session
+    noises : dict of str to float, optional
+        Standard deviations by sensor in place of those that its `sigma` stands for.
+    """
+    given = noises or {}
+    return Plan(
+        names=tuple(setup.name for setup in session.sensors),
+        sensors=tuple(setup.sensor for setup in session.sensors),
+        noises=tuple(given.get(setup.name, noise_of(setup)) for setup in session.sensors),
+        sigmas=tuple(setup.extract.sigma for setup in session.sensors),
+        body=session.body,
+        free=free_mask(session.estimator),
+    )
+
+
+def predict(plan: Plan, poses: Floats) -> Prediction:
+    """Predict the covariance of one frame at each of P poses (P, 4, 4)."""
+    points, count = plan.body.means, len(poses)
+    rotations = poses[:, :3, :3]
+    world, arms = transform(poses, points), points @ rotations.swapaxes(1, 2)
+    spread = _marker_covariances(plan.body, rotations)
+    H, V = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+    G = np.zeros((count, len(points), 6, 3))
+    seen = np.zeros((count, len(plan.sensors), len(points)), dtype=np.bool_)
+    rows = zip(plan.sensors, plan.noises, plan.sigmas, strict=True)
+    for k, (sensor, noise, sigma) in enumerate(rows):
+        _, A, visible = sensor.linearise(world)
+        visible = visible & facing(sensor, poses, world, plan.body.normals)
+        seen[:, k] = visible
+        A = A * visible[..., None, None]
+        J = pose_jacobian(A, arms)
+        wide = sigma**2 * np.eye(A.shape[-2])
+        W = np.linalg.inv(wide + A @ spread @ A.swapaxes(-1, -2))
+        JW = J.swapaxes(-1, -2) @ W
+        H += (JW @ J).sum(axis=1)
+        V += noise**2 * (JW @ JW.swapaxes(-1, -2)).sum(axis=1)
+        G += JW @ A
+    V += (G @ spread @ G.swapaxes(-1, -2)).sum(axis=1)
+    covariances = np.array([_sandwiched(h, v, plan.free) for h, v in zip(H, V)])
+    return Prediction(poses, covariances, seen)
+
+
+def at_tip(prediction: Prediction, tip: Floats) -> Floats:
+    """Covariance (P, 3, 3) of a point (3,) of the body, in world axes; infinite where open."""
+    arms = prediction.poses[:, :3, :3] @ tip
+    J = np.zeros((len(arms), 3, 6))
+    J[:, :, :3] = np.eye(3)
+    x, y, z = arms.T
+    # a turn ω moves the point by ω × arm
+    J[:, 0, 4], J[:, 0, 5] = z, -y
+    J[:, 1, 3], J[:, 1, 5] = -z, x
+    J[:, 2, 3], J[:, 2, 4] = y, -x
+    known = np.isfinite(prediction.covariances)
+    result = J @ np.where(known, prediction.covariances, 0.0) @ J.swapaxes(1, 2)
+    unknown = ~np.isfinite(np.einsum("pii->pi", prediction.covariances))
+    reach = np.abs(J) > 1e-9 * max(1.0, float(np.abs(tip).max()))
+    touched = (reach & unknown[:, None, :]).any(axis=2)
+    for p, axis in np.argwhere(touched):
+        result[p, axis, axis] = np.inf
+    return np.asarray(result)
+
+
+def _marker_covariances(body: Body, rotations: Floats) -> Floats:
+    """Spreads of features in world axes (P, N, 3, 3)."""
+    turned = rotations[:, None] @ body.covariances @ rotations[:, None].swapaxes(-1, -2)
+    if body.gravity is not None:
+        direction = np.asarray(body.gravity.direction, dtype=np.float64)
+        unit = direction / np.linalg.norm(direction)
+        turned = turned + body.gravity.sigma**2 * np.outer(unit, unit)
+    return np.asarray(turned)
+
+
+def _sandwiched(H: Floats, V: Floats, free: Mask) -> Floats:
+    inverse = invert_information(H, free)
+    is_open = ~np.isfinite(np.diag(inverse))
+    inverse[is_open, :] = inverse[:, is_open] = 0.0
+    covariance = inverse @ V @ inverse
+    covariance[is_open, is_open] = np.inf
+    return np.asarray((covariance + covariance.T) / 2)

@@ -1,0 +1,214 @@
+"""A whole study: systems side by side, what equals what, and what would help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.checking import noise_of
+from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
+from mixpose.design.confirmation import Confirmation, confirm
+from mixpose.design.congruence import Congruence, congruent_subsets
+from mixpose.design.equality import noise_to_equal, scaled
+from mixpose.design.prediction import Plan, at_tip, plan_of, predict
+from mixpose.design.summary import Summary, pooled, summarise
+from mixpose.rigid import Floats
+from mixpose.session import SensorSetup, Session
+
+SHARE_OF_RADIUS = 0.1
+"""Bodies whose markers lie alike to within this share of the smaller one's radius are told: two of
+a motion capture recording that are taken for each other, rigid to 2 to 5 mm, have 0.08."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a study.
+
+    Attributes
+    ----------
+    poses : (P, 4, 4) float64
+    tip : (3,) float64 or None
+        In the object's frame; None for its origin.
+    noises : mapping of (int or None, str) to float
+        Standard deviations by system (None: all) and sensor.
+    runs : int
+        Frames to simulate for each system; 0 for none.
+    seed : int
+    tolerance : float or None
+        Within which markers of bodies lie alike; None for a share of the radius.
+    """
+
+    poses: Floats
+    tip: Floats | None = None
+    noises: Mapping[tuple[int | None, str], float] = field(default_factory=dict)
+    runs: int = 0
+    seed: int = 0
+    tolerance: float | None = None
+
+
+@dataclass(frozen=True)
+class Equal:
+    """What a system's detections must err by to be as accurate as the first system.
+
+    Attributes
+    ----------
+    factor : float or None
+        On all its noises; None where nothing makes it so.
+    noises : tuple of float
+        The noises with that factor.
+    wanted : float
+        Error of the first system.
+    confirmation : Confirmation or None
+        Of the system with these noises.
+    """
+
+    factor: float | None
+    noises: tuple[float, ...]
+    wanted: float
+    confirmation: Confirmation | None = None
+
+
+@dataclass(frozen=True)
+class System:
+    """One system of a study."""
+
+    name: str
+    session: Session
+    plan: Plan
+    summary: Summary
+    error: float  # pooled over the poses: of the tip, or of the origin
+    confirmation: Confirmation | None = None
+    equal: Equal | None = None
+    move: MarkerMove | None = None
+    new: NewSensor | None = None
+
+
+@dataclass(frozen=True)
+class Study:
+    """Systems, and what their bodies have in common."""
+
+    request: Request
+    unit: str
+    systems: tuple[System, ...]
+    congruences: tuple[Congruence, ...]
+
+
+def study(
+    named: Sequence[tuple[str, Session]],
+    request: Request,
+    say: Callable[[str], None] = lambda text: None,
+) -> Study:
+    """Study systems, the first being what the others are compared with.
+
+    Parameters
+    ----------
+    named : sequence of (str, Session)
+        Of one unit; cameras with resolutions.
+    request : Request
+    say : callable
+        Told what is being done.
+    """
+    systems: list[System] = []
+    for k, (name, session) in enumerate(named):
+        say(f"{name}: prediction and advice")
+        noises = {s: v for (which, s), v in request.noises.items() if which in (None, k)}
+        systems.append(_system(name, session, plan_of(session, noises), request))
+    for k, system in enumerate(systems):
+        if request.runs:
+            say(f"{system.name}: {request.runs} simulated frames")
+            systems[k] = replace(system, confirmation=_confirmed(system, system.plan, request))
+        if k > 0:
+            systems[k] = replace(systems[k], equal=_equal(systems[k], systems[0], request, say))
+    bodies = [each.body for _, session in named for each in session.objects]
+    return Study(
+        request=request,
+        unit=named[0][1].unit,
+        systems=tuple(systems),
+        congruences=tuple(_congruences(bodies, request)),
+    )
+
+
+def _tip(request: Request) -> Floats:
+    return np.zeros(3) if request.tip is None else request.tip
+
+
+def _error_of(request: Request) -> Callable[[Plan], float]:
+    def error_of(plan: Plan) -> float:
+        tips = at_tip(predict(plan, request.poses), _tip(request))
+        return pooled(np.sqrt(np.einsum("pii->p", tips)))
+
+    return error_of
+
+
+def _system(name: str, session: Session, plan: Plan, request: Request) -> System:
+    error_of = _error_of(request)
+    prediction = predict(plan, request.poses)
+    setups = tuple(_with_noise(s, n) for s, n in zip(session.sensors, plan.noises, strict=True))
+    summary = summarise(plan, setups, prediction, _tip(request))
+    middle = (request.poses[:, :3, :3] @ plan.body.means.mean(axis=0)).mean(axis=0)
+    middle = middle + request.poses[:, :3, 3].mean(axis=0)
+    return System(
+        name=name,
+        session=session,
+        plan=plan,
+        summary=summary,
+        error=error_of(plan),
+        move=best_marker_move(plan, error_of),
+        new=best_new_sensor(plan, error_of, middle),
+    )
+
+
+def _with_noise(setup: SensorSetup, noise: float) -> SensorSetup:
+    """A sensor whose `sigma` stands for a noise, as poses that look alike go by it."""
+    sigma = setup.extract.sigma * noise / noise_of(setup)
+    return replace(setup, extract=replace(setup.extract, sigma=sigma))
+
+
+def _confirmed(system: System, plan: Plan, request: Request) -> Confirmation | None:
+    closed = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
+    if not len(closed):
+        return None
+    return confirm(
+        system.session,
+        plan,
+        request.poses[closed],
+        request.runs,
+        tip=_tip(request),
+        seed=request.seed,
+    )
+
+
+def _equal(system: System, first: System, request: Request, say: Callable[[str], None]) -> Equal:
+    factor = noise_to_equal(system.plan, first.error, _error_of(request))
+    if factor is None:
+        return Equal(None, (), first.error)
+    plan = scaled(system.plan, factor)
+    found = None
+    if request.runs:
+        say(f"{system.name}: {request.runs} simulated frames with what equals {first.name}")
+        found = _confirmed(system, plan, request)
+    return Equal(factor, plan.noises, first.error, found)
+
+
+def _congruences(bodies: Sequence[Body], request: Request) -> list[Congruence]:
+    found: list[Congruence] = []
+    known: list[Body] = []
+    for body in bodies:
+        if any(_same(body, other) for other in known):
+            continue
+        for other in known:
+            tolerance = request.tolerance
+            if tolerance is None:
+                tolerance = SHARE_OF_RADIUS * min(body.radius, other.radius)
+            alike = congruent_subsets(other, body, tolerance)
+            if alike is not None:
+                found.append(alike)
+        known.append(body)
+    return found
+
+
+def _same(body: Body, other: Body) -> bool:
+    return body.name == other.name and np.array_equal(body.means, other.means)

@@ -1,0 +1,154 @@
+"""Many independent tasks at once: in threads, in processes, or on a cluster.
+
+A cluster is one of ``dask.distributed`` (the extra ``[dask]``): ``local`` starts one on this
+machine, an address such as ``tcp://head:8786`` names the scheduler of one that is running.  It
+repeats the tasks of a worker that was lost, so a task must do no harm when it is done twice.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Any, Protocol, TypeVar
+
+from mixpose.errors import SessionError
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+LOCAL = "local"
+"""In place of an address: a cluster of this machine's own."""
+
+PATIENCE_S = 20.0
+"""How long a scheduler may take to answer."""
+
+
+class Executor(Protocol):
+    """Does tasks; each is tried to its end whatever becomes of the others."""
+
+    def run(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        """Do a function for each task.
+
+        Yields
+        ------
+        number, result : int, object
+            Place of the task and what the function returned or raised, as tasks are done.
+        """
+
+
+class _Pool:
+    """Threads or processes of this machine."""
+
+    def __init__(self, pool: futures.Executor) -> None:
+        self._pool = pool
+
+    def run(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        numbers = {self._pool.submit(function, task): k for k, task in enumerate(tasks)}
+        for future in futures.as_completed(numbers):
+            error = future.exception()
+            if error is not None and not isinstance(error, Exception):
+                raise error
+            yield numbers[future], future.result() if error is None else error
+
+
+class _Cluster:
+    """Workers of a scheduler of ``dask.distributed``."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def run(
+        self, function: Callable[[Task], Result], tasks: Sequence[Task]
+    ) -> Iterator[tuple[int, Result | Exception]]:
+        from distributed import as_completed  # noqa: PLC0415 - an extra
+
+        submitted = self._client.map(function, list(tasks), pure=False)
+        numbers = {future.key: k for k, future in enumerate(submitted)}
+        for future in as_completed(submitted):
+            error = future.exception()
+            yield numbers[future.key], future.result() if error is None else error
+
+
+@contextmanager
+def in_threads(workers: int) -> Iterator[Executor]:
+    """As many tasks at a time as there are workers, in threads: for tasks that mostly wait."""
+    with futures.ThreadPoolExecutor(workers) as pool:
+        try:
+            yield _Pool(pool)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@contextmanager
+def in_processes(workers: int | None = None) -> Iterator[Executor]:
+    """The same in processes, as many as there are processors if not said: for tasks that reckon.
+
+    The linear algebra of each has one thread.
+    """
+    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
+    context = multiprocessing.get_context("spawn")
+    with futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+        try:
+            yield _Pool(pool)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@contextmanager
+def on_cluster(scheduler: str, workers: int | None = None) -> Iterator[Executor]:
+    """The workers of a scheduler.
+
+    Parameters
+    ----------
+    scheduler : str
+        Its address, or `LOCAL`.
+    workers : int or None
+        Of a local cluster: as many as there are processors if not said.
+
+    Raises
+    ------
+    SessionError
+        If ``dask.distributed`` is not installed, or no scheduler answers.
+    """
+    if find_spec("distributed") is None:
+        raise SessionError(
+            f"--scheduler {scheduler}: needs the package distributed; install it with: "
+            "python -m pip install 'mixpose[dask]'"
+        )
+    from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra
+
+    if scheduler == LOCAL:
+        with (
+            LocalCluster(
+                n_workers=workers or os.cpu_count() or 1,
+                threads_per_worker=1,
+                dashboard_address=None,
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+            yield _Cluster(client)
+        return
+    try:
+        client = Client(scheduler, timeout=PATIENCE_S)
+    except (OSError, ValueError) as error:  # a timeout is an OSError, too
+        raise SessionError(
+            f"--scheduler {scheduler}: no scheduler answers there; allowed are {LOCAL}, or an "
+            "address such as tcp://head:8786, where `dask scheduler` runs"
+        ) from error
+    with client:
+        yield _Cluster(client)
+
+
+def executor(scheduler: str | None, workers: int | None = None) -> Any:
+    """A context with the processes of this machine, or with a cluster where one is named."""
+    return in_processes(workers) if scheduler is None else on_cluster(scheduler, workers)

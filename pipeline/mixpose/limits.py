@@ -1,0 +1,34 @@
+"""What inputs may be at most, so that none of them takes all memory or time.
+
+Each limit is looked at before what it limits is allocated.  Together they keep a run of a few
+sensors below 2 GB.
+"""
+
+from __future__ import annotations
+
+MOST_PIXELS = 2**26
+"""Of an image: 67 million, more than usual sensors have; up to 20 bytes each are used."""
+
+MOST_FEATURES = 2000
+"""Of a body, pieces of segments included: their pairs are compared."""
+
+MOST_DETECTIONS = 5000
+"""Of one sensor in one frame: each is drawn, with 0.2 MB."""
+
+MOST_SAMPLES = 4_000_000
+"""Of all features of a body together, where densities are integrated by sampling."""
+
+MOST_BINS = 1_000_000
+"""Of a range profile."""
+
+MOST_UNSORTED_ROWS = 1_000_000
+"""Of a table whose rows are not in the order of frames: it is read whole."""
+
+MOST_BYTES = 4_000_000
+"""Of a session file, a calibration or a table of markers."""
+
+MOST_YAML_CHARACTERS = 500_000
+"""Of a calibration in YAML, whose reader is slow: this much takes seconds."""
+
+MOST_YAML_NODES = 100_000
+"""Of a YAML file once its aliases are written out."""

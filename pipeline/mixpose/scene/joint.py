@@ -1,0 +1,290 @@
+"""One frame of several bodies: each on what the others leave, until nothing changes hands.
+
+Bodies that convince where they are expected come first, all at once; what they meet is theirs.
+The others look at what is left, the most evident is believed, and takes its detections from the
+rest.  Where two poses want the same detections, it counts what both bodies explain together if
+the one or the other has them; not which stands first in the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.judgement import Judged, convinces, is_possible
+from mixpose.objective import SharedDensities, View, project_body
+from mixpose.records import PointPattern
+from mixpose.scene.members import Member
+from mixpose.scene.ownership import (
+    MERGED,
+    Claim,
+    Left,
+    Owners,
+    are_alike,
+    claimed,
+    claims_of,
+    expected_owners,
+    hides_near,
+    is_reached,
+    left_for,
+    merged_spots,
+    overlap,
+    unmet_places,
+)
+from mixpose.scene.rules import SceneRules
+from mixpose.tracking import Track
+from mixpose.tracking.likelihood import FrameData
+
+Floats: TypeAlias = NDArray[np.float64]
+Claims: TypeAlias = Mapping[str, Claim]
+
+
+class Joint:
+    """The bodies of one frame, and what each has found so far.
+
+    Attributes
+    ----------
+    data : dict of int to FrameData
+        By member: the frame as it is left for it.
+    ranked : dict of int to list of Judged
+        Its poses, most evident first.
+    close_calls : set of int
+        Members that won or lost their detections by little.
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Member],
+        tracks: Sequence[Track],
+        frame: int,
+        time_s: float | None,
+        views: Sequence[View],
+        rules: SceneRules,
+    ) -> None:
+        self.members, self.tracks = members, tracks
+        self.data: dict[int, FrameData] = {}
+        self.ranked: dict[int, list[Judged]] = {}
+        self.close_calls: set[int] = set()
+        self._frame, self._time_s, self._rules = frame, time_s, rules
+        self._views = [view for view in views if not view.observation.is_empty]
+        self._left: dict[int, Left] = {}
+        self._owners: dict[int, Owners] = {}
+        self._claims: dict[int, Claims] = {}
+        self._merged: dict[str, set[int]] = {}
+        self._shared: SharedDensities | None = None
+        if self._views and all(
+            isinstance(view.observation.pattern, PointPattern) for view in self._views
+        ):
+            self._shared = SharedDensities.drawn(self._views)
+
+    def solve(self) -> None:
+        """Find the poses of all members."""
+        self._follow([k for k in range(len(self.members)) if self._is_trusted(k)])
+        self._look_for([k for k in range(len(self.members)) if k not in self._claims])
+        self._part()
+        owners = self._owned()
+        for k in range(len(self.members)):
+            if not are_alike(k, owners, self._owners[k]):
+                self._rejudge(k, left_for(k, self._views, owners))
+
+    def _follow(self, trusted: Sequence[int]) -> None:
+        """Bodies where they are expected, all at once."""
+        expected = {k: self._places(k, self._expected(k)) for k in trusted}
+        owners = expected_owners(self._views, expected, self._rules.gate)
+        stale = list(trusted)
+        for _ in range(self._rules.rounds):
+            for k in stale:
+                self._look(k, owners, expected=expected[k])
+                self._claims.pop(k, None)
+                if self._convinces(k):
+                    self._claim(k)
+            owners = claimed(self._views, self._claims)
+            stale = [k for k in self._claims if self._is_touched(k, owners)]
+            if not stale:
+                break
+
+    def _part(self) -> None:
+        """Take from bodies what may be their feature and another's in one spot, and fit again."""
+        rules = self._rules
+        unmet = {k: unmet_places(self.ranked[k][0]) for k in self._claims}
+        found = merged_spots(self._views, self._claims, unmet, rules.touching, rules.pulled)
+        if not found:
+            return
+        for name, numbers in found.items():
+            self._merged.setdefault(name, set()).update(numbers)
+        owners = self._owned()
+        for k in list(self._claims):
+            if are_alike(k, owners, self._owners[k]):
+                continue
+            before = self.ranked[k]
+            self._look(k, owners, start=before)
+            if self.ranked[k]:
+                self._claim(k)
+            else:
+                self.ranked[k] = before
+
+    def _owned(self) -> Owners:
+        """Owners by all that is claimed so far."""
+        owners = claimed(self._views, self._claims)
+        for name, numbers in self._merged.items():
+            owners[name][list(numbers)] = MERGED
+        return owners
+
+    def _look_for(self, others: Sequence[int]) -> None:
+        """Bodies that are not where they are expected, on what is left, the most evident first."""
+        waiting = list(others)
+        self._look_at_all(waiting)
+        while waiting:
+            possible = [k for k in waiting if self._is_possible(k)]
+            if not possible:
+                break
+            winner = self._most_evident(possible)
+            self._claim(winner)
+            waiting.remove(winner)
+            taken = self._claims[winner]
+            self._look_at_all([k for k in waiting if self._wants(k, taken)])
+
+    def _look_at_all(self, some: Iterable[int]) -> None:
+        """Everywhere, on what is left; identical bodies of which nothing is known look as one."""
+        owners = claimed(self._views, self._claims)
+        seen: dict[int, int] = {}
+        for k in some:
+            tracker = self.members[k].tracker
+            twin = seen.get(id(tracker.body)) if self._is_forgotten(k) else None
+            if twin is None:
+                self._look(k, owners)
+                if self._is_forgotten(k):
+                    seen[id(tracker.body)] = k
+                continue
+            self.data[k] = tracker.data(self.tracks[k], self._frame, self._time_s, self._views)
+            self.ranked[k] = self.ranked[twin]
+            self._left[k], self._owners[k] = self._left[twin], owners
+
+    def _look(
+        self,
+        k: int,
+        owners: Owners,
+        *,
+        expected: Mapping[str, Floats] | None = None,
+        start: Sequence[Judged] = (),
+    ) -> None:
+        """Poses of a body on what others leave; near where it is expected, if that is known.
+
+        With `start`, from these poses alone.
+        """
+        tracker = self.members[k].tracker
+        left = left_for(k, self._views, owners)
+        track = self.tracks[k]
+        if self._is_forgotten(k):
+            track = replace(track, branches=())
+        data = tracker.data(track, self._frame, self._time_s, left.views)
+        if expected is not None and self._may_share(data, left, expected):
+            data = replace(data, shared=self._shared)
+        if start:
+            self.ranked[k] = tracker.refitted(data, start)
+        else:
+            self.ranked[k] = tracker.ranked(data, quickly=expected is not None)
+        if track is not self.tracks[k]:
+            known = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
+            data = replace(known, log=data.log)
+        self.data[k], self._left[k], self._owners[k] = data, left, owners
+
+    def _rejudge(self, k: int, left: Left) -> None:
+        """The poses of a body again, by what is left for it in the end."""
+        tracker = self.members[k].tracker
+        data = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
+        self.ranked[k] = tracker.rejudged(data, self.ranked[k])
+        self.data[k], self._left[k] = replace(data, log=self.data[k].log), left
+
+    def _may_share(self, data: FrameData, left: Left, places: Mapping[str, Floats]) -> bool:
+        """Whether nothing that is another's lies within reach, so that all may look as one."""
+        if self._shared is None or len(data.views) != len(self._views):
+            return False
+        return not any(
+            hides_near(view, left.kept[view.name], places[view.name], self._rules.reach)
+            for view in self._views
+        )
+
+    def _most_evident(self, possible: Sequence[int]) -> int:
+        """The body that is believed next: with it, all that compete explain most."""
+        first = max(possible, key=self._evidence)
+        for other in possible:
+            if other == first or self._is_same(first, other):
+                continue
+            if overlap(self._own_claims(first), self._own_claims(other)) < self._rules.rival:
+                continue
+            gain = self._together(first, other) - self._together(other, first)
+            rules = self.members[first].tracker.rules.acceptance
+            if abs(gain) < -np.log(rules.rival):
+                self.close_calls |= {first, other}
+            if gain < 0:
+                first = other
+        return first
+
+    def _together(self, keeps: int, other: int) -> float:
+        """Evidence of two bodies, if the one keeps what it meets and the other has the rest."""
+        claims = {**self._claims, keeps: self._own_claims(keeps)}
+        left = left_for(other, self._views, claimed(self._views, claims))
+        tracker = self.members[other].tracker
+        data = tracker.data(self.tracks[other], self._frame, self._time_s, left.views)
+        rest = tracker.rejudged(data, self.ranked[other])
+        return self._evidence(keeps) + max((one.log_evidence for one in rest[:1]), default=0.0)
+
+    def _is_trusted(self, k: int) -> bool:
+        track = self.tracks[k]
+        return bool(track.branches) and track.misses == 0 and not track.doubted
+
+    def _is_forgotten(self, k: int) -> bool:
+        """Whether where the body was says nothing any more."""
+        track = self.tracks[k]
+        return not track.branches or track.misses > self._rules.forgotten
+
+    def _is_same(self, a: int, b: int) -> bool:
+        """Whether two are identical and nothing tells which is which."""
+        same = self.members[a].tracker.body is self.members[b].tracker.body
+        return same and self._is_forgotten(a) and self._is_forgotten(b)
+
+    def _expected(self, k: int) -> Floats:
+        tracker = self.members[k].tracker
+        return tracker.predictions(self.tracks[k], self._frame, self._time_s)[0].T_world_object
+
+    def _convinces(self, k: int) -> bool:
+        tracker, ranked = self.members[k].tracker, self.ranked[k]
+        return bool(ranked) and convinces(ranked[0], tracker.free, tracker.rules.acceptance)
+
+    def _is_possible(self, k: int) -> bool:
+        tracker, ranked = self.members[k].tracker, self.ranked[k]
+        return bool(ranked) and is_possible(ranked[0], tracker.free, tracker.rules.acceptance)
+
+    def _evidence(self, k: int) -> float:
+        return self.ranked[k][0].log_evidence
+
+    def _own_claims(self, k: int) -> Claims:
+        return claims_of(self.ranked[k][0], self._left[k])
+
+    def _claim(self, k: int) -> None:
+        self._claims[k] = self._own_claims(k)
+
+    def _wants(self, k: int, taken: Claims) -> bool:
+        """Whether a body meets any of some detections."""
+        return bool(self.ranked[k]) and overlap(self._own_claims(k), taken) > 0
+
+    def _is_touched(self, k: int, owners: Owners) -> bool:
+        before, reach = self._owners[k], self._rules.reach
+        if are_alike(k, owners, before):
+            return False
+        places = self._places(k, self.ranked[k][0].T_world_object)
+        return is_reached(k, self._views, owners, before, places, reach)
+
+    def _places(self, k: int, T: Floats) -> dict[str, Floats]:
+        """Where the sensors have the features of a body at a pose."""
+        sensors = tuple(view.sensor for view in self._views)
+        at = project_body(sensors, self.members[k].tracker.body).project(T[None])
+        return {
+            view.name: at.y[i, 0][at.seen[i, 0]][:, : view.sensor.dimension]
+            for i, view in enumerate(self._views)
+        }

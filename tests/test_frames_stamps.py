@@ -1,0 +1,64 @@
+"""Images named after the nanosecond they were taken in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from session_lines import with_lines
+
+from mixpose.cli.check import check_session
+from mixpose.frames import Source, SourceSpec, open_source, pair, paired_by_stamp
+
+FIRST = 1403636579763555584  # as in recordings of drones
+STEP = 50_000_000
+
+
+def camera(folder: Path, name: str, stamps: list[int], fps: float | None = None) -> Source:
+    for stamp in stamps:
+        cv2.imwrite(str(folder / f"{name}{stamp}.png"), np.zeros((4, 4), np.uint8))
+    return open_source(SourceSpec(name, f"{name}*.png", folder, "camera", fps=fps))
+
+
+def test_stamps_are_times_whatever_fps_says(tmp_path: Path) -> None:
+    source = camera(tmp_path, "a", [FIRST, FIRST + STEP], fps=20.0)
+    times = [frame.time_s for frame in source.frames()]
+    assert times == pytest.approx([1403636579.763555584, 1403636579.813555584], abs=1e-6)
+    assert "nanoseconds" in str(source.caution())
+    assert camera(tmp_path, "b", [FIRST, FIRST + STEP]).caution() is None
+
+
+def test_numbers_of_frames_are_no_stamps(tmp_path: Path) -> None:
+    source = camera(tmp_path, "a", [0, 10**16], fps=10.0)
+    assert [frame.time_s for frame in source.frames()] == [0.0, 1e15]
+
+
+def test_cameras_some_microseconds_apart_are_paired(tmp_path: Path) -> None:
+    left = [FIRST + k * STEP for k in range(6)]
+    right = [stamp + 13_000 for stamp in left]
+    del right[2]
+    top = [stamp - 7_000 for stamp in left[1:]] + [left[2] + 20_000_000]
+    sources = {"left": camera(tmp_path, "l", left), "right": camera(tmp_path, "r", right)}
+    sources["top"] = camera(tmp_path, "t", top)
+    sets = list(pair(paired_by_stamp(sources)))
+    found = [(each.number, "".join(name[0] for name in each.frames)) for each in sets]
+    stray = left[2] + 20_000_000
+    expected = [(left[0], "lr"), (left[1], "lrt"), (left[2], "lt"), (stray, "t")]
+    assert found == [*expected, *((number, "lrt") for number in left[3:])]
+    times = [sets[1].frames[name].time_s or 0.0 for name in ("left", "right", "top")]
+    assert np.diff(times) * 1e6 == pytest.approx([13, -20], abs=0.5)  # float64 has 0.24 µs there
+
+
+def test_a_quick_check_tells_that_frames_do_not_pair(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k in range(40):
+        for name in (f"l{k}", f"b{k + 1000}"):
+            cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((1024, 1280), np.uint8))
+    session = tmp_path / "session.toml"
+    session.write_text(with_lines(sonar="", sonar_keys=""), encoding="utf-8")
+    check_session(session, quick=True)
+    said = capsys.readouterr().out
+    assert "sensor 'left': 0 of its 40 frames pair with those of other sensors" in said

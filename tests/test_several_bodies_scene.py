@@ -1,0 +1,214 @@
+"""Several bodies in one scene: each detection is one body's, and identical ones keep their numbers.
+
+Scenes are drawn here from the cameras' geometry alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mixpose
+from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View
+from mixpose.poses.estimates import estimate_of
+from mixpose.poses.evaluate import evaluate
+from mixpose.poses.jsonl import PoseFile, read_poses
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Estimate, PointPattern
+from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
+from mixpose.scene import Member, Scene
+from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, overlap
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Track, Tracker
+
+RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
+TOOL = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [10, -30, 45], [35, 30, -40.0]])
+OTHER = np.array([[0, 0, 0], [45, 0, 20], [-30, 35, 0], [5, -55, 10], [20, 20, 50.0]])
+
+
+def camera(angle: float) -> PinholeCamera:
+    K = np.array([[1000, 0, 640], [0, 1000, 512], [0, 0, 1.0]])
+    T = from_rotation_vector([0, angle, 0], [0, 0, 1200])
+    return PinholeCamera(K, np.zeros(5), (1280, 1024), T)
+
+
+CAMERAS = {"left": camera(0.5), "right": camera(-0.5)}
+
+
+def body(name: str, points: Floats) -> Body:
+    return Body(name, tuple(PointFeature(point) for point in points))
+
+
+def scene_of(*bodies: Body) -> Scene:
+    """A scene in which the same body several times is as many identical ones."""
+    members = []
+    for k, one in enumerate(bodies):
+        alike = [other for other in bodies if other is one]
+        instance = [j for j, other in enumerate(bodies) if other is one].index(k)
+        tracker = Tracker.create(one, EstimatorOptions())
+        members.append(Member(tracker, instance if len(alike) > 1 else None))
+    return Scene(tuple(members))
+
+
+def views_of(bodies: Sequence[Body], poses: Sequence[Floats], seed: int) -> list[View]:
+    """What the cameras see, with 0.2 px of noise, and a false spot."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for name, one in CAMERAS.items():
+        spots = [np.array([[30.0, 40.0]])]
+        for each, T in zip(bodies, poses, strict=True):
+            spots.append(one.project(transform(T, each.means))[0])
+        points = rng.permutation(np.concatenate(spots))
+        points = points + 0.2 * rng.standard_normal(points.shape)
+        pattern = PointPattern(points, np.ones(len(points)))
+        views.append(View(name, one, Observation(pattern, 1.5)))
+    return views
+
+
+def at(x: float, y: float = 0.0, z: float = 0.0, turn: float = 0.0) -> Floats:
+    return from_rotation_vector([0.3, turn, -0.2], [x, y, z])
+
+
+def off(estimate: Estimate, T: Floats) -> tuple[float, float]:
+    assert estimate.T_world_object is not None
+    away = float(np.linalg.norm(estimate.T_world_object[:3, 3] - T[:3, 3]))
+    return away, float(rotation_angle_deg(estimate.T_world_object, T))
+
+
+def test_a_recording_of_two_different_and_two_identical_bodies() -> None:
+    session = mixpose.load_session(RECORDING / "session.toml")
+    lines = []
+    for k, one in enumerate(mixpose.run(session)):
+        lines.append(
+            PoseLine(
+                *(k, one.frame, one.time_s, one.object, one.status, one.T_world_object),
+                *(one.covariance, one.score, one.sensors, one.hypotheses, None, one.instance),
+            )
+        )
+    found = evaluate(
+        PoseFile(Path("poses"), {}, tuple(lines), "mm"), read_poses(RECORDING / "truth.jsonl")
+    )
+    assert len(lines) == 4 * 30
+    assert found.ok == 120
+    assert found.swaps is not None
+    assert found.swaps.count == 0
+    # one body alone before such cameras has 0.03 degrees at worst over 16 recordings; a rod is
+    # hidden by others for a third of the frames
+    for each in found.bodies.values():
+        assert each.rotation_deg is not None
+        assert each.translation is not None
+        assert each.rotation_deg.median < 0.03
+        assert each.rotation_deg.rms < 0.15
+        assert each.translation.rms < 0.06
+    assert found.nees is not None
+    assert found.nees.nees_per_dimension < 1.5
+
+
+def test_bodies_found_from_nothing_are_those_that_are_there() -> None:
+    bodies = [body("tool", TOOL), body("other", OTHER)]
+    poses = [at(-100, turn=0.4), at(110, 30, turn=-0.8)]
+    scene = scene_of(*bodies)
+    outcomes = scene.advance(scene.begin(), 0, None, views_of(bodies, poses, 1))
+    for outcome, T in zip(outcomes, poses, strict=True):
+        assert outcome.estimate.status == "ok"
+        away, angle = off(outcome.estimate, T)
+        assert away < 1.0  # 0.2 px are 0.24 mm at this distance
+        assert angle < 1.0
+
+
+def test_a_body_that_is_not_there_is_not_found_on_its_twin() -> None:
+    bodies = [body("rod", TOOL)]
+    one = bodies[0]
+    scene = scene_of(one, one)
+    outcomes = scene.advance(scene.begin(), 0, None, views_of(bodies, [at(20)], 2))
+    assert [outcome.estimate.status for outcome in outcomes] == ["ok", "lost"]
+
+
+def test_identical_bodies_found_from_nothing_are_numbered_along_x() -> None:
+    one = body("rod", TOOL)
+    poses = [at(150, turn=1.0), at(-140, 10), at(5, 40, turn=-0.7)]
+    scene = scene_of(one, one, one)
+    views = views_of([one] * 3, poses, 3)
+    outcomes = scene.advance(scene.begin(), 0, None, views)
+    x = [outcome.estimate.T_world_object[0, 3] for outcome in outcomes]  # type: ignore[index]
+    assert x == pytest.approx([-140, 5, 150], abs=2)
+    assert [outcome.estimate.instance for outcome in outcomes] == [0, 1, 2]
+
+
+def followed(scene: Scene, one: Body, path: Sequence[Sequence[Floats]]) -> list[list[Estimate]]:
+    tracks: Sequence[Track] = scene.begin()
+    found = []
+    for frame, poses in enumerate(path):
+        views = views_of([one] * len(poses), poses, frame)
+        outcomes = scene.advance(tracks, frame, None, views)
+        tracks = [outcome.track for outcome in outcomes]
+        found.append([outcome.estimate for outcome in outcomes])
+    return found
+
+
+def test_identical_bodies_keep_their_numbers_where_their_paths_cross() -> None:
+    one = body("rod", TOOL)
+    path = [[at(-90 + 12 * f, 70), at(90 - 12 * f, -70, 60, 1.0)] for f in range(16)]
+    found = followed(scene_of(one, one), one, path)
+    for estimates, poses in zip(found, path, strict=True):
+        assert [estimate.status for estimate in estimates] == ["ok", "ok"]
+        for estimate, T in zip(estimates, poses, strict=True):
+            assert off(estimate, T)[0] < 2.0
+
+
+def test_identical_bodies_lost_together_come_back_in_doubt_for_one_frame() -> None:
+    one = body("rod", TOOL)
+    here, there = at(-90, 70), at(90, -70, 60, 1.0)
+    gone: list[Floats] = []
+    path = [[here, there]] * 3 + [gone] * 8 + [[here, there]] * 2
+    found = followed(scene_of(one, one), one, path)
+    statuses = [[estimate.status for estimate in estimates] for estimates in found]
+    assert statuses[:3] == [["ok", "ok"]] * 3
+    assert statuses[3:11] == [["lost", "lost"]] * 8
+    assert statuses[11:] == [["ambiguous", "ambiguous"], ["ok", "ok"]]
+    told = found[11][0]
+    places = sorted(rival.T_world_object[0, 3] for rival in told.hypotheses)
+    assert places == pytest.approx([-90, 90], abs=2)
+    assert sum(rival.weight for rival in told.hypotheses) <= 1.0 + 1e-9
+
+
+def claim(numbers: list[int], places: list[list[float]], squared: list[float]) -> Claim:
+    return Claim(np.array(numbers), np.array(places), np.array(squared))
+
+
+def spots(*points: list[float]) -> list[View]:
+    pattern = PointPattern(np.array(points), np.ones(len(points)))
+    return [View("left", CAMERAS["left"], Observation(pattern, 1.0))]
+
+
+def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
+    views = spots([0.0, 0.0], [50.0, 0.0])
+    first = {"left": claim([0, 1], [[0.4, 0.0], [50.0, 0.0]], [0.16, 0.0])}
+    second = {"left": claim([0], [[0.1, 0.0]], [0.01])}
+    assert claimed(views, {0: first, 1: second})["left"].tolist() == [1, 0]
+    assert claimed(views, {1: second, 0: first})["left"].tolist() == [1, 0]
+    assert overlap(first, second) == 1.0
+
+
+def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
+    views = spots([0.0, 0.0])
+    first = {"left": claim([0], [[-1.5, 0.0]], [2.25])}
+    second = {"left": claim([0], [[1.5, 0.0]], [2.25])}
+    assert claimed(views, {0: first, 1: second})["left"].tolist() == [MERGED]
+
+
+def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:
+    views = spots([0.0, 0.0], [3.0, 0.0], [100.0, 0.0])
+    places = {0: {"left": np.array([[0.5, 0.0]])}, 1: {"left": np.array([[2.0, 0.0]])}}
+    assert expected_owners(views, places, 6.0)["left"].tolist() == [0, 1, -1]
+
+
+def test_an_estimate_is_the_same_line_by_line() -> None:
+    line = PoseLine(1, 0, None, "rod", "ok", np.eye(4), None, 1.0, {}, (), None, 2)
+    assert estimate_of(line).label == "rod-2"

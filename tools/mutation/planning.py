@@ -1,0 +1,137 @@
+"""Mutants of `design` and `importing`, and of the formats that these read."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_IMPORTS = ("test_import.py",)
+
+_FORMATS = (
+    Mutant(
+        "session-kalibr-chain-from-the-wrong-end",
+        "session/calibration/kalibr.py",
+        "T = step @ T",
+        "T = T @ step",
+        "the third camera of a chain stands elsewhere",
+        _IMPORTS,
+    ),
+    Mutant(
+        "session-kalibr-imu-the-wrong-way-round",
+        "session/calibration/kalibr.py",
+        "return None if T_imu_cam is None else inverse(T_imu_cam)",
+        "return T_imu_cam",
+        "cameras of OpenVINS stand elsewhere",
+        _IMPORTS,
+    ),
+    Mutant(
+        "session-colmap-pixels-from-their-corner",
+        "session/calibration/colmap.py",
+        "_CENTRE = 0.5 ",
+        "_CENTRE = 0.0 ",
+        "every pose from COLMAP is half a pixel off",
+        _IMPORTS,
+    ),
+    Mutant(
+        "session-mc-calib-poses-not-inverted",
+        "session/calibration/opencv.py",
+        'return inverse(rigid(values.reshape(4, 4), "camera_pose_matrix"))',
+        'return rigid(values.reshape(4, 4), "camera_pose_matrix")',
+        "the second camera stands on the wrong side",
+        _IMPORTS,
+    ),
+    Mutant(
+        "session-poses-in-files-keep-their-unit",
+        "session/sensor_setups.py",
+        "T[:3, 3] * scale_between(stated or unit, unit)",
+        "T[:3, 3]",
+        "Kalibr's metres are taken for the session's millimetres",
+        _IMPORTS,
+    ),
+    Mutant(
+        "session-bodies-keep-their-unit",
+        "session/marker_files/__init__.py",
+        "points=markers.points * scale_between(stated, unit)",
+        "points=markers.points",
+        "an .obj in metres is a thousandth as large",
+        ("test_session_bodies.py",),
+    ),
+    Mutant(
+        "session-damaged-rom-passes",
+        "session/marker_files/ndi.py",
+        "sum(content[_SUMMED_FROM:]) & 0xFFFF != stated",
+        "False",
+        "markers of a damaged file are believed",
+        ("test_session_bodies.py",),
+    ),
+)
+
+_IMPORTING = (
+    Mutant(
+        "importing-translations-keep-their-unit",
+        "importing/gather.py",
+        "scaled[:3, 3] *= factor",
+        "scaled[:3, 3] *= 1.0",
+        "a rig in metres is written as millimetres",
+    ),
+    Mutant(
+        "importing-copies-pass",
+        "importing/gather.py",
+        "if _same(a, b):",
+        "if False:",
+        "a camera that was copied by mistake is not noticed",
+    ),
+    Mutant(
+        "importing-worlds-mixed",
+        "importing/gather.py",
+        "if len(placed) > 1:",
+        "if len(placed) > 2:",
+        "cameras of two rigs are put into one world",
+    ),
+)
+
+_DESIGN = (
+    Mutant(
+        "design-marker-errors-apart-in-each-sensor",
+        "design/prediction.py",
+        "        G += JW @ A\n",
+        "        V += (JW @ A @ spread @ (JW @ A).swapaxes(-1, -2)).sum(axis=1)\n",
+        "markers seem to err less than they do where several sensors see them",
+    ),
+    Mutant(
+        "design-weighed-by-what-features-err-by",
+        "design/prediction.py",
+        "wide = sigma**2 * np.eye(A.shape[-2])",
+        "wide = noise**2 * np.eye(A.shape[-2])",
+        "the prediction is better than a run that weighs by sigma",
+    ),
+    Mutant(
+        "design-tip-turned-the-other-way",
+        "design/prediction.py",
+        "J[:, 0, 4], J[:, 0, 5] = z, -y",
+        "J[:, 0, 4], J[:, 0, 5] = -z, y",
+        "errors of the tip along x add up wrongly with those of the position",
+    ),
+    Mutant(
+        "design-averted-features-count",
+        "design/prediction.py",
+        "visible = visible & facing(sensor, poses, world, plan.body.normals)",
+        "visible = visible & True",
+        "markers on the back are counted",
+    ),
+    Mutant(
+        "design-mirror-images-are-alike",
+        "design/congruence.py",
+        "R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt",
+        "R = U @ Vt",
+        "bodies that are each other's mirror image are called alike",
+    ),
+    Mutant(
+        "design-new-camera-looks-away",
+        "design/advice.py",
+        "    forward = -direction\n",
+        "    forward = direction\n",
+        "the advice is to put a camera with its back to the body",
+    ),
+)
+
+MUTANTS = (*_FORMATS, *_IMPORTING, *_DESIGN)
