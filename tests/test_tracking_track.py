@@ -63,7 +63,7 @@ def test_a_velocity_is_believed_for_five_frames_without_a_pose(misses: int, fram
 def test_a_prediction_widens_with_every_frame_without_a_pose(misses: int, wider: float) -> None:
     track = Track((branch(),), frame=0)
     for _ in range(misses):
-        track = track.missed(SearchState())
+        track = track.missed(SearchState(), track.clutter)
     # by half each, then to four times and a tenth of that more for each
     (prediction,) = predict(track, EIGHT, 1, None)
     assert prediction.uncertainty == pytest.approx(wider * NARROW)

@@ -167,6 +167,8 @@ class Estimate:
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
+    guesses : tuple of int or None
+        Where the body was searched for: guesses made, tested on everything, and refined.
     delays : mapping of str to DelaySeen
         How late sensors are beyond what the session says, as far as the frames so far show it; no
         part of the pose line.
@@ -184,6 +186,7 @@ class Estimate:
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
     proposer: str = field(default="", compare=False)
+    guesses: tuple[int, int, int] | None = field(default=None, compare=False)
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
 
     @property

@@ -356,24 +356,24 @@ _PROPOSALS = (
     Mutant(
         "tracking-live-search-is-thorough",
         "tracking/proposers/searched.py",
-        "budget=data.rules.live if live else data.rules.search,",
-        "budget=data.rules.search,",
+        "budget = data.rules.live if live else data.rules.search",
+        "budget = data.rules.search",
         "a live search takes as long as a thorough one",
         (_STARTS,),
     ),
     Mutant(
         "tracking-live-search-begins-anew",
         "tracking/proposers/searched.py",
-        "state=data.track.search if live else None,",
-        "state=None,",
+        "state=data.track.search if live else None)",
+        "state=None)",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
     Mutant(
         "tracking-live-search-forgets",
         "tracking/tracker.py",
-        "return track.missed(data.log.state)",
-        "return track.missed(track.search)",
+        "return track.missed(data.log.state, clutter)",
+        "return track.missed(track.search, clutter)",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
@@ -470,6 +470,33 @@ _REFLECTION = (
         "return rival.log_evidence > -1e9 + ",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),
+    ),
+)
+
+_STATIC = (
+    Mutant(
+        "tracking-static-clutter-is-searched-first",
+        "tracking/static_clutter.py",
+        "if moving.all():",
+        "if True:",
+        "a room full of lamps hides what comes into it",
+        ("test_tracking_static.py",),
+    ),
+    Mutant(
+        "tracking-static-clutter-for-ever",
+        "tracking/static_clutter.py",
+        "np.where(met, 1, -1)",
+        "np.where(met, 1, 0)",
+        "a lamp that was moved is left out for ever",
+        ("test_tracking_static.py",),
+    ),
+    Mutant(
+        "tracking-what-stands-still-is-never-found",
+        "tracking/proposers/searched.py",
+        "return found + result.candidates",
+        "return found or result.candidates[:0]",
+        "a body that stands still is not looked for",
+        ("test_tracking_static.py",),
     ),
 )
 
@@ -574,6 +601,7 @@ MUTANTS = (
     *_PROPOSALS,
     *_TRACKER,
     *_REFLECTION,
+    *_STATIC,
     *_SEARCH_EVIDENCE,
     *_SEARCH,
 )

@@ -46,10 +46,12 @@ def warn_of_sources(sources: Mapping[str, Source]) -> None:
 
 
 def origin_of(estimate: Estimate) -> str:
-    """A frame's status, and which proposer its pose came from."""
-    if not estimate.proposer:
-        return estimate.status
-    return f"{estimate.status}, the pose came from: {estimate.proposer}"
+    """A frame's status, which proposer its pose came from, and what a search cost."""
+    origin = f", the pose came from: {estimate.proposer}" if estimate.proposer else ""
+    if estimate.guesses:
+        made, tested, refined = estimate.guesses
+        origin += f"; guesses of the search: {made} made, {tested} tested, {refined} refined"
+    return estimate.status + origin
 
 
 class Summary:

@@ -189,13 +189,13 @@ class Atlas:
             place = np.arange(len(number)) - np.searchsorted(number, number)
         most = int(place.max(initial=0)) + 1
         away = ((found.q[of] - corner[number]) * (1 / self._sigma)).astype(np.float32)[..., None]
-        away = away - np.arange(side) * np.float32(1 / self._sigma)
+        away = away - np.arange(side, dtype=np.float32) * np.float32(1 / self._sigma)
         bells = np.exp(np.float32(-0.5) * away * away)
-        slopes = bells * away
-        if found.flat.any():  # rows that are all alike
-            bells[found.flat[of], 1], slopes[found.flat[of], 1] = 1.0, 0.0
+        if self._flat.any():  # rows that are all alike
+            flat = self._flat[found.sensor[of]]
+            bells[flat, 1], away[flat, 1] = 1.0, 0.0
         bells[:, 1] *= found.share[of, None]
-        slopes[:, 1] *= found.share[of, None]
+        slopes = bells * away
         along_v = np.zeros((len(corner), most, 2, side), dtype=np.float32)
         along_u = np.zeros((len(corner), most, 2, side, 3), dtype=np.float32)
         along_v[number, place, 0], along_v[number, place, 1] = bells[:, 1], slopes[:, 1]
@@ -219,11 +219,15 @@ class Atlas:
 
 
 class Plane(NamedTuple):
-    """The plane of every sensor: origin in cells, pages along u and v, and cells along a page."""
+    """The plane of every sensor: origin in cells, pages along u and v, and cells along a page.
+
+    `is_cut` where some detections are too far away for it.
+    """
 
     origin: Floats
     shape: tuple[int, int]
     page: int
+    is_cut: bool = False
 
     @property
     def squares(self) -> int:
@@ -249,16 +253,19 @@ class Plane(NamedTuple):
         q = np.concatenate([one for k, one in enumerate(places) if k not in grids] or places)
         page = max(math.ceil(reach / REACH if len(grids) == len(places) else 2 * reach), MIN_PAGE)
         lower, upper = q.min(axis=0), q.max(axis=0)
-        if len(grids) < len(places) and _count(lower, upper, page) > MAX_PAGES:
+        is_cut = len(grids) < len(places) and _count(lower, upper, page) > MAX_PAGES
+        if is_cut:
             middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
             lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
-        for k in grids:
-            lower, upper = np.minimum(lower, places[k][0]), np.maximum(upper, places[k][1])
-        page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
+        if grids:
+            corners = np.concatenate([places[k] for k in grids])
+            lower = np.minimum(lower, corners.min(axis=0))
+            upper = np.maximum(upper, corners.max(axis=0))
+            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
         # half a cell is left, lest rounding puts a place on a square of the rim
         origin = page * np.floor((lower - (reach + page + 0.5)) / page)
         columns, rows = ((upper - lower + 2 * reach) / page).tolist()
-        return cls(origin, (int(columns) + 5, int(rows) + 5), page)
+        return cls(origin, (int(columns) + 5, int(rows) + 5), page, is_cut)
 
 
 def _count(lower: Floats, upper: Floats, page: int) -> float:
@@ -276,14 +283,13 @@ class _Detections(NamedTuple):
         Places, in cells from the origin of the plane.
     share : (D,) float32
         Of the sensor's density.
-    flat : (D,) bool
-        Whether the second coordinate is missing.
+    sensor : (D,) int
     squares : (D, 4) int
     """
 
     q: Floats
     share: Singles
-    flat: NDArray[np.bool_]
+    sensor: Indices
     squares: Indices
 
 
@@ -300,13 +306,12 @@ def _detections(
         parts = [(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0))]
     sensor, q, share = (np.concatenate(column) for column in zip(*parts, strict=True))
     first = plane.squares_of(q - reach)
-    inside = ((first >= 1) & (first <= np.array(plane.shape) - 3)).all(axis=1)
-    if not inside.all():
+    if plane.is_cut:
+        inside = ((first >= 1) & (first <= np.array(plane.shape) - 3)).all(axis=1)
         sensor, q, share, first = sensor[inside], q[inside], share[inside], first[inside]
     begin = plane.squares * sensor + first[:, 0] + plane.shape[0] * first[:, 1]
     squares = begin[:, None] + np.array([0, 1, plane.shape[0], plane.shape[0] + 1])
-    flat = np.array([_dimension(pattern) == 1 for pattern in patterns])[sensor]
-    return _Detections(q - plane.origin, share.astype(np.float32), flat, squares)
+    return _Detections(q - plane.origin, share.astype(np.float32), sensor, squares)
 
 
 def _dimension(pattern: Pattern) -> int:

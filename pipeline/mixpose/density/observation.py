@@ -90,11 +90,6 @@ class Observation:
         values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
         return float(values.sum())
 
-    @property
-    def is_sparse(self) -> bool:
-        """Whether its density costs little to draw everywhere: detections, and profiles."""
-        return self.cell is None or self.dimension == 1
-
     @cached_property
     def is_empty(self) -> bool:
         """Whether the sensor saw no feature at all."""

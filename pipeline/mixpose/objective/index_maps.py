@@ -1,8 +1,8 @@
 """Where the samples of a body lie in the arrays of densities, as maps for `cv2.remap`.
 
-One evaluation of a sampled objective is to cost hardly more than its look-ups.  So samples are
-kept in single precision, and sensors of one kind share one matrix product that ends in array
-indices.  Single precision suffices because samples are relative
+One evaluation of a sampled objective is to cost hardly more than its look-ups.  So for the paper's
+sensors, parallel beams and ranges, samples are kept in single precision, and all sensors share one
+matrix product that ends in array indices.  Single precision suffices because samples are relative
 to their centre: maps err by less than 1/1000 of an index in arrays of up to 4000 a side.
 
 Samples that a sensor does not see, or that are not finite, come to lie at `FAR`, outside any array.
@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from mixpose.density import FAR, Density
 from mixpose.rigid import transform
-from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
-from mixpose.sensors.pinhole import NEAREST
+from mixpose.sensors import ParallelBeam, RangeSensor, Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
@@ -109,7 +108,7 @@ class Samples:
 
 def index_maps(terms: Sequence[SampledTerm], samples: Samples) -> Projection:
     """Build the function from poses (k, 4, 4) to a pair of maps (k·B, W) per term."""
-    groups: dict[type[_Parallel | _Pinholes | _Ranges | _Any], list[int]] = {}
+    groups: dict[type[_Parallel | _Ranges | _Any], list[int]] = {}
     for number, term in enumerate(terms):
         groups.setdefault(_kind(term.sensor, samples), []).append(number)
     parts = [
@@ -174,45 +173,6 @@ class _Parallel:
         return [(maps[:, k], maps[:, k + 1]) for k in range(0, maps.shape[1], 2)]
 
 
-class _Pinholes:
-    """Pinhole cameras without lens distortion: one product, and a division by the depth.
-
-    Indices count from the middle of a window before they are divided, which keeps them exact.
-    """
-
-    def __init__(self, terms: Sequence[SampledTerm], samples: Samples) -> None:
-        self._samples = samples
-        self._count = len(terms)
-        pixels, depths, middles = [], [], []
-        for term in terms:
-            sensor, window = term.sensor, term.density.window
-            assert isinstance(sensor, PinholeCamera)
-            T = sensor.T_sensor_world[:3]
-            middle = (np.array(window.shape[::-1]) - 1) / 2
-            from_middle = sensor.camera_matrix[:2] @ T
-            from_middle -= np.outer(window.origin + middle * window.step, T[2])
-            pixels.append(from_middle / window.step)
-            depths.append(T[2:])
-            middles.append(middle)
-        self._by_pose = samples.by_pose(np.concatenate(pixels + depths))
-        self._middle = np.concatenate(middles).astype(np.float32)[:, None]
-        lower, upper = _index_limits(terms)
-        self._limits = lower[:, None], upper[:, None]
-
-    def __call__(self, poses: Floats) -> Sequence[Maps]:
-        count = 2 * self._count
-        with np.errstate(all="ignore"):
-            rows = self._samples.product(poses.reshape(-1, 16) @ self._by_pose)
-            maps, depth = rows[:, :count], rows[:, count:]
-            depth[~(depth > NEAREST)] = np.nan
-            by_camera = maps.reshape(len(maps), self._count, 2, -1)
-            by_camera /= depth[:, :, None]
-            maps = by_camera.reshape(maps.shape)
-            maps += self._middle
-            _hide(maps, *self._limits)
-        return [(maps[:, k], maps[:, k + 1]) for k in range(0, count, 2)]
-
-
 class _Ranges:
     """Range sensors: with a from the source to the centre, ‖a + z‖ = ‖a‖ + d / (‖a + z‖ + ‖a‖).
 
@@ -271,11 +231,9 @@ class _Any:
         return found
 
 
-def _kind(sensor: Sensor, samples: Samples) -> type[_Parallel | _Pinholes | _Ranges | _Any]:
+def _kind(sensor: Sensor, samples: Samples) -> type[_Parallel | _Ranges | _Any]:
     if isinstance(sensor, ParallelBeam):
         return _Parallel
-    if isinstance(sensor, PinholeCamera) and sensor.lens is None:
-        return _Pinholes
     if isinstance(sensor, RangeSensor) and samples.offsets is None:
         return _Ranges
     return _Any

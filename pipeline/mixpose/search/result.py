@@ -46,6 +46,14 @@ class SearchReport:
     tested: int = 0
     refined: int = 0
 
+    def joined(self, other: SearchReport | None) -> SearchReport:
+        """The cost of two searches."""
+        if other is None:
+            return self
+        return SearchReport(
+            self.made + other.made, self.tested + other.tested, self.refined + other.refined
+        )
+
 
 @dataclass(frozen=True)
 class SearchState:

@@ -34,7 +34,7 @@ from mixpose.objective import (
 )
 from mixpose.records import SensorReport
 from mixpose.rigid import twist_between
-from mixpose.search import SearchState
+from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.course import Expected, unknown
@@ -87,9 +87,10 @@ class Likelihood(Protocol):
 
 @dataclass
 class SearchLog:
-    """Where the search of a frame goes on in the next."""
+    """What the search of a frame cost, and where it goes on in the next."""
 
     state: SearchState = SearchState()
+    report: SearchReport | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,13 +23,11 @@ def has_outlier(judged: Judged, rules: ProposalRules) -> bool:
 
 def least_squares_step(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:
     """The step (6,) to where the features were met, merged ones in their middle."""
-    rows = [(np.sqrt(one.shares) / one.sigma)[:, None] for one in associations]
-    J = np.concatenate(
-        [(r[..., None] * m.J).reshape(-1, 6) for r, m in zip(rows, associations, strict=True)]
-    )
-    offsets = [(r * one.offsets).ravel() for r, one in zip(rows, associations, strict=True)]
+    J, offsets, shares = _rows(associations, free)
+    weights = np.sqrt(shares)[:, None]
     step = np.zeros(len(free))
-    step[free] = np.linalg.lstsq(J[:, free], np.concatenate(offsets), rcond=None)[0]
+    rows = (weights[..., None] * J).reshape(-1, J.shape[2])
+    step[free] = np.linalg.lstsq(rows, (weights * offsets).ravel(), rcond=None)[0]
     return step
 
 
@@ -43,7 +41,7 @@ def step_without_loosest(
     lowers the sum of squares by r_iᵀ (I − H_i)⁻¹ r_i (R. D. Cook and S. Weisberg, Residuals and
     Influence in Regression, 1982).
     """
-    J, offsets = _rows(associations, free)
+    J, offsets, _ = _rows(associations, free)
     step = np.zeros(len(free))
     coordinates = min(one.J.shape[1] for one in associations if one.met)
     fewest = -(-(int(free.sum()) + 2) // coordinates)
@@ -64,15 +62,18 @@ def step_without_loosest(
     return step
 
 
-def _rows(associations: Sequence[Association], free: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Jacobians (n, 2, k) and offsets (n, 2) of the met features in σ, missing coordinates 0."""
-    met = [one.shares > 0 for one in associations]
-    count = sum(int(np.count_nonzero(seen)) for seen in met)
-    J, offsets = np.zeros((count, 2, int(free.sum()))), np.zeros((count, 2))
-    begin = 0
-    for one, seen in zip(associations, met, strict=True):
-        m, end = one.J.shape[1], begin + int(np.count_nonzero(seen))
-        J[begin:end, :m] = one.J[seen][..., free] / one.sigma
-        offsets[begin:end, :m] = one.offsets[seen] / one.sigma
-        begin = end
-    return J, offsets
+def _rows(
+    associations: Sequence[Association], free: NDArray[np.bool_]
+) -> tuple[Floats, Floats, Floats]:
+    """Jacobians (n, 2, k) and offsets (n, 2) of the met features in σ, and their shares (n,).
+
+    A coordinate that is missing has rows of 0.
+    """
+    J, offsets, shares = [], [], []
+    for one in associations:
+        met = one.shares > 0
+        missing = 2 - one.J.shape[1]
+        J.append(np.pad(one.J[met][..., free], ((0, 0), (0, missing), (0, 0))) / one.sigma)
+        offsets.append(np.pad(one.offsets[met], ((0, 0), (0, missing))) / one.sigma)
+        shares.append(one.shares[met])
+    return np.concatenate(J), np.concatenate(offsets), np.concatenate(shares)

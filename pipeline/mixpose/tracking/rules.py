@@ -11,6 +11,7 @@ from mixpose.tracking.course import CourseRules
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.proposal_rules import ProposalRules
 from mixpose.tracking.range_rules import RangeRules
+from mixpose.tracking.static_clutter import StaticRules
 
 
 @dataclass(frozen=True)
@@ -24,5 +25,6 @@ class Rules:
     course: CourseRules = CourseRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
+    static: StaticRules = StaticRules()
     search: SearchBudget = THOROUGH
     live: SearchBudget = LIVE

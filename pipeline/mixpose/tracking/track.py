@@ -16,6 +16,7 @@ from mixpose.search import SearchState
 from mixpose.tracking.course import Course, CourseRules
 from mixpose.tracking.delays import DelayEvidence
 from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.static_clutter import StaticClutter
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -94,6 +95,8 @@ class Track:
         How late sensors are, as far as it was seen.
     doubted : bool
         Whether another body of the scene may have what the last pose meets.
+    clutter : StaticClutter
+        What stayed where it was while the body was lost.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -106,10 +109,11 @@ class Track:
     search: SearchState = SearchState()
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
+    clutter: StaticClutter = StaticClutter()
 
-    def missed(self, search: SearchState) -> Track:
+    def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
-        return replace(self, misses=self.misses + 1, search=search)
+        return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
 
 
 @dataclass(frozen=True)
@@ -246,7 +250,8 @@ def follow(
             else:
                 course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
-    return Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
+    after = Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
+    return replace(after, clutter=track.clutter)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

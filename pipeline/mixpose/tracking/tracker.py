@@ -8,7 +8,7 @@ everywhere else, and invents nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -122,7 +122,10 @@ class Tracker:
         ranked = self.ranked(data)
         verdict = self.verdict(data, ranked)
         followed = self.followed(data, frame, time_s, verdict)
-        return followed, self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
+        estimate = self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
+        if data.log.report:
+            estimate = replace(estimate, guesses=astuple(data.log.report))
+        return followed, estimate
 
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
@@ -219,7 +222,8 @@ class Tracker:
         """The track after a frame."""
         track, best = data.track, verdict.best
         if best is None:
-            return track.missed(data.log.state)
+            clutter = track.clutter.learnt(data.views, self.rules.static)
+            return track.missed(data.log.state, clutter)
         found = [
             Found(
                 one.T_world_object,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
 
 from mixpose.judgement import Judged
 from mixpose.search import Candidate, search_frame
@@ -16,19 +18,33 @@ def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
 
 
 def candidates_of(data: FrameData) -> list[Candidate]:
-    """What the search finds, the most evident first; with a budget, as far as that reaches."""
+    """What the search finds, the most evident first; with a budget, as far as that reaches.
+
+    Detections that stayed where they are while the body was lost are left out at first, for half
+    of the budget.
+    """
     live = data.options.search == "live"
-    result = search_frame(
-        data.views,
-        data.body,
+    budget = data.rules.live if live else data.rules.search
+    search = partial(
+        search_frame,
+        body=data.body,
         free=data.free,
         T_reference=data.T_reference,
         seed=data.options.seed,
-        budget=data.rules.live if live else data.rules.search,
-        state=data.track.search if live else None,
     )
+    found: list[Candidate] = []
+    moving = data.track.clutter.without(data.views, data.rules.static)
+    if any(one is not other for one, other in zip(moving, data.views, strict=True)):
+        half = None if budget.max_guesses is None else budget.max_guesses // 2
+        budget = replace(budget, max_guesses=half)
+        first = search(moving, budget=budget)
+        found, data.log.report = first.candidates, first.report
+        if found and found[0].evidence > budget.beyond_doubt:
+            return found
+    result = search(data.views, budget=budget, state=data.track.search if live else None)
     data.log.state = result.state
-    return result.candidates
+    data.log.report = result.report.joined(data.log.report)
+    return found + result.candidates
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:

@@ -1,0 +1,90 @@
+"""Detections that stay where they are, frame after frame, while the body is lost.
+
+Lamps, screws and reflections do not move; a body that is looked for will.  What is static is
+searched last.  A body that stands still is found all the same, only later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mixpose.constants import constant
+from mixpose.objective import View
+from mixpose.records import PointPattern
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StaticRules:
+    """When a detection counts as static."""
+
+    frames: int = constant(
+        10, "without the body in which a detection must be there: a moving one is for one or two"
+    )
+    same: float = constant(1.0, "σ_ε by which a static detection may be off: five times its noise")
+    most: int = constant(2000, "places remembered of a sensor: features of a textured room")
+
+
+@dataclass(frozen=True)
+class StaticClutter:
+    """Places with the number of frames that had a detection there, less those without.
+
+    Attributes
+    ----------
+    places : mapping of str to (K, m) float64
+        By sensor.
+    counts : mapping of str to (K,) int
+    """
+
+    places: Mapping[str, Floats] = field(default_factory=dict)
+    counts: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
+
+    def learnt(self, views: Sequence[View], rules: StaticRules) -> StaticClutter:
+        """What is remembered after one more frame without the body."""
+        places, counts = dict(self.places), dict(self.counts)
+        for view in views:
+            pattern = view.observation.pattern
+            if not isinstance(pattern, PointPattern):
+                continue
+            old = places.get(view.name, pattern.points[:0])
+            count = counts.get(view.name, np.zeros(0, dtype=np.intp))
+            near = _nearest(old, pattern.points, rules.same * view.observation.sigma)
+            met = np.isin(np.arange(len(old)), near)
+            count = np.minimum(count + np.where(met, 1, -1), 2 * rules.frames)
+            fresh = pattern.points[near == len(old)]
+            joined = np.concatenate([old, fresh])
+            count = np.concatenate([count, np.ones(len(fresh), dtype=np.intp)])
+            kept = np.argsort(-count, kind="stable")[: rules.most]
+            kept = kept[count[kept] > 0]
+            places[view.name], counts[view.name] = joined[kept], count[kept]
+        return StaticClutter(places, counts)
+
+    def without(self, views: Sequence[View], rules: StaticRules) -> list[View]:
+        """The views without static detections."""
+        return [self._moving(view, rules) for view in views]
+
+    def _moving(self, view: View, rules: StaticRules) -> View:
+        pattern = view.observation.pattern
+        if not isinstance(pattern, PointPattern) or view.name not in self.places:
+            return view
+        static = self.places[view.name][self.counts[view.name] >= rules.frames]
+        near = _nearest(static, pattern.points, rules.same * view.observation.sigma)
+        moving = near == len(static)
+        if moving.all():
+            return view
+        rest = PointPattern(pattern.points[moving], pattern.weights[moving])
+        return replace(view, observation=replace(view.observation, pattern=rest))
+
+
+def _nearest(places: Floats, points: Floats, reach: float) -> NDArray[np.intp]:
+    """The place (M,) within reach of each point; the number of places where there is none."""
+    if not len(places):
+        return np.zeros(len(points), dtype=np.intp)
+    return np.asarray(cKDTree(places).query(points, distance_upper_bound=reach)[1])
