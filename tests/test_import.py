@@ -230,6 +230,7 @@ def test_lenses_of_colmap_and_its_corner_of_pixels(
     assert camera.intrinsics.model == ("fisheye" if "FISHEYE" in model else "pinhole")
 
 
+COLMAP_LINE = "1 PINHOLE 640 480 1 1 3 2\n"
 WRONG = {
     "kalibr model": (texts.kalibr().replace("model: pinhole", "model: omni"), '"omni"'),
     "kalibr lens": (texts.kalibr().replace("radtan", "fov"), 'cam0.distortion_model: found "fov"'),
@@ -260,12 +261,20 @@ WRONG = {
         texts.toml("cam_").replace("rotation = [", "rotation = [1.0, ", 1),
         "cam_0.rotation: found",
     ),
-    "colmap model": ("1 FOV 640 480 1 1 320 240 0.1\n", "camera[1]: found"),
+    "colmap model": ("1 FOV 640 480 1 1 320 240 0.1\n", "camera.1: found"),
     "colmap parameters": (
         "1 OPENCV 640 480 1 1 320 240\n",
         "found 4 parameters of OPENCV; allowed: 8",
     ),
     "colmap number": ("1 PINHOLE 640 480 1 x 320 240\n", 'found "x"; allowed: a finite number'),
+    "colmap size": (
+        "1 PINHOLE 640 480 1 1 3 2\n2 PINHOLE x 480 1 1 3 2\n",
+        'found "x"; allowed: an in',
+    ),
+    "colmap cut": (
+        "1 PINHOLE 640 480 1 1 3 2\n2 PINHOLE\n",
+        'found "2 PINHOLE"; allowed: CAMERA_ID',
+    ),
     "colmap alone": ("1 1 0 0 0 0 0 0 1 a.png\n\n", "cameras.txt is missing"),
     "unknown": ("hello: world\n", "found hello; allowed: Kalibr"),
     "binary": ("\x00\x01", "not YAML"),

@@ -15,7 +15,7 @@ from mixpose.judgement import (
     AcceptanceRules,
     Association,
     Judged,
-    Noise,
+    Residuals,
     associate,
     beliefs,
     convinces,
@@ -38,7 +38,7 @@ SURE = Judged(
     measurements=32.0,
     covariance=1e-6 * np.eye(6),
     log_evidence=50.0,
-    noise=Noise(),
+    residuals=Residuals(),
 )
 ELSEWHERE = perturb(TRUTH, np.repeat([90.0, 0.8], 3))
 CORNERS = ((50.0, 50.0, 0.0), (-50.0, 50.0, 0.0), (-50.0, -50.0, 0.0), (50.0, -50.0, 0.0))
@@ -143,11 +143,13 @@ def association(name: str, met: float, expected: float = 8.0, unseen: float = 0.
         explained=1.0,
         features=np.arange(8),
         shares=np.full(8, met / 8),
+        places=np.zeros((8, 2)),
         offsets=np.zeros((8, 2)),
         J=np.zeros((8, 2, 6)),
         expected=expected,
         unseen=unseen,
         sigma=1.5,
+        finest=0.05,
         crowd=1e-5,
         count=8.0,
     )

@@ -1,4 +1,4 @@
-"""The odds for a pose against clutter, and the noise of detections, worked out by hand."""
+"""The odds for a pose against clutter, worked out by hand."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.judgement import Association, DetectionModel, Noise, NoiseModel, Prior
+from mixpose.judgement import Association, DetectionModel, Prior
 from mixpose.judgement.evidence import log_evidence
-from mixpose.judgement.noise import covariance_of, information_of, noise_of, noises
+from mixpose.judgement.noise import information_of
 
 Floats = NDArray[np.float64]
 
 FREE = np.ones(6, dtype=np.bool_)
 BY_VOLUME = DetectionModel(by_count=False)
-MODEL = NoiseModel()
+S2 = 0.04  # of the noise, in σ²
 KNOWN = 1e4 * np.eye(6)
 """An information that a prior of unit width adds nothing to, but for 1e-4."""
 
@@ -26,11 +26,13 @@ SIX = Association(
     explained=1.0,
     features=np.arange(6),
     shares=np.ones(6),
+    places=np.zeros((6, 2)),
     offsets=np.zeros((6, 2)),
     J=np.random.default_rng(0).normal(0, 1, (6, 2, 6)),
     expected=6.0,
     unseen=0.0,
     sigma=2.0,
+    finest=0.05,
     crowd=1e-5,
     count=6.0,
 )
@@ -44,13 +46,12 @@ def evidence(
     detection: DetectionModel = BY_VOLUME,
 ) -> float:
     prior = Prior(log_density, np.ones(6))
-    return log_evidence([one], information, Noise(), FREE, prior, 1.0, detection, MODEL)
+    return log_evidence([one], information / S2, np.array([S2]), FREE, prior, 1.0, detection)
 
 
 def test_the_odds_by_volume_are_those_of_the_formula() -> None:
-    # variance 0.2² of σ², as no residuals say otherwise
-    s2, met = 0.04, log(0.75 / (2.0**2 * 1e-5 * 2 * pi * 0.04))
-    laplace = 0.5 * (6 * log(2 * pi) - 6 * log(1e4 / s2 + 1))
+    met = log(0.75 / (2.0**2 * 1e-5 * 2 * pi * S2))
+    laplace = 0.5 * (6 * log(2 * pi) - 6 * log(1e4 / S2 + 1))
     assert evidence(SIX) == pytest.approx(6 * met + laplace - 10.0)
 
 
@@ -104,7 +105,7 @@ def two_cameras_at_right_angles() -> list[Association]:
 def odds_by_volume(found: list[Association], *, in_space: bool = True) -> float:
     detection = DetectionModel(by_count=False, in_space=in_space)
     prior = Prior(0.0, np.ones(6))
-    return log_evidence(found, KNOWN, Noise(), FREE, prior, 200.0, detection, MODEL)
+    return log_evidence(found, KNOWN / S2, np.full(len(found), S2), FREE, prior, 200.0, detection)
 
 
 def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it() -> None:
@@ -140,45 +141,9 @@ def test_a_point_in_space_is_off_as_far_as_its_place_is_from_the_feature() -> No
     assert odds_by_volume(both) - off == pytest.approx(2.0, rel=1e-3)
 
 
-def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:
-    # tables: F of 6 and 10 degrees is 3.217 at 95 %, χ² of 6 is 12.592
-    assert MODEL.enlargement(6, 10.0) == pytest.approx(6 * 3.217 / 12.592, rel=1e-3)
-    assert MODEL.enlargement(6, 1e6) == pytest.approx(1.0, rel=1e-4)
-    covariance = covariance_of(KNOWN, Noise(10 * 0.25, 10.0), FREE, MODEL)
-    expected = 0.25 / 1e4 * 6 * 3.217 / 12.592
-    np.testing.assert_allclose(covariance, expected * np.eye(6), rtol=1e-3, atol=1e-12)
-
-
-def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:
-    goes_by, remembered = noises(Noise(2.0, 40.0), Noise(0.5, 10.0), MODEL)
-    assert goes_by == remembered
-    assert remembered.squares == pytest.approx(0.95 * 2.0 + 0.5)
-    assert remembered.degrees == pytest.approx(0.95 * 40.0 + 10.0)
-
-
-def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
-    # 4 times the variance, of 10 and 40 degrees: F is 3.9 at 99.9 %, so that 3.5 times is chance
-    before = Noise(2.0, 40.0)
-    own = Noise(10 * 0.05 * 4.5, 10.0)
-    assert noises(before, own, MODEL) == (own, Noise(1.6, 32.0))
-    chance = Noise(10 * 0.05 * 3.5, 10.0)
-    assert noises(before, chance, MODEL)[0].degrees == pytest.approx(48.0)
-
-
-def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
-    offsets = np.full((6, 2), 0.2)  # 0.1 σ along each axis
-    noise = noise_of([replace(SIX, offsets=offsets)], FREE)
-    assert noise.squares == pytest.approx(12 * 0.01)
-    assert noise.degrees == pytest.approx(6.0)
-    assert noise_of([replace(SIX, shares=np.array([1.0, 1, 1, 0, 0, 0]))], FREE) == Noise(0.0, 0.0)
-
-
-def test_where_no_residuals_say_otherwise_detections_err_by_a_fifth_of_sigma() -> None:
-    covariance = covariance_of(KNOWN, Noise(), FREE, NoiseModel(confidence=0.0))
-    np.testing.assert_allclose(covariance, 0.04 / 1e4 * np.eye(6), atol=1e-15)
-
-
 def test_information_is_that_of_least_squares() -> None:
     shares = np.array([1.0, 1.0, 0.5, 1.0, 0.0, 1.0])
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))
-    np.testing.assert_allclose(information_of([replace(SIX, shares=shares)]), expected)
+    np.testing.assert_allclose(
+        information_of([replace(SIX, shares=shares)], np.array([S2])), expected / S2
+    )

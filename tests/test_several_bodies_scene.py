@@ -178,6 +178,30 @@ def test_identical_bodies_lost_together_come_back_in_doubt_for_one_frame() -> No
     assert sum(rival.weight for rival in told.hypotheses) <= 1.0 + 1e-9
 
 
+def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_not_seen() -> None:
+    shared = TOOL[:4]
+    one = body("one", np.concatenate([shared[:3], [[70.0, 60.0, -50.0]], [[-60.0, -40.0, 30.0]]]))
+    other = body("other", np.concatenate([shared[:3], [[-50.0, 20.0, 70.0]], [[30.0, 80.0, 40.0]]]))
+    part = body("part", shared[:3])
+    T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
+    scene = scene_of(one, other)
+    alone = scene.advance(scene.begin(), 0, None, views_of([part], [T], 5))
+    assert "ok" not in [outcome.estimate.status for outcome in alone]
+    both = scene.advance(scene.begin(), 0, None, views_of([one, other], [T, elsewhere], 6))
+    assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
+
+
+def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
+    isosceles = np.array([[0, 45, 0], [-30, 0, 0], [30, 0, 0.0]])
+    whole = np.concatenate([isosceles, [[10, 15, 60.0]], [[-20, -40, 35.0]], [[45, 30, -50.0]]])
+    one, other, part = body("one", whole), body("other", OTHER), body("part", isosceles)
+    T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
+    scene = scene_of(one, other)
+    outcomes = scene.advance(scene.begin(), 0, None, views_of([part, other], [T, elsewhere], 5))
+    assert outcomes[0].estimate.status != "ok"
+    assert outcomes[1].estimate.status == "ok"
+
+
 def claim(numbers: list[int], places: list[list[float]], squared: list[float]) -> Claim:
     return Claim(np.array(numbers), np.array(places), np.array(squared))
 

@@ -19,7 +19,7 @@ from mixpose.simulation import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = [
-    *("camera_and_ranges", "one_camera_video", "parallel_beams", "range_profiles"),
+    *("camera_and_ranges", "one_camera_video", "parallel_beams", "range_profiles", "real_room"),
     *("several_bodies", "two_cameras"),
 ]
 
@@ -60,7 +60,7 @@ def test_the_first_frames_come_out_anew(name: str, tmp_path: Path) -> None:
         assert one.T_world_object is not None
         assert other.T_world_object is not None
         np.testing.assert_allclose(one.T_world_object, other.T_world_object, atol=1e-9)
-    for path in out.glob("*.png"):
+    for path in (*out.glob("*.png"), *out.glob("*.jpg")):
         assert np.array_equal(read_image(path), read_image(kept / path.name))
     for path in out.glob("*.npy"):
         np.testing.assert_allclose(np.load(path), np.load(kept / path.name)[:2], atol=1e-6)

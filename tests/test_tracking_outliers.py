@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import Observation
+from mixpose.density import ErrorRules, Observation
 from mixpose.fit import EstimatorOptions, fit_near
-from mixpose.fit.near import SHARP
 from mixpose.judgement import Judged, judge
 from mixpose.objective import View, matched_objective
-from mixpose.optimise import ascend
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Rules, Tracker
-from mixpose.tracking.outliers import has_outlier, step_without_loosest
+from mixpose.tracking import Tracker
 
 Floats = NDArray[np.float64]
 
@@ -90,25 +87,24 @@ def test_a_hidden_feature_beside_a_seen_one_is_no_pair() -> None:
     assert association.met == pytest.approx(5.0)
 
 
-def test_a_closer_look_is_hardly_bent_by_a_false_detection_beside_a_hidden_feature(
+def test_a_false_detection_beside_a_hidden_feature_does_not_pull(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     T = from_parts(Rotation.from_rotvec([0.3, -0.4, 0.2]).as_matrix(), np.array([50.0, 40.0, 5.0]))
     views = []
     for k, camera in enumerate(pinhole_cameras):
         points = camera.project(transform(T, POINTS))[0]
-        points[4] += [2.0, 1.0] if k == 0 else [0.0, 0.0]
+        points[2] += [2.0, 1.0] if k == 0 else [0.0, 0.0]
         pattern = PointPattern(points, np.ones(len(points)))
         views.append(View(str(k), camera, Observation(pattern, SIGMA)))
     tracker = Tracker.create(BODY, EstimatorOptions(), T)
     u, samples = tracker.start_uncertainty, tracker.samples
-    T_bent = fit_near(views, BODY, T, u, tracker.options, samples).T_world_object
-    bent = judged_at(T_bent, views)
-    rules = Rules().proposals
-    assert has_outlier(bent, rules)
-    T_begin = perturb(T_bent, step_without_loosest(bent.associations, tracker.free, rules))
-    # eleven of twelve are exact: without the twelfth they agree on the truth
-    assert rotation_angle_deg(T_begin, T) < 1e-3
-    narrow = matched_objective(views, BODY, [rules.narrow * SIGMA] * 2)
-    T_sharp = ascend(narrow.linearise, perturb, T_begin, tracker.free, SHARP).state
-    assert rotation_angle_deg(T_sharp, T) < 0.3 * rotation_angle_deg(T_bent, T)
+
+    def angle(errors: ErrorRules) -> float:
+        fit = fit_near(views, BODY, T, u, tracker.options, samples, errors=errors)
+        return float(rotation_angle_deg(fit.T_world_object, T))
+
+    # at sigma the twelfth, 2.2 px off, pulls with more than half of its weight; the other eleven
+    # are exact, and the last blur is too narrow for it to pull at all
+    assert angle(ErrorRules(narrowest=1.0)) > 0.25
+    assert angle(ErrorRules()) < 1e-3

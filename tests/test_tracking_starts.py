@@ -19,8 +19,8 @@ from mixpose.judgement import (
     Association,
     DetectionModel,
     Judged,
-    Noise,
     NoiseModel,
+    Residuals,
 )
 from mixpose.objective import View
 from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg, twist_between
@@ -50,11 +50,13 @@ def association(name: str, met: float, off: float = 0.1, surplus: float = 0.0) -
         explained=1.0,
         features=np.arange(8),
         shares=np.full(8, met / 8),
+        places=np.zeros((8, 2)),
         offsets=np.full((8, 2), 1.5 * off),
         J=np.zeros((8, 2, 6)),
         expected=8.0,
         unseen=0.0,
         sigma=1.5,
+        finest=0.05,
         crowd=1e-5,
         count=8.0,
         surplus=surplus,
@@ -63,7 +65,7 @@ def association(name: str, met: float, off: float = 0.1, surplus: float = 0.0) -
 
 def judged_at(T: Floats, *associations: Association) -> Judged:
     coverage = sum(one.coverage for one in associations) / max(len(associations), 1)
-    return Judged(T, {}, 1.0, coverage, 32.0, 1e-6 * np.eye(6), 50.0, Noise(), associations)
+    return Judged(T, {}, 1.0, coverage, 32.0, 1e-6 * np.eye(6), 50.0, Residuals(), associations)
 
 
 def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> FrameData:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import AcceptanceRules, DetectionModel, Noise, flat_prior, judge
+from mixpose.judgement import AcceptanceRules, DetectionModel, Residuals, flat_prior, judge
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.search import SearchState
@@ -36,7 +36,7 @@ def moved(frame: float) -> Floats:
 
 def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
     found = [Found(T, 1.0 / len(places)) for T in places]
-    return follow(track, EIGHT, found, frame, time_s, Noise(), {}, RULES)
+    return follow(track, EIGHT, found, frame, time_s, Residuals(), {}, RULES)
 
 
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
@@ -149,7 +149,7 @@ def test_the_noise_of_an_ambiguous_frame_is_not_remembered(
     views = detect(pinhole_cameras, wand, TRUTH, noise=0.2)
     track, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
     assert estimate.status == "ambiguous"
-    assert track.noise == Noise()
+    assert track.residuals == Residuals()
 
 
 def test_a_sure_frame_has_no_rivals_and_its_noise_is_remembered(
@@ -160,8 +160,8 @@ def test_a_sure_frame_has_no_rivals_and_its_noise_is_remembered(
     track, estimate = tracker.advance(tracker.begin(), 0, 0.0, views)
     assert estimate.status == "ok"
     assert estimate.hypotheses == ()
-    # 2 · 8 · 2 coordinates, six of which the pose has used up
-    assert track.noise.degrees == pytest.approx(26)
+    # 2 · 8 · 2 coordinates, six of which the pose has used up, counted by how near they are met
+    assert track.residuals.total.degrees == pytest.approx(26, rel=0.01)
 
 
 def test_a_start_may_be_as_far_off_as_is_said() -> None:

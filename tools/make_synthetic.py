@@ -318,6 +318,57 @@ spot_sigma = 4.0
 sigma = 1.5
 """
 
+REAL_ROOM = """\
+# What real rigs do, told in this file: spheres in place of points, rolling shutters, a camera that
+# is late.  What it does not tell: a lamp, another body, a polished table, an arm in front, JPEG.
+unit = "mm"
+
+[object]
+name = "spheres"
+shape = "sphere"
+radius = 6.0
+points = [
+    [0.0, 0.0, 0.0],
+    [95.0, 12.0, -8.0],
+    [-62.0, 70.0, 14.0],
+    [-38.0, -84.0, 22.0],
+    [41.0, 48.0, 76.0],
+    [58.0, -57.0, 45.0],
+    [-74.0, -10.0, -58.0],
+]
+
+[extract]
+method = "blobs"
+sigma = 1.5
+
+[[sensor]]
+name = "left"
+model = "pinhole"
+source = "left*.jpg"
+fps = 30
+resolution = [400, 320]
+camera_matrix = [[508.4, 0.0, 201.7], [0.0, 507.9, 157.3], [0.0, 0.0, 1.0]]
+distortion = [-0.12, 0.05, 0.0004, -0.0003, 0.0]
+readout = 0.02
+exposure = 0.004
+rotation_vector = [0.06, -0.72, 0.02]
+translation = [14.0, -9.0, 780.0]
+
+[[sensor]]
+name = "right"
+model = "pinhole"
+source = "right*.jpg"
+fps = 30
+resolution = [400, 320]
+camera_matrix = [[507.2, 0.0, 197.9], [0.0, 507.8, 162.4], [0.0, 0.0, 1.0]]
+distortion = [-0.11, 0.04, -0.0002, 0.0005, 0.0]
+readout = 0.02
+exposure = 0.004
+delay = 0.005
+rotation_vector = [-0.04, 0.81, -0.03]
+translation = [-11.0, 6.0, 820.0]
+"""
+
 
 @dataclass(frozen=True)
 class Recording:
@@ -328,6 +379,23 @@ class Recording:
 
 
 RECORDINGS = {
+    "real_room": Recording(
+        REAL_ROOM,
+        SimulationOptions(
+            frames=20,
+            seed=16,
+            background=-2.0,
+            noise=1.0,
+            lamps=1,
+            others=1,
+            mirror=0.4,
+            occluder=1,
+            jpeg=75,
+            amplitude_translation=25.0,
+            amplitude_rotation_deg=22.0,
+            period_s=2.0,
+        ),
+    ),
     "camera_and_ranges": Recording(
         CAMERA_AND_RANGES,
         SimulationOptions(

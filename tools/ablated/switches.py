@@ -14,7 +14,6 @@ from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
-from mixpose.tracking.proposers.without_outlier import without_outlier
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 FREE = 0.0
@@ -92,7 +91,6 @@ SWITCHES = (
     Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
     Switch("no mirrored", without_proposer(mirrored)),
-    Switch("no without_outlier", without_refinement(without_outlier)),
     Switch("no merged_pair", without_refinement(merged_pair)),
     Switch("no without_sensor", without_refinement(without_sensor)),
     Switch("nothing merged", ruled("judgement.association", merged=False)),
@@ -105,7 +103,9 @@ SWITCHES = (
     Switch("no fusion of ranges", unfused),
     Switch("noise: no memory", ruled("judgement.noise", memory=0.0)),
     Switch("noise: no outdone", ruled("judgement.noise", known=NEVER)),
-    Switch("noise: no typical", ruled("judgement.noise", typical_degrees=1e-3)),
+    Switch("noise: no typical", ruled("judgement.noise.errors", typical_degrees=1e-3)),
+    Switch("noise: nothing lasts", ruled("judgement.noise", lasting=0.0, slanted=0.0)),
+    Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),

@@ -370,4 +370,28 @@ _SAMPLED = (
     ),
 )
 
-MUTANTS = (*_ATLAS, *_BLUR, *_MET, *_PROJECTION, *_KERNEL, *_MATCHED, *_SAMPLED)
+_ERRORS = (
+    Mutant(
+        "density-errors-cut-by-the-blur",
+        "density/extraction_error.py",
+        "factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))",
+        "factor = np.ones(count)",
+        "the noise seems smaller than it is",
+    ),
+    Mutant(
+        "density-errors-of-all-detections-alike",
+        "density/extraction_error.py",
+        "weights = shares * np.exp(-0.25 * squared / blurs[sensor] ** 2)",
+        "weights = shares",
+        "a cut spot is noise of all others",
+    ),
+    Mutant(
+        "density-errors-of-a-frame-forgotten",
+        "density/extraction_error.py",
+        "np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))",
+        "np.sqrt(variances)",
+        "a frame that is not like those before it is looked at too narrowly",
+    ),
+)
+
+MUTANTS = (*_ATLAS, *_ERRORS, *_BLUR, *_MET, *_PROJECTION, *_KERNEL, *_MATCHED, *_SAMPLED)

@@ -44,6 +44,17 @@ _NEAR = (
     ),
 )
 
+_NARROW = (
+    Mutant(
+        "fit-ends-at-sigma",
+        "fit/near.py",
+        "clear = (offsets.squared <= limits) | (offsets.shares == 0)",
+        "clear = offsets.squared < np.inf",
+        "a cut spot bends the pose",
+        ("test_tracking_outliers.py",),
+    ),
+)
+
 _PROBABLE = (
     Mutant(
         "fit-start-ignored",
@@ -180,30 +191,54 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "return frame.variance > limit * self.variance",
+        "return bool(ratio > fdtri(degrees, known, model.by_chance))",
         "return False",
         "a frame of large residuals is as sure as those before it",
     ),
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "degrees = max(measurements - int(free.sum()), 0.0)",
-        "degrees = max(measurements, 0.0)",
+        "offsets, count = _offsets(associations), int(free.sum())",
+        "offsets, count = _offsets(associations), 0",
         "noise seems smaller than it is",
     ),
     Mutant(
         "judgement-information-in-sigmas",
         "judgement/noise.py",
-        "one.shares / one.sigma**2",
-        "one.shares / one.sigma",
+        "one.shares / (variance * one.sigma**2)",
+        "one.shares / (variance * one.sigma)",
         "covariances depend on the unit of a sensor",
     ),
     Mutant(
         "judgement-unknown-noise-is-sigma",
         "judgement/noise.py",
-        "noise.variance if noise.degrees >= 1 else model.typical**2",
-        "noise.variance if noise.degrees >= 1 else 0.0",
+        "typical = 0.0 if degrees >= 1 else model.errors.typical_degrees",
+        "typical = 0.0",
         "three features in one camera have an exact pose",
+    ),
+)
+
+_FIELDS = (
+    Mutant(
+        "judgement-fields-of-a-sensor-are-noise",
+        "judgement/noise.py",
+        "np.tensordot(shares.variances * factors, parts, 1)",
+        "shares.variances[0] * factors[0] * parts[0]",
+        "a camera that was turned after its calibration leaves the pose as sure as before",
+    ),
+    Mutant(
+        "judgement-fields-that-the-pose-takes-are-seen",
+        "judgement/noise.py",
+        "left = [one - J @ each for one, each in zip(P, drawn, strict=True)]",
+        "left = [one for one, each in zip(P, drawn, strict=True)]",
+        "offsets that a pose takes for its own are thought to be small",
+    ),
+    Mutant(
+        "judgement-outliers-in-the-covariance",
+        "judgement/noise.py",
+        "shares = np.where(inlying, one.shares, 0.0)",
+        "shares = one.shares",
+        "a cut spot makes a frame unsure",
     ),
 )
 
@@ -376,7 +411,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-worse-twin-kept",
         "judgement/acceptance.py",
-        "if new.log_evidence > old.log_evidence:",
+        "if new.log_evidence > old.log_evidence - rules.as_evident:",
         "if new.log_evidence < old.log_evidence:",
         "of two fits that are one pose the worse is told",
     ),
@@ -428,4 +463,14 @@ _JUDGE = (
     ),
 )
 
-MUTANTS = (*_NEAR, *_PROBABLE, *_MISFIT, *_NOISE, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
+MUTANTS = (
+    *_NEAR,
+    *_NARROW,
+    *_PROBABLE,
+    *_MISFIT,
+    *_NOISE,
+    *_FIELDS,
+    *_EVIDENCE,
+    *_ACCEPTANCE,
+    *_JUDGE,
+)

@@ -8,7 +8,6 @@ _PROPOSERS = "test_tracking_proposers.py"
 _STARTS = "test_tracking_starts.py"
 _RANGES = "test_tracking_ranges.py"
 _DELAYS = "test_tracking_delays.py"
-_OUTLIERS = "test_tracking_outliers.py"
 _WINDOWS = "test_tracking_gating.py"
 _TRACK = "test_tracking_track.py"
 
@@ -300,26 +299,10 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers/merged_pair.py",
-        "if at is not begin:",
-        "if at is begin:",
+        "return [] if at is judged else",
+        "return [] if at is not judged else",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
-    ),
-    Mutant(
-        "tracking-closer-look-not-closer",
-        "tracking/proposers/without_outlier.py",
-        "narrowed=rules.narrow)",
-        "narrowed=1.0)",
-        "a false detection beside a hidden feature bends the pose",
-        (_PROPOSERS,),
-    ),
-    Mutant(
-        "tracking-loosest-feature-kept",
-        "tracking/outliers.py",
-        "kept = np.arange(len(J)) != int(np.argmax(gain))",
-        "kept = np.arange(len(J)) != int(np.argmin(gain))",
-        "the features that agree are left out",
-        (_OUTLIERS,),
     ),
     Mutant(
         "tracking-slips-never-looked-for",
@@ -423,8 +406,8 @@ _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
         "tracking/tracker.py",
-        'noise = best.noise if verdict.status == "ok" else track.noise',
-        "noise = best.noise",
+        'residuals = best.residuals if verdict.status == "ok" else track.residuals',
+        "residuals = best.residuals",
         "residuals of a wrong pose make the frames after it unsure",
         (_TRACK,),
     ),

@@ -3,7 +3,8 @@
 `recordings` reads every frame and counts features, `advice` says which key to change where the
 count is off and the body is found with that change, `sensor_keys` doubts calibrations and widths,
 `placement` looks at where sensors stand and the body starts, `lookalikes` finds poses that the
-sensors could not tell apart, `typical` poses where the session names no start.
+sensors could not tell apart, `shared_parts`
+bodies that could be taken for each other, `typical` poses where the session names no start.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
 from mixpose.checking.sensor_keys import key_warnings
+from mixpose.checking.shared_parts import shared_part_warnings
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
 __all__ = [
@@ -29,6 +31,7 @@ __all__ = [
     "numbers_of",
     "placement_lines",
     "placement_warnings",
+    "shared_part_warnings",
     "survey",
     "typical_poses",
     "with_image_sizes",

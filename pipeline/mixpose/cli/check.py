@@ -25,6 +25,7 @@ from mixpose.checking import (
     numbers_of,
     placement_lines,
     placement_warnings,
+    shared_part_warnings,
     survey,
     typical_poses,
     with_image_sizes,
@@ -35,7 +36,7 @@ from mixpose.frames import ALL_NUMBERS, Source
 from mixpose.judgement import expected_covariance
 from mixpose.rigid import TWIST_NAMES, Floats
 from mixpose.runner import open_sources
-from mixpose.session import SensorSetup, Session, load_session
+from mixpose.session import ObjectSetup, SensorSetup, Session, load_session
 
 _TYPICAL_POSES = 3
 _AWAY = (1.0, 2.0, 4.0)  # times the distance at which the body fills half of one camera's image
@@ -88,7 +89,8 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
         source.check_times(ALL_NUMBERS)
     report = _Report()
     report.say("session", f"{session.path}, lengths in {session.unit}")
-    _say_object(report, session)
+    for one in session.objects:
+        _say_object(report, session, one)
     surveys: dict[str, Survey] = {}
     with _progress(sources, quick=quick) as done:
         for setup in session.sensors:
@@ -100,7 +102,9 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
     report.warnings += _pairing_warnings(sources)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
-    _say_accuracy(report, sized)
+    for one in session.objects:
+        _say_accuracy(report, sized.alone(one.body.name))
+    report.warnings += shared_part_warnings(sized)
     report.untested = _untested(surveys)
     report.write()
     damage = [text for each in surveys.values() for text in each.damage]
@@ -115,11 +119,12 @@ def _untested(surveys: Mapping[str, Survey]) -> str:
     return f"whether the geometry fits the recording, mixpose run --stop {first + 3} shows"
 
 
-def _say_object(report: _Report, session: Session) -> None:
-    body = session.body
+def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
+    body = one.body
     spread = f", spread up to {body.spread:g} {session.unit}" if body.spread else ", exact"
     extent = f"{len(body)} features within {body.radius:.4g} {session.unit} of their centre"
-    report.say("object", f"{body.name}: {extent}{spread}")
+    many = f", {one.count} that are identical" if one.count > 1 else ""
+    report.say("object", f"{body.name}: {extent}{spread}{many}")
     alike = len(body.symmetries)
     text = "none"
     if alike > 1:
@@ -185,7 +190,9 @@ def _pairing_warnings(sources: Mapping[str, Source]) -> list[str]:
 def _say_features(
     report: _Report, session: Session, setup: SensorSetup, source: Source, found: Survey
 ) -> None:
-    where, expected = f"sensor {setup.name!r}", expected_count(setup, session)
+    where = f"sensor {setup.name!r}"
+    each = [(expected_count(setup, session.alone(o.body.name)), o.count) for o in session.objects]
+    expected = sum(seen * count for seen, count in each)
     if found.counts is None:
         if found.numbers and found.empty:
             report.warnings.append(

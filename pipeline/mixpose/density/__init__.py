@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import render
+from mixpose.density.extraction_error import (
+    ErrorRules,
+    Noise,
+    Offsets,
+    Seen,
+    errors_seen,
+    pooled,
+)
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
 from mixpose.density.grid import FAR, FLOOR, Density, Window
 from mixpose.density.observation import Observation, matched_atlas
@@ -16,13 +24,19 @@ __all__ = [
     "AssociationRules",
     "Atlas",
     "Density",
+    "ErrorRules",
+    "Noise",
     "Observation",
+    "Offsets",
+    "Seen",
     "Window",
     "close_pairs",
     "crowding",
+    "errors_seen",
     "features_met",
     "matched_atlas",
     "peak",
+    "pooled",
     "render",
     "self_overlap",
     "surplus",

@@ -10,7 +10,7 @@ Two densities are made of a pattern g0 whose features have standard deviation σ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
@@ -30,6 +30,10 @@ STEPS_PER_SIGMA = 4.0
 
 MOST_CELLS = 1_500_000
 """Grid points of a dense window; a larger one gets coarser."""
+
+MOST_SIGMAS = 4000.0
+"""Extent of features over the narrowest blur at which they are drawn: pages are 12 σ wide, and a
+plane has 400 000 of them."""
 
 _MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 
@@ -103,6 +107,27 @@ class Observation:
             return pattern.points.min(axis=0), pattern.points.max(axis=0)
         size = np.array(pattern.values.shape[::-1])[: self.dimension]
         return pattern.origin, np.asarray(pattern.origin + (size - 1) * pattern.step)
+
+    def around(self, y: Floats, reach: float) -> Observation:
+        """Detections within a reach, in σ_ε, of places (n, m), if there are any."""
+        pattern = self.pattern
+        if not isinstance(pattern, PointPattern) or not len(y):
+            return self
+        away = pattern.points - y[:, None]
+        near = ((away * away).sum(axis=2) < (reach * self.sigma) ** 2).any(axis=0)
+        if not near.any() or near.all():
+            return self
+        return replace(self, pattern=PointPattern(pattern.points[near], pattern.weights[near]))
+
+    def narrowest(self, share: float, y: Floats) -> float:
+        """Narrowest blur in σ_ε: a share for detections, as far as an atlas reaches.
+
+        `y` (n, m) are predicted features, about which it is drawn.
+        """
+        if self.cell is not None or not len(y):
+            return 1.0
+        extent = float((y.max(axis=0) - y.min(axis=0)).max())
+        return min(max(share, extent / (MOST_SIGMAS * self.sigma)), 1.0)
 
     def density(
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False

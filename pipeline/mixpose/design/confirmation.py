@@ -87,7 +87,9 @@ def confirm(
         frames = runs // count + (k < runs % count)
         if frames == 0:
             continue
-        found = _errors_at(session, plan, T, frames, seed + k, statuses)
+        # of its own for each pose and each study
+        own = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+        found = _errors_at(session, plan, T, frames, own, statuses)
         errors += found
         which += [k] * len(found)
         progress(sum(statuses.values()))

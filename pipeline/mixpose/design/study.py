@@ -80,6 +80,7 @@ class System:
     plan: Plan
     summary: Summary
     error: float  # pooled over the poses: of the tip, or of the origin
+    weighed: float  # the same with sigmas in proportion to what features err by
     confirmation: Confirmation | None = None
     equal: Equal | None = None
     move: MarkerMove | None = None
@@ -156,6 +157,7 @@ def _system(name: str, session: Session, plan: Plan, request: Request) -> System
         plan=plan,
         summary=summary,
         error=error_of(plan),
+        weighed=error_of(replace(plan, sigmas=plan.noises)),
         move=best_marker_move(plan, error_of),
         new=best_new_sensor(plan, error_of, middle),
     )

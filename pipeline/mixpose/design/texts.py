@@ -19,6 +19,7 @@ from mixpose.sensors import RangeSensor, Sensor
 _DEGREES = 180 / np.pi
 _CROWDED = 0.05  # of the features: fewer hardly show in the errors
 _NARROW, _FILLED = 0.4, 1.1  # of sigma: for cameras, and for ranges, which err by sigma
+_WORTHWHILE = 0.05  # of an error, to be told
 _NOTED = 3  # look-alikes and poses that are listed
 
 
@@ -78,6 +79,11 @@ def _system_lines(system: System, study: Study) -> list[str]:
     if narrow:
         told = ", ".join(f"{n} {share:.2g}" for n, share in narrow)
         say("sigma", f"features err by much of sigma: {told} of it; raise sigma in [extract]")
+    if system.weighed < (1 - _WORTHWHILE) * system.error:
+        largest = max(plan.noises)
+        told = ", ".join(f"{n} {e / largest:.2g}" for n, e in zip(plan.names, plan.noises))
+        gain = _gain(system.weighed, system.error)
+        say("weights", f"sigma in proportion to what features err by ({told}) gains {gain}")
     say("alike", _alike_text(summary))
     if system.confirmation is not None:
         say("simulated", _confirmation_text(system.confirmation, plan))
@@ -241,6 +247,7 @@ def _system_json(system: System) -> dict[str, Any]:
         "name": system.name,
         "noise": dict(zip(plan.names, plan.noises, strict=True)),
         "error": _finite(system.error),
+        "error_if_weighed": _finite(system.weighed),
         "deviations": [[_finite(v) for v in row] for row in summary.deviations],
         "position": [_finite(v) for v in summary.position],
         "rotation": [_finite(v) for v in summary.rotation],

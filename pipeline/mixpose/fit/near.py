@@ -1,14 +1,16 @@
 """A pose near a start: ascent of an objective through narrowing blurs.
 
-    draw C of every sensor at a blur → climb Σ_l ω_l S_l → narrow the blur → ... → σ_ε
+    draw C of every sensor at a blur → climb Σ_l ω_l S_l → narrow the blur → ... → σ_ε → ... → noise
 
-Where most features are near a detection at the start already, σ_ε alone will do.
+Where most features are near a detection at the start already, it begins at σ_ε.  Where all of them
+are met as closely as the detections' noise lets them, σ_ε is the end: narrower blurs would find the
+same pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -44,6 +47,10 @@ class FitRules:
 
     schedule: ScheduleRules = ScheduleRules()
     misfit: MisfitRules = MisfitRules()
+    met: float = constant(
+        3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
+    )
+    narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
     near: float = constant(
         0.1,
         "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
@@ -86,9 +93,11 @@ def fit_near(
     samples: Floats,
     *,
     finest: MatchedObjective | None = None,
+    noise: Sequence[Noise] | None = None,
+    errors: ErrorRules = ErrorRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
-    """Descend from coarse blurs to σ_ε and climb the objective at each.
+    """Descend from coarse blurs to the detections' noise and climb the objective at each.
 
     Parameters
     ----------
@@ -103,6 +112,9 @@ def fit_near(
         Samples of the body, for the objectives that integrate by sampling.
     finest : MatchedObjective or None
         At σ_ε, where it is at hand.
+    noise : sequence of Noise or None
+        What is known of each view's noise, in σ_ε; None: nothing.
+    errors : ErrorRules
     rules : FitRules
     """
     free = free_mask(options)
@@ -116,6 +128,9 @@ def fit_near(
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
+    if matched and any(view.observation.cell is None for view in views):
+        known = noise or [Noise()] * len(views)
+        ascent = _to_the_noise(views, body, ascent, free, finest, known, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
@@ -147,3 +162,62 @@ def _through_blurs(
             objective = build_objective(name, views, body, samples, sigmas, near)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
     return ascent
+
+
+def _to_the_noise(
+    views: Sequence[View],
+    body: Body,
+    ascent: Ascent[Floats],
+    free: NDArray[np.bool_],
+    finest: MatchedObjective | None,
+    noise: Sequence[Noise],
+    errors: ErrorRules,
+    rules: FitRules,
+) -> Ascent[Floats]:
+    """The ascent from σ_ε on, while detections are farther off than their noise lets them be."""
+    known = np.array([(one.squares, one.degrees) for one in noise]).T
+    sigmas = np.array([view.observation.sigma for view in views])
+    blurs = np.ones(len(views))
+    objective = finest or matched_objective(views, body, sigmas.tolist())
+    while True:
+        offsets = _offsets(objective, ascent.state, errors, rules)
+        seen = errors_seen(offsets, int(free.sum()), known, errors)
+        limits = errors.outlying**2 * seen.variances[offsets.sensor]
+        clear = (offsets.squared <= limits) | (offsets.shares == 0)
+        narrower = np.minimum(seen.blurs, blurs)
+        if clear.all() or (narrower > rules.narrower * blurs).all():
+            return ascent
+        blurs = narrower
+        near = _around_the_body(objective, ascent.state, errors.reach)
+        objective = matched_objective(near, body, (blurs * sigmas).tolist())
+        ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
+
+
+def _offsets(
+    objective: MatchedObjective, T: Floats, errors: ErrorRules, rules: FitRules
+) -> Offsets:
+    """How far off features are met, as the density around them shows it: v ∇C / C."""
+    at, sampled, _ = objective.match(T[None])
+    sensor, feature = np.nonzero(at.seen[:, 0] & (sampled[:, 0, :, 0] > 0))
+    C, slope = sampled[sensor, 0, feature, 0], sampled[sensor, 0, feature, 1:]
+    sigmas = np.array([view.observation.sigma for view in objective.views])
+    away = slope * (objective.variances[sensor, 0] / C / sigmas[sensor])[:, None]
+    squared = (away * away).sum(axis=1)
+    shares = np.where(squared < rules.met**2, at.weights[sensor, 0, feature], 0.0)
+    dimensions = objective.projection.dimensions
+    finest = [
+        view.observation.narrowest(errors.narrowest, y[0, seen[0], :m])
+        for view, y, seen, m in zip(objective.views, at.y, at.seen, dimensions, strict=True)
+    ]
+    return Offsets(squared, shares, sensor, dimensions, np.array(finest))
+
+
+def _around_the_body(objective: MatchedObjective, T: Floats, reach: float) -> list[View]:
+    """Views with what was detected around the features alone: a fine grid has to hold no more."""
+    at = objective.projection.project(T[None])
+    return [
+        replace(view, observation=view.observation.around(y[0, seen[0], :m], reach))
+        for view, y, seen, m in zip(
+            objective.views, at.y, at.seen, objective.projection.dimensions, strict=True
+        )
+    ]

@@ -22,7 +22,7 @@ from mixpose.judgement.evidence import (
 )
 from mixpose.judgement.expected_covariance import expected_covariance, invert_information
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
-from mixpose.judgement.noise import Noise, NoiseModel
+from mixpose.judgement.noise import NoiseModel, Residuals
 
 __all__ = [
     "AcceptanceRules",
@@ -30,9 +30,9 @@ __all__ = [
     "DetectionModel",
     "Judged",
     "JudgementRules",
-    "Noise",
     "NoiseModel",
     "Prior",
+    "Residuals",
     "Sighting",
     "Verdict",
     "associate",

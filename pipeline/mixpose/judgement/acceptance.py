@@ -46,6 +46,9 @@ class AcceptanceRules:
         8.0, "features met by some sensor that are enough however many are missed: a shape"
     )
     rival: float = constant(0.01, "belief from which another pose makes a frame ambiguous")
+    as_evident: float = constant(
+        0.01, "log odds by which the later of two poses that are one may be behind: it says more"
+    )
     listed: float = constant(0.001, "belief from which a pose stands among the hypotheses")
     widest_turn_deg: float = constant(
         15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
@@ -179,7 +182,7 @@ def insert(
     """Keep a list of distinct poses, the most evident first."""
     for k, old in enumerate(ranked):
         if _alike(old, new, body, free, rules):
-            if new.log_evidence > old.log_evidence:
+            if new.log_evidence > old.log_evidence - rules.as_evident:
                 ranked[k] = new
             break
     else:
@@ -203,7 +206,7 @@ def _alike(
     if apart < rules.same_distance * body.radius and turned < rules.same_rotation_deg:
         return True
     # one peak, of which one of the two is not the top: as in depth, seen by one camera
-    better = a if a.log_evidence >= b.log_evidence else b
     away = twist_between(T_a, T_b)[free]
-    inside = away @ np.linalg.solve(better.covariance[np.ix_(free, free)], away) < rules.same_peak
+    both = (a.covariance + b.covariance)[np.ix_(free, free)]
+    inside = away @ np.linalg.solve(both, away) < rules.same_peak
     return bool(inside and turned < rules.same_peak_deg)

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import AssociationRules, crowding, features_met, surplus
+from mixpose.density import AssociationRules, ErrorRules, crowding, features_met, surplus
 from mixpose.objective import MatchedObjective
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -30,6 +30,8 @@ class Association:
         Nodes of the body that are in view.
     shares : (n,) float64
         How far each was met, 0 to its weight.
+    places : (n, m) float64
+        Where they are predicted.
     offsets : (n, m) float64
         Observed minus predicted place of each, sensor units; 0 where it was not met.  Two that
         were detected as one have those of their middle.
@@ -41,12 +43,12 @@ class Association:
         Sum of the weights of the features that face the sensor outside its view.
     sigma : float
         σ_ε.
+    finest : float
+        Narrowest blur of the sensor, in σ_ε.
     crowd : float
         Observed features per unit of the sensor's coordinates, around the prediction.
     count : float
         Number of observed features.
-    places : (n, m) float64
-        Where they are predicted.
     detections : (n,) int
         The observed features by which they were met; -1 for none.
     merged : int
@@ -59,16 +61,17 @@ class Association:
     explained: float
     features: NDArray[np.intp]
     shares: Floats
+    places: Floats
     offsets: Floats
     J: Floats
     expected: float
     unseen: float
     sigma: float
+    finest: float
     crowd: float
     count: float
     merged: int = 0
     surplus: float = 0.0
-    places: Floats = field(default_factory=lambda: np.zeros((0, 0)))
     detections: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     @cached_property
@@ -110,7 +113,10 @@ class Association:
 
 
 def associate(
-    objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    rules: AssociationRules,
+    narrowest: float = ErrorRules().narrowest,
 ) -> tuple[list[Association], float]:
     """Compare what a pose predicts with what every sensor observed.
 
@@ -120,6 +126,8 @@ def associate(
         At σ_ε of every sensor.
     T_world_object : (4, 4) array
     rules : AssociationRules
+    narrowest : float
+        Narrowest blur in σ_ε, as `mixpose.density.ErrorRules` has it.
 
     Returns
     -------
@@ -157,14 +165,15 @@ def associate(
                 explained=min(product**2 / (energy * norm), 1.0) if product > 0 else 0.0,
                 features=features,
                 shares=shares,
+                places=y,
                 offsets=offsets,
                 J=J,
                 expected=float(weights.sum()),
                 unseen=float(node_weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
                 sigma=sigma,
+                finest=observation.narrowest(narrowest, y),
                 crowd=crowd,
                 count=count,
-                places=y,
                 detections=detections,
                 merged=merged,
                 surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),

@@ -42,7 +42,6 @@ from scipy.special import gammaln
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.association import Association
-from mixpose.judgement.noise import Noise, NoiseModel
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -150,12 +149,11 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 def log_evidence(
     associations: Sequence[Association],
     information: Floats,
-    noise: Noise,
+    variances: Floats,
     free: NDArray[np.bool_],
     prior: Prior,
     size: float,
     detection: DetectionModel,
-    model: NoiseModel,
 ) -> float:
     """Logarithm of the odds for the body at a pose against mere clutter.
 
@@ -164,25 +162,22 @@ def log_evidence(
     associations : sequence of Association
         One per sensor that saw something.
     information : (6, 6) array
-        For noise of one σ.
-    noise : Noise
+    variances : (L,) array
+        Of the noise of each, in σ_ε².
     free : (6,) bool
     prior : Prior
     size : float
         Of the body, length units.
     detection : DetectionModel
-    model : NoiseModel
     """
     if not any(one.met for one in associations):
         return -np.inf
-    typical = Noise(model.typical_degrees * model.typical**2, model.typical_degrees)
-    variance = typical.joined(noise).variance
-    sightings = _sightings(associations)
-    odds = odds_of(sightings, np.array([variance]), size, detection)
+    sightings = _sightings(associations, variances)
+    odds = odds_of(sightings, np.ones(1), size, detection)
     unseen = sum(one.unseen for one in associations) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
-    inner = information[np.ix_(free, free)] / variance + np.diag(1 / prior.spread[free] ** 2)
+    inner = information[np.ix_(free, free)] + np.diag(1 / prior.spread[free] ** 2)
     laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
     by_volume = float(odds.gained[0] + odds.missed[0]) + laplace + prior.log_density
     if not detection.by_count:
@@ -281,19 +276,23 @@ def _log_choices(sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floa
     return np.asarray(ways + assigned + math.log(2))
 
 
-def _sightings(associations: Sequence[Association]) -> list[Sighting]:
-    """Associations of one pose, each feature of the body in a column of its own."""
+def _sightings(associations: Sequence[Association], variances: Floats) -> list[Sighting]:
+    """Associations of one pose, each feature in a column of its own.
+
+    Their noise stands in the place of σ_ε, so that their variance is 1.
+    """
     columns = 1 + max(int(one.features.max(initial=0)) for one in associations)
     found = []
-    for one in associations:
+    units = np.sqrt(variances) * [one.sigma for one in associations]
+    for one, unit in zip(associations, units.tolist(), strict=True):
         n, m = one.offsets.shape
         weights, shares = np.zeros((2, 1, columns))
         offsets, by_world = np.zeros((1, columns, m)), np.zeros((1, columns, m, 3))
         weights[0, one.features] = one.expected / max(n, 1)
         shares[0, one.features] = one.shares
-        offsets[0, one.features] = one.offsets / one.sigma
-        by_world[0, one.features] = one.J[..., :3] / one.sigma
-        crowd = np.array([one.crowd * one.sigma**m])
+        offsets[0, one.features] = one.offsets / unit
+        by_world[0, one.features] = one.J[..., :3] / unit
+        crowd = np.array([one.crowd * unit**m])
         found.append(Sighting(weights, shares, offsets, by_world, crowd, one.count))
     return found
 

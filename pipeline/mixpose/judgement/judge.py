@@ -15,12 +15,10 @@ from mixpose.density import AssociationRules
 from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.noise import (
-    Noise,
     NoiseModel,
-    covariance_of,
+    Residuals,
     information_of,
     noise_of,
-    noises,
 )
 from mixpose.objective import MatchedObjective
 from mixpose.records import SensorReport
@@ -55,8 +53,8 @@ class Judged:
         Zero in directions that are not estimated.
     log_evidence : float
         Logarithm of the odds for this pose against mere clutter.
-    noise : Noise
-        Residuals of this frame and, fading, of those before it, for the next frame.
+    residuals : Residuals
+        Of this frame and, fading, of those before it, for the next frame.
     associations : tuple of Association
         The pose against each sensor that saw something.
     spread : (6,) float64 or None
@@ -74,7 +72,7 @@ class Judged:
     measurements: float
     covariance: Floats
     log_evidence: float
-    noise: Noise
+    residuals: Residuals
     associations: tuple[Association, ...] = ()
     spread: Floats | None = None
     proposer: str = ""
@@ -86,7 +84,7 @@ def judge(
     T_world_object: Floats,
     free: NDArray[np.bool_],
     *,
-    before: Noise = Noise(),
+    before: Residuals = Residuals(),
     prior: Prior | None = None,
     unmet: Sequence[Association] = (),
     rules: JudgementRules = JudgementRules(),
@@ -100,22 +98,28 @@ def judge(
     T_world_object : (4, 4) array
     free : (6,) bool
         Directions that were estimated.
-    before : Noise
-        Residuals of the frames before.
+    before : Residuals
+        Of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
     unmet : sequence of Association
         Other sensors, which count as if they had met nothing.
     rules : JudgementRules
     """
-    found, value = associate(objective, T_world_object, rules.association)
+    narrowest = rules.noise.errors.narrowest
+    found, value = associate(objective, T_world_object, rules.association, narrowest)
     prior = prior or flat_prior(objective.projection.body, free, rules.detection)
-    information = information_of(found)
-    noise, remembered = noises(before, noise_of(found, free), rules.noise)
+    noise = noise_of(found, free, before, rules.noise)
     blind = [replace(one, shares=np.zeros(len(one.features))) for one in unmet]
-    size = 2 * objective.projection.body.radius
+    variances = np.append(noise.variances, np.ones(len(blind)))
     evidence = log_evidence(
-        [*found, *blind], information, noise, free, prior, size, rules.detection, rules.noise
+        [*found, *blind],
+        information_of(found, noise.variances),
+        variances,
+        free,
+        prior,
+        2 * objective.projection.body.radius,
+        rules.detection,
     )
     count = len(found)
     return Judged(
@@ -124,9 +128,9 @@ def judge(
         score=sum(math.sqrt(one.explained) for one in found) / count,
         coverage=sum(one.coverage for one in found) / count,
         measurements=sum(one.measurements for one in found),
-        covariance=covariance_of(information, noise, free, rules.noise),
+        covariance=noise.covariance,
         log_evidence=evidence,
-        noise=remembered,
+        residuals=noise.remembered,
         associations=tuple(found),
         value=value,
     )

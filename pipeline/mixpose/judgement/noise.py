@@ -1,7 +1,20 @@
 """What detections err by, as residuals show it, and the covariance of a pose that follows.
 
-Offsets of met features from their prediction, in units of each sensor's σ_ε, have one unknown
-common variance φ².  It is estimated from the frame's residuals and those of frames before it.
+Offsets of the met features from their prediction are of two kinds.  What the extraction errs by is
+independent from feature to feature, with a variance s_0².  What a calibration, a clock or a lens
+errs by is alike in all features of a sensor: a field over its coordinates, an offset (s_1²) and
+what turns, scales and shears the features' image (s_2²).  With weights W, the matrix R = 1 − J
+(JᵀWJ)⁻¹ JᵀW that a pose leaves of errors, and the fields P_1 and P_2 as columns, let
+K_jk = P_jᵀ W R P_k.  The residuals r have the expectations
+
+    rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
+
+(C. R. Henderson's method of moments).  Their sums over the frames so far, fading, give the three
+variances, in units of each sensor's noise.  Most of a field a pose takes for its own; the
+covariance has it back:
+
+    s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹,         A = JᵀWJ.
+
 With ν degrees of freedom the estimate itself is uncertain: the covariance is enlarged so that its
 95 % ellipsoid is that of the F distribution with (d, ν) degrees, d directions being free.  For
 many degrees of freedom nothing is added.
@@ -9,19 +22,24 @@ many degrees of freedom nothing is added.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
+from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled
 from mixpose.judgement.association import Association
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_LEAST = 1e-6  # degrees of freedom: less is as good as none
+_LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 
 
@@ -29,12 +47,7 @@ _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as non
 class NoiseModel:
     """What is believed of detection noise before residuals are seen, and for how long."""
 
-    typical: float = constant(
-        0.2, "of σ_ε: centres of blobs err by 0.01-0.3 px where sigma is 1.5 px (recordings)"
-    )
-    typical_degrees: float = constant(
-        4.0, "degrees of freedom that `typical` counts as where evidence is weighed: two features"
-    )
+    errors: ErrorRules = ErrorRules()
     smallest: float = constant(1e-3, "of σ_ε: float32 densities do not resolve residuals below")
     by_chance: float = constant(
         0.999, "frames whose residuals are larger than so many by chance stand on their own"
@@ -47,6 +60,19 @@ class NoiseModel:
         0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
     )
     forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
+    lasting: float = constant(
+        0.18,
+        "of the noise: an offset that all features of a sensor have in common, before it is seen "
+        "(a chessboard, web cams and action cameras: 0.6-5)",
+    )
+    lasting_fields: float = constant(
+        3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
+    )
+    slanted: float = constant(
+        0.7,
+        "of `lasting`: what turns, scales and shears (a chessboard 0.65, web cams and action "
+        "cameras 0.25-0.4)",
+    )
 
     def enlargement(self, directions: int, degrees: float) -> float:
         """Factor that makes the Gaussian ellipsoid as large as that of the F distribution.
@@ -64,73 +90,203 @@ class NoiseModel:
         return float(directions * tail / chdtri(directions, 1 - self.confidence))
 
 
-@dataclass(frozen=True)
-class Noise:
-    """Sum of squared residuals in σ_ε, and its degrees of freedom."""
+class Moments(NamedTuple):
+    """Sums over frames, from which the variances of independent errors and of fields follow.
 
-    squares: float = 0.0
-    degrees: float = 0.0
+    Attributes
+    ----------
+    seen : (3,) float64
+        rᵀWr and |P_kᵀWr|².
+    expected : (3, 3) float64
+        Of these, by unit variances of each kind.
+    """
+
+    seen: Floats = np.zeros(3)
+    expected: Floats = np.zeros((3, 3))
+
+    def joined(self, other: Moments, memory: float) -> Moments:
+        """Add those of another frame."""
+        return Moments(memory * self.seen + other.seen, memory * self.expected + other.expected)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What is remembered of residuals: each sensor's noise in σ_ε, and what fields have of it."""
+
+    noise: Mapping[str, Noise] = field(default_factory=dict)
+    moments: Moments = Moments()
 
     @property
-    def variance(self) -> float:
-        """Mean of the squares."""
-        return self.squares / max(self.degrees, 1e-12)
-
-    def joined(self, other: Noise, memory: float = 1.0) -> Noise:
-        """Add another noise to what is remembered of the present one."""
-        return Noise(memory * self.squares + other.squares, memory * self.degrees + other.degrees)
-
-    def is_outdone_by(self, frame: Noise, model: NoiseModel) -> bool:
-        """Whether a frame's residuals are larger than chance makes them."""
-        if self.degrees < model.known or frame.degrees < 1:
-            return False
-        limit = float(fdtri(frame.degrees, self.degrees, model.by_chance))
-        return frame.variance > limit * self.variance
+    def total(self) -> Noise:
+        """Noise of all sensors."""
+        total = Noise()
+        for one in self.noise.values():
+            total = total.joined(one)
+        return total
 
 
-def noises(before: Noise, own: Noise, model: NoiseModel) -> tuple[Noise, Noise]:
-    """The noise that a frame's covariance goes by, and the one that is remembered.
+@dataclass(frozen=True)
+class FrameNoise:
+    """The noise that a frame goes by.
 
-    As a rule both are that of the frames so far.  A frame with residuals of another kind, as where
-    two features run into each other, goes by its own, and the frames after it forget it.
+    Attributes
+    ----------
+    variances : (L,) float64
+        Of each sensor, in σ_ε²; the typical one counts, too.
+    covariance : (6, 6) float64
+        Zero where the pose is not free.
+    remembered : Residuals
+        For the next frame.
     """
-    if before.is_outdone_by(own, model):
-        forgotten = model.forgetting
-        return own, Noise(forgotten * before.squares, forgotten * before.degrees)
-    joined = before.joined(own, model.memory)
-    return joined, joined
+
+    variances: Floats
+    covariance: Floats
+    remembered: Residuals
 
 
-def noise_of(associations: Sequence[Association], free: NDArray[np.bool_]) -> Noise:
-    """Residuals of a frame, with the degrees of freedom that the pose has left."""
-    measurements = sum(one.measurements for one in associations)
-    degrees = max(measurements - int(free.sum()), 0.0)
-    return Noise(sum(one.squares for one in associations) if degrees else 0.0, degrees)
+def noise_of(
+    associations: Sequence[Association],
+    free: NDArray[np.bool_],
+    before: Residuals,
+    model: NoiseModel,
+) -> FrameNoise:
+    """The noise of a frame, from its residuals and from those before it.
+
+    As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
+    own, and the frames after it forget it.
+    """
+    offsets, count = _offsets(associations), int(free.sum())
+    last = [before.noise.get(one.name, Noise()) for one in associations]
+    past = np.array([(one.squares, one.degrees) for one in last]).T
+    sums, rest = model.memory * past, None
+    seen = errors_seen(offsets, count, sums, model.errors)
+    if _is_outdone(past, seen, model):
+        sums, rest = np.zeros_like(past), model.forgetting * past
+        seen = errors_seen(offsets, count, sums, model.errors)
+    sums = sums + seen.own
+    degrees = float(sums[1].sum())
+    typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
+    variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
+    own, parts = _moments(associations, offsets, variances, free, model)
+    moments = before.moments.joined(own, model.memory)
+    shares = _shares(moments, own, float(np.mean([one.met for one in associations])), model)
+    # fields last: a further frame shows no more of them
+    factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
+    covariance = np.zeros((6, 6))
+    covariance[np.ix_(free, free)] = np.tensordot(shares.variances * factors, parts, 1)
+    told = sums if rest is None else rest
+    noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
+    return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
 
 
-def information_of(associations: Sequence[Association]) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / σ_l² over the met features: (6, 6), for noise of one σ."""
-    information = np.zeros((6, 6))
-    for one in associations:
-        weighted = (one.J * (one.shares / one.sigma**2)[:, None, None]).reshape(-1, 6)
-        information += weighted.T @ one.J.reshape(-1, 6)
-    return information
+def _offsets(associations: Sequence[Association]) -> Offsets:
+    """Offsets of the features of all sensors."""
+    return Offsets(
+        np.concatenate([one.squared for one in associations]),
+        np.concatenate([one.shares for one in associations]),
+        np.repeat(np.arange(len(associations)), [len(one.shares) for one in associations]),
+        np.array([one.J.shape[1] for one in associations]),
+        np.array([one.finest for one in associations]),
+    )
 
 
-def covariance_of(
-    information: Floats, noise: Noise, free: NDArray[np.bool_], model: NoiseModel
-) -> Floats:
-    """Covariance of a pose (6, 6), zero where it is not free.
+def _is_outdone(past: Floats, seen: Seen, model: NoiseModel) -> bool:
+    """Whether a frame's residuals are larger than chance makes them."""
+    known, degrees = float(past[1].sum()), float(seen.own[1].sum())
+    if known < model.known or degrees < 1:
+        return False
+    before = np.maximum(pooled(past, model.errors, 0.0), model.smallest**2)
+    ratio = float((seen.own[0] / before).sum()) / degrees
+    return bool(ratio > fdtri(degrees, known, model.by_chance))
+
+
+class _Shares(NamedTuple):
+    """Variances (3,) of independent errors and of fields; degrees of freedom (2,) of the latter."""
+
+    variances: Floats
+    degrees: Floats
+
+
+def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _Shares:
+    """What moments say; each sensor meets so many features, of a frame that has its own moments."""
+    weights = model.lasting_fields * np.array([met, met**2])
+    believed = np.array([_LEAST, weights[1], weights[1]])
+    expected = moments.expected + np.diag(believed)
+    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2])
+    seen = moments.seen + believed * size
+    scale = 1 / np.maximum(expected.diagonal(), _LEAST)
+    variances = nnls(scale[:, None] * expected, scale * seen)[0]
+    variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
+    once, squared = own.expected[0, 1:] + weights[0], own.expected.diagonal()[1:] + weights[1]
+    return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
+
+
+def _moments(
+    associations: Sequence[Association],
+    offsets: Offsets,
+    variances: Floats,
+    free: NDArray[np.bool_],
+    model: NoiseModel,
+) -> tuple[Moments, Floats]:
+    """Of one frame, and the covariances (3, k, k) that unit variances of each kind make.
+
+    Detections that are farther off than the extraction errs are left out.
+    """
+    count = int(free.sum())
+    clear = offsets.squared <= model.errors.outlying**2 * variances[offsets.sensor]
+    ends = np.cumsum(np.bincount(offsets.sensor, minlength=len(associations)))[:-1]
+    parts, blocks = [], []
+    for one, inlying, variance in zip(associations, np.split(clear, ends), variances.tolist()):
+        shares = np.where(inlying, one.shares, 0.0)
+        scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
+        rows = np.concatenate([one.J[..., free], one.offsets[..., None]], axis=2)
+        parts.append((scale * rows).reshape(-1, count + 1))
+        blocks.append(_fields(one.places, shares))
+    weighted = np.concatenate(parts)
+    J, r = weighted[:, :count], weighted[:, count]
+    P = [block_diag(*kind) for kind in zip(*blocks)]
+    inverse = _inverse(J.T @ J)
+    drawn = [inverse @ (J.T @ one) for one in P]
+    left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
+    K = [[float(((a.T @ b) ** 2).sum()) for b in left] for a in P]
+    once = [float((a * b).sum()) for a, b in zip(P, left, strict=True)]
+    degrees = float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count
+    squares = [float(r @ r), *(float(((one.T @ r) ** 2).sum()) for one in P)]
+    expected = np.array([[degrees, *once], [once[0], *K[0]], [once[1], *K[1]]])
+    own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
+    return own, np.array([inverse, *(one @ one.T for one in drawn)])
+
+
+def _fields(places: Floats, shares: Floats) -> tuple[Floats, Floats]:
+    """What all features (n, m) of a sensor have in common, with their shares.
+
+    Offsets (nm, m), and what turns, scales and shears (nm, m²).
+    """
+    n, m = places.shape
+    total = max(float(shares.sum()), _LEAST)
+    away = places - shares @ places / total
+    size = float(np.sqrt((shares @ (away * away)).sum() / (m * total)))
+    roots, axes = np.sqrt(shares)[:, None, None, None], np.eye(m)
+    slants = roots * away[:, None, :, None] / max(size, _LEAST) * axes[:, None]
+    return (roots[..., 0] * axes).reshape(n * m, m), slants.reshape(n * m, m * m)
+
+
+def _inverse(information: Floats) -> Floats:
+    """Inverse of an information matrix.
 
     Directions that the data leave open get the variance that their information says: large, and
     at most what float64 can invert.
     """
-    inner = information[np.ix_(free, free)]
-    scale = 1.0 / np.sqrt(np.maximum(inner.diagonal(), _MIN_INFORMATION))
-    values, vectors = np.linalg.eigh(inner * scale * scale[:, None])
+    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), _MIN_INFORMATION))
+    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale * scale[:, None]
-    variance = noise.variance if noise.degrees >= 1 else model.typical**2
-    variance = max(variance, model.smallest**2) * model.enlargement(int(free.sum()), noise.degrees)
-    covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = variance / 2 * (inverse + inverse.T)
-    return covariance
+    return np.asarray((inverse + inverse.T) / 2)
+
+
+def information_of(associations: Sequence[Association], variances: Floats) -> Floats:
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (6, 6) over the met features, for noise (L,) in σ_ε²."""
+    information = np.zeros((6, 6))
+    for one, variance in zip(associations, variances.tolist(), strict=True):
+        weighted = (one.J * (one.shares / (variance * one.sigma**2))[:, None, None]).reshape(-1, 6)
+        information += weighted.T @ one.J.reshape(-1, 6)
+    return information

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from mixpose.judgement import Judged, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate
+from mixpose.scene.doubt import may_be_another
 from mixpose.scene.identity import identify
 from mixpose.scene.joint import Joint
 from mixpose.scene.members import Member, groups
@@ -58,6 +59,13 @@ class Scene:
         found = [self._decided(k, joint.data[k], joint.ranked[k]) for k in range(len(self.members))]
         for group in groups(self.members):
             self._identify(group, found, joint.data)
+        sure = [one.verdict.status == "ok" and one.told is None for one in found]
+        for k, one in enumerate(found):
+            best = one.verdict.best
+            if sure[k] and best is not None:
+                others = (self.members, joint.data, sure, self.rules.alike)
+                if may_be_another(k, best, *others):
+                    found[k] = Decided(replace(one.verdict, status="ambiguous"), one.ranked)
         return [
             self._outcome(k, found[k], joint.data[k], frame, time_s, views)
             for k in range(len(self.members))

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
-from mixpose.density import AssociationRules
-from mixpose.judgement import DetectionModel, NoiseModel, Sighting, odds_of, paid_by_count
+from mixpose.density import AssociationRules, ErrorRules
+from mixpose.judgement import DetectionModel, Sighting, odds_of, paid_by_count
 from mixpose.rigid import transform
 from mixpose.search.detections import SensorDetections
 from mixpose.sensors import facing
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_DETECTION, _NOISE, _ASSOCIATION = DetectionModel(), NoiseModel(), AssociationRules()
+_DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
 def evidence(
@@ -48,8 +48,8 @@ def evidence(
         coordinates += one.offsets.shape[2] * found
         met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(sightings)
     spare = np.maximum(coordinates - free.sum(), 0.0)
-    degrees = _NOISE.typical_degrees
-    variance = degrees * _NOISE.typical**2 + np.where(spare > 0, squares, 0.0)
+    degrees = _ERRORS.typical_degrees
+    variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
     odds = odds_of(sightings, variance, 2 * body.radius, _DETECTION)
     return paid_by_count(odds, sightings, free), met

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.density import Noise
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
     Association,
@@ -122,6 +123,12 @@ class FrameData:
         """Directions that are estimated."""
         return free_mask(self.options)
 
+    @cached_property
+    def noise(self) -> list[Noise]:
+        """What is remembered of each view's noise."""
+        memory, known = self.rules.judgement.noise.memory, self.track.residuals.noise
+        return [known.get(view.name, Noise()).faded(memory) for view in self.views]
+
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
         return prior_of(
@@ -141,15 +148,8 @@ class FrameData:
             views = tuple(self.views)
             projection = project_body(tuple(view.sensor for view in views), self.body)
             return replace(self.still.finest, views=views, projection=projection)
-        if self.shared is None:
-            return self.at_sigma()
         sigmas = [view.observation.sigma for view in self.views]
         return matched_objective(self.views, self.body, sigmas, shared=self.shared)
-
-    def at_sigma(self, *, narrowed: float = 1.0) -> MatchedObjective:
-        """The matched objective at a share of σ_ε."""
-        sigmas = [narrowed * view.observation.sigma for view in self.views]
-        return matched_objective(self.views, self.body, sigmas)
 
     def without(self, names: Mapping[str, str]) -> FrameData:
         """The frame without some sensors."""
@@ -240,6 +240,8 @@ class MatchedLikelihood:
                 seen.options,
                 seen.samples,
                 finest=seen.finest,
+                noise=seen.noise,
+                errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )
 
@@ -263,7 +265,7 @@ class MatchedLikelihood:
             data.finest,
             T,
             data.free,
-            before=data.track.noise,
+            before=data.track.residuals,
             prior=data.prior(T),
             unmet=others,
             rules=rules,
@@ -318,7 +320,7 @@ class AssociationLikelihood:
         return judge_ranges(
             judged,
             self._posterior(start),
-            data.track.noise,
+            data.track.residuals.total,
             # the posterior holds the prediction already
             replace(data.prior(T), spread=anywhere.spread),
             data.rules.judgement.noise,
@@ -327,7 +329,7 @@ class AssociationLikelihood:
 
     def _posterior(self, start: Start) -> Posterior:
         data = self.data
-        noise = noise_ratio(data.track.noise, data.rules.ranges)
+        noise = noise_ratio(data.track.residuals.total, data.rules.ranges)
         detection = data.rules.judgement.detection
         return Posterior(data.views, data.body, data.free, noise, _prior_of(start), detection)
 

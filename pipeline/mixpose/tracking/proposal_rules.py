@@ -31,9 +31,3 @@ class ProposalRules:
         "σ_ε by which features may be out of their plane and still meet what their mirror image "
         "shows: as far as one is met",
     )
-    narrow: float = constant(
-        0.5, "blur of a closer look in σ_ε: twice what centres of blobs err by (0.2 σ_ε)"
-    )
-    noticeable: float = constant(
-        0.35, "squared offset in σ_ε² that makes a closer look worth while: nine times 0.2²"
-    )

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.density import Noise
 from mixpose.fit import blur_schedule
-from mixpose.judgement import DetectionModel, Judged, Noise, NoiseModel, Prior
+from mixpose.judgement import DetectionModel, Judged, NoiseModel, Prior, Residuals
 from mixpose.objective import Quadratic, View
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
@@ -150,7 +151,7 @@ def judge_ranges(
         judged,
         covariance=covariance,
         log_evidence=float(found.log_odds[0]) + known.log_density + float(volume),
-        noise=before.joined(noise, model.memory),
+        residuals=Residuals({"": before.faded(model.memory).joined(noise)}),
         spread=np.sqrt(np.diag(covariance)),
         value=float(found.log_odds[0]),
     )

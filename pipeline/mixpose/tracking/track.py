@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.judgement import DetectionModel, Noise, Prior, flat_prior, nearest_alike
+from mixpose.judgement import DetectionModel, Prior, Residuals, flat_prior, nearest_alike
 from mixpose.rigid import perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.course import Course, CourseRules
@@ -83,8 +83,8 @@ class Track:
         Its time.
     misses : int
         Frames since then.
-    noise : Noise
-        Residuals so far.
+    residuals : Residuals
+        So far.
     walk : RandomWalk or None
         None before two uncertain poses.
     tallies : mapping of str to SensorTally
@@ -103,7 +103,7 @@ class Track:
     frame: int | None = None
     time_s: float | None = None
     misses: int = 0
-    noise: Noise = field(default_factory=Noise)
+    residuals: Residuals = Residuals()
     walk: RandomWalk | None = None
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)
     search: SearchState = SearchState()
@@ -201,7 +201,7 @@ def follow(
     found: Sequence[Found],
     frame: int,
     time_s: float | None,
-    noise: Noise,
+    residuals: Residuals,
     tallies: Mapping[str, SensorTally],
     rules: MotionRules,
     course_rules: CourseRules = CourseRules(),
@@ -217,8 +217,8 @@ def follow(
         Best first.
     frame, time_s
         Of the frame.
-    noise : Noise
-        Residuals so far.
+    residuals : Residuals
+        So far.
     tallies
         Of the best pose, as `Track` has them.
     rules : MotionRules
@@ -250,8 +250,8 @@ def follow(
             else:
                 course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
-    after = Track(tuple(branches), frame, time_s, 0, noise, walk, tallies, delays=track.delays)
-    return replace(after, clutter=track.clutter)
+    parts = tuple(branches), frame, time_s, 0, residuals, walk, tallies
+    return Track(*parts, delays=track.delays, clutter=track.clutter)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

@@ -233,7 +233,7 @@ class Tracker:
             )
             for one, weight in verdict.kept
         ]
-        noise = best.noise if verdict.status == "ok" else track.noise
+        residuals = best.residuals if verdict.status == "ok" else track.residuals
         motion = self.rules.motion
         followed = follow(
             track,
@@ -241,7 +241,7 @@ class Tracker:
             found,
             frame,
             time_s,
-            noise,
+            residuals,
             _tallies(best),
             motion,
             self.rules.course,

@@ -26,6 +26,7 @@ from mixpose.session.intrinsics import CameraModel, Intrinsics, camera_matrix
 from mixpose.session.messages import BadKeyError, found, one_of, under
 
 _MOST_IMAGES = 100
+_LONGEST = 18  # digits of an integer
 _CENTRE = 0.5  # px, of a pixel from its corner
 
 
@@ -56,7 +57,7 @@ _LENSES = {
 
 
 def _is_integer(text: str) -> bool:
-    return text.lstrip("-").isdigit()
+    return text.isascii() and text.removeprefix("-").isdigit()
 
 
 def _rows(content: Content) -> list[list[str]]:
@@ -130,14 +131,14 @@ def _from_images(content: Content) -> dict[str, tuple[str, Floats | None]]:
                 "NAME, and a line of points after each"
             )
         name = str(PurePosixPath(row[9]).with_suffix("")).replace("/", "_")
-        with under("image", int(row[0])):
+        with under("image", row[0]):
             placed[name] = (row[8], _motion(row[1:8]))
     return placed
 
 
 def _from_rigs(content: Content) -> dict[str, tuple[str, Floats | None]]:
     """Sensors of the only rig: the reference at its origin, the others where they say."""
-    rigs = [row for row in _rows(content) if int(row[1]) > 1]
+    rigs = [row for row in _rows(content) if len(row) > 3 and _whole(row[1]) > 1]
     if len(rigs) > 1:
         raise BadKeyError(f"found {len(rigs)} rigs of several sensors; allowed: one")
     placed: dict[str, tuple[str, Floats | None]] = {}
@@ -149,7 +150,7 @@ def _from_rigs(content: Content) -> dict[str, tuple[str, Floats | None]]:
             kind, number, has_pose, *rest = rest
             pose, rest = (rest[:7], rest[7:]) if has_pose == "1" else (None, rest)
             if kind == "CAMERA":
-                with under("rig", int(row[0]), f"camera{number}"):
+                with under("rig", row[0], f"camera{number}"):
                     placed[f"camera{number}"] = (number, _motion(pose) if pose else None)
     return placed
 
@@ -159,6 +160,12 @@ def _motion(cells: Sequence[str]) -> Floats:
     if len(values) != 7:
         raise BadKeyError(found(" ".join(cells), "QW QX QY QZ TX TY TZ"))
     return motion_of_quaternion(values[:4], values[4:])
+
+
+def _whole(cell: str) -> int:
+    if not _is_integer(cell) or len(cell) > _LONGEST:
+        raise BadKeyError(found(cell, "an integer"))
+    return int(cell)
 
 
 def _floats(cells: Sequence[str]) -> list[float]:
@@ -182,7 +189,7 @@ def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
     row = next((row for row in _rows(cameras) if row[0] == number), None)
     if row is None:
         raise BadKeyError(f"found no camera {number} in {cameras.name}, which {name} was taken by")
-    with under("camera", int(number)):
+    with under("camera", number):
         intrinsics = _intrinsics(row)
     note = "" if pose is None else "COLMAP's lengths have no unit and no scale"
     places = sum(number == other for other, _ in placed.values())
@@ -192,6 +199,8 @@ def _read(group: Group, name: str, model: CameraModel) -> CalibratedCamera:
 
 
 def _intrinsics(row: list[str]) -> Intrinsics:
+    if len(row) < 5:
+        raise BadKeyError(found(" ".join(row), "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"))
     if row[1] not in _LENSES:
         raise BadKeyError(found(row[1], one_of(_LENSES)))
     lens = _LENSES[row[1]]
@@ -204,7 +213,7 @@ def _intrinsics(row: list[str]) -> Intrinsics:
     cx, cy, *rest = values[lens.focal_lengths :]
     K = camera_matrix([[fx, 0.0, cx - _CENTRE], [0.0, fy, cy - _CENTRE], [0.0, 0.0, 1.0]])
     D = np.array([0.0 if place is None else rest[place] for place in lens.distortion])
-    return Intrinsics(K, D, size_of([int(row[2]), int(row[3])]), lens.model)
+    return Intrinsics(K, D, size_of([_whole(cell) for cell in row[2:4]]), lens.model)
 
 
 COLMAP = Format(

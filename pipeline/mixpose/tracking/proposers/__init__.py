@@ -17,7 +17,6 @@ from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
-from mixpose.tracking.proposers.without_outlier import without_outlier
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 
@@ -42,4 +41,4 @@ class Refinement(Protocol):
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, multistart, searched, mirrored)
-REFINEMENTS: tuple[Refinement, ...] = (without_sensor, without_outlier, merged_pair)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair)

@@ -1,0 +1,169 @@
+"""ε, what the extraction errs by: how large it is, as offsets of features show it.
+
+At a blur σ a feature r away from its prediction pulls with r exp(−r²/4σ²), as in robust least
+squares with the loss of Welsch.  At σ = 1.5 s, s being the standard deviation of the offsets, that
+is 95 % as efficient as least squares where all offsets are normal, and an offset of 6 s is as good
+as out.  Offsets weighted so have the variance q with 1/q = 1/s² + 1/2σ²: both sides of
+
+    σ = 1.5 s,      s² = q / (1 − q / 2σ²)
+
+follow from one another, from the session's σ_ε down to where they agree.  Lengths are in σ_ε of
+their sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.constants import constant
+
+Floats: TypeAlias = NDArray[np.float64]
+Indices: TypeAlias = NDArray[np.intp]
+
+_LEAST_DEGREES = 0.5  # of freedom: fewer are none, but for shares that do not add up to whole ones
+
+
+@dataclass(frozen=True)
+class ErrorRules:
+    """What is believed of the extraction's error before offsets are seen."""
+
+    typical: float = constant(
+        0.2, "of σ_ε: centres of blobs err by 0.01-0.3 px where sigma is 1.5 px (recordings)"
+    )
+    typical_degrees: float = constant(
+        4.0, "degrees of freedom that `typical` counts as, and all sensors for one: two features"
+    )
+    blur: float = constant(1.5, "of the noise: Welsch's loss is then 95 % as efficient as squares")
+    narrowest: float = constant(
+        0.05, "of σ_ε, blur of the last look: what centres of blobs err by at best (0.03 σ_ε)"
+    )
+    reach: float = constant(
+        9.0,
+        "σ_ε around features within which detections count: at σ_ε they are drawn to 6, and the "
+        "pose moves by less than the rest",
+    )
+    outlying: float = constant(
+        3.5, "standard deviations from which an offset is no noise: by chance 2 in 1000 are beyond"
+    )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Sum of squared offsets in σ_ε, and its degrees of freedom."""
+
+    squares: float = 0.0
+    degrees: float = 0.0
+
+    @property
+    def variance(self) -> float:
+        """Mean of the squares."""
+        return self.squares / max(self.degrees, 1e-12)
+
+    def faded(self, memory: float) -> Noise:
+        """What is remembered of it."""
+        return Noise(memory * self.squares, memory * self.degrees)
+
+    def joined(self, other: Noise) -> Noise:
+        """Together with another one."""
+        return Noise(self.squares + other.squares, self.degrees + other.degrees)
+
+
+class Offsets(NamedTuple):
+    """Offsets of K features in L sensors.
+
+    Attributes
+    ----------
+    squared : (K,) float64
+        In σ_ε².
+    shares : (K,) float64
+        How far each feature was met.
+    sensor : (K,) int
+    dimensions : (L,) int
+        Coordinates of each sensor.
+    finest : (L,) float64
+        Narrowest blur of each sensor, in σ_ε.
+    """
+
+    squared: Floats
+    shares: Floats
+    sensor: Indices
+    dimensions: Indices
+    finest: Floats
+
+
+class Seen(NamedTuple):
+    """What offsets show.
+
+    Attributes
+    ----------
+    own : (2, L) float64
+        Squares, in σ_ε², and degrees of freedom of each sensor's noise in this frame.
+    variances : (L,) float64
+        Of each sensor's noise, together with what was known.
+    blurs : (L,) float64
+        In σ_ε.
+    """
+
+    own: Floats
+    variances: Floats
+    blurs: Floats
+
+
+def errors_seen(
+    offsets: Offsets, free: int, known: Floats, rules: ErrorRules = ErrorRules()
+) -> Seen:
+    """How large the extraction's errors are.
+
+    Parameters
+    ----------
+    offsets : Offsets
+        At a pose that was fitted to them.
+    free : int
+        Directions in which it was.
+    known : (2, L) array
+        Squares and degrees of freedom of each sensor's noise so far.
+    rules : ErrorRules
+    """
+    blurs = np.ones(len(offsets.dimensions))
+    while True:
+        seen = _seen_at(blurs, offsets, free, known, rules)
+        if (seen.blurs > 0.9 * blurs).all():
+            return seen
+        blurs = np.minimum(seen.blurs, blurs)
+
+
+def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
+    """The same, as seen at one blur (L,) for each sensor."""
+    squared, shares, sensor, dimensions, finest = offsets
+    count = len(dimensions)
+    weights = shares * np.exp(-0.25 * squared / blurs[sensor] ** 2)
+    total = dimensions * np.bincount(sensor, weights, count)
+    q = np.bincount(sensor, weights * squared, count) / np.maximum(total, 1e-12)
+    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+    factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))
+    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+    degrees = factor ** (dimensions / 2) * total
+    most = float(degrees.sum())
+    left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
+    own = np.array([(left > 0) * factor * q * degrees, left * degrees])
+    variances = pooled(known + own, rules, rules.typical_degrees)
+    # narrower only where this frame alone allows it, too: it may not be like those before it
+    blurs = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))
+    return Seen(own, variances, np.clip(blurs, finest, 1.0))
+
+
+def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
+    """Variances (L,), each drawn to that of all sensors together, in σ_ε².
+
+    Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
+    that of all sensors, in degrees of freedom.
+    """
+    squares, degrees = sums
+    most = float(degrees.sum()) + typical
+    common = (float(squares.sum()) + typical * rules.typical**2) / max(most, 1e-12)
+    pull = min(rules.typical_degrees, most)
+    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, 1e-12))

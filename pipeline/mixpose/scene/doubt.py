@@ -1,0 +1,67 @@
+"""Poses that may be another body, or another way up: all that is met is a part that both have.
+
+A body of which three markers are met looks like every body that has three markers in the same
+places.  Where such another one of the session is not surely somewhere else, its pose there is a
+rival: if that explains the frame about as well, the body is in doubt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from mixpose.body import Body, SharedPart, shared_parts
+from mixpose.judgement import Judged
+from mixpose.scene.members import Member
+from mixpose.tracking.likelihood import FrameData
+
+
+def may_be_another(
+    k: int,
+    best: Judged,
+    members: Sequence[Member],
+    data: Mapping[int, FrameData],
+    elsewhere: Sequence[bool],
+    alike: float,
+) -> bool:
+    """Whether a pose of member k might as well be one of another body, or another of its own.
+
+    Parameters
+    ----------
+    k : int
+    best : Judged
+    members : sequence of Member
+    data : mapping of int to FrameData
+        The frame as it is left for each.
+    elsewhere : sequence of bool
+        Which members are surely where they are.
+    alike : float
+        How far markers of two bodies may be off each other, of the smaller one's radius.
+    """
+    met = {int(i) for one in best.associations for i in one.features[one.shares > 0]}
+    body = members[k].tracker.body
+    for j, other in enumerate(members):
+        theirs = other.tracker.body
+        # a body's own markers may repeat themselves: then it may be turned another way
+        if j != k and (theirs is body or elsewhere[j]):
+            continue
+        limit = best.log_evidence + float(np.log(other.tracker.rules.acceptance.rival))
+        for part in parts_of(body, theirs, alike):
+            if not met <= set(part.own):
+                continue
+            there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
+            own = data[j]
+            seen = replace(own, views=data[k].views, shared=None)
+            found = other.tracker.refitted(seen, [there])
+            if found and found[0].log_evidence > limit:
+                return True
+    return False
+
+
+@lru_cache(maxsize=4096)
+def parts_of(body: Body, other: Body, alike: float) -> tuple[SharedPart, ...]:
+    """Parts that two bodies have in common."""
+    return tuple(shared_parts(body.means, other.means, alike * min(body.radius, other.radius)))

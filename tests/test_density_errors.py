@@ -1,0 +1,63 @@
+"""How large extraction errors are, as offsets show it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mixpose.density import ErrorRules, Offsets, errors_seen
+
+Floats = NDArray[np.float64]
+
+RULES = ErrorRules()
+NOTHING = np.zeros((2, 1))
+
+
+def offsets_of(away: Floats, finest: float = 0.01) -> Offsets:
+    count = len(away)
+    return Offsets(
+        (away * away).sum(axis=1),
+        np.ones(count),
+        np.zeros(count, np.intp),
+        np.array([away.shape[1]]),
+        np.array([finest]),
+    )
+
+
+@pytest.mark.parametrize("coordinates", [1, 2])
+@pytest.mark.parametrize("s", [0.05, 0.3])
+def test_normal_offsets_have_their_variance(coordinates: int, s: float) -> None:
+    away = np.random.default_rng(0).normal(0, s, (4000, coordinates))
+    seen = errors_seen(offsets_of(away), 0, NOTHING, RULES)
+    # of so many, 1 standard deviation of the variance is 2 %
+    assert seen.variances[0] == pytest.approx(s**2, rel=0.06)
+    assert seen.own[1, 0] == pytest.approx(4000 * coordinates, rel=0.02)
+    assert seen.blurs[0] == pytest.approx(1.5 * s, rel=0.03)
+
+
+def test_an_eighth_of_offsets_far_off_changes_little() -> None:
+    rng = np.random.default_rng(1)
+    away = rng.normal(0, 0.05, (400, 2))
+    away[::8] += rng.uniform(0.5, 1.5, (50, 2))
+    seen = errors_seen(offsets_of(away), 0, NOTHING, RULES)
+    assert seen.variances[0] == pytest.approx(0.05**2, rel=0.15)
+
+
+def test_the_blur_stays_wide_where_a_frame_is_not_like_those_before_it() -> None:
+    away = np.random.default_rng(2).normal(0, 0.3, (12, 2))
+    before = np.array([[200 * 0.02**2], [200.0]])
+    seen = errors_seen(offsets_of(away), 6, before, RULES)
+    assert seen.blurs[0] > 1.5 * 0.2
+
+
+def test_without_offsets_to_spare_the_noise_is_the_typical_one() -> None:
+    seen = errors_seen(offsets_of(np.zeros((3, 2))), 6, NOTHING, RULES)
+    assert seen.own.tolist() == [[0.0], [0.0]]
+    assert seen.variances[0] == pytest.approx(0.2**2)
+    assert seen.blurs[0] == pytest.approx(1.5 * 0.2)
+
+
+def test_no_blur_is_narrower_than_a_density_can_be_drawn() -> None:
+    seen = errors_seen(offsets_of(np.full((50, 2), 1e-4), finest=0.2), 0, NOTHING, RULES)
+    assert seen.blurs[0] == pytest.approx(0.2)

@@ -1,0 +1,132 @@
+"""The noise of detections as residuals show it, and the covariance that follows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mixpose.density import Noise
+from mixpose.judgement import Association, NoiseModel, Residuals
+from mixpose.judgement.noise import noise_of
+
+Floats = NDArray[np.float64]
+
+FREE = np.ones(6, dtype=np.bool_)
+MODEL = NoiseModel()
+ALONE = replace(MODEL, confidence=0.0, lasting=0.0)
+"""Nothing is enlarged, and nothing believed to last before it is seen."""
+
+
+def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Association:
+    """A sensor of sigma 2 px that meets n features at any places."""
+    n = len(offsets)
+    return Association(
+        name=name,
+        explained=1.0,
+        features=np.arange(n),
+        shares=np.ones(n),
+        places=rng.uniform(0, 100, (n, 2)),
+        offsets=offsets,
+        J=rng.normal(0, 1, (n, 2, 6)),
+        expected=float(n),
+        unseen=0.0,
+        sigma=2.0,
+        finest=0.05,
+        crowd=1e-5,
+        count=float(n),
+    )
+
+
+def known(squares: float, degrees: float) -> Residuals:
+    return Residuals({"0": Noise(squares, degrees)})
+
+
+def fitted(found: list[Association], errors: list[Floats]) -> tuple[list[Association], Floats]:
+    """What least squares leaves of errors, and by how much the pose is off."""
+    J = np.concatenate([one.J.reshape(-1, 6) for one in found])
+    e = np.concatenate([error.ravel() for error in errors])
+    off = np.linalg.lstsq(J, e, rcond=None)[0]
+    left = [
+        replace(one, offsets=error - one.J @ off) for one, error in zip(found, errors, strict=True)
+    ]
+    return left, off
+
+
+def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:
+    # tables: F of 6 and 10 degrees is 3.217 at 95 %, χ² of 6 is 12.592
+    assert MODEL.enlargement(6, 10.0) == pytest.approx(6 * 3.217 / 12.592, rel=1e-3)
+    assert MODEL.enlargement(6, 1e6) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
+    one = sensor("0", np.random.default_rng(0), np.full((6, 2), 0.1))  # 0.05 σ along each axis
+    noise = noise_of([one], FREE, Residuals(), MODEL).remembered.noise["0"]
+    # twelve coordinates, six are used up; equal offsets weigh a little more than normal ones
+    assert noise.squares == pytest.approx(12 * 0.05**2, rel=0.1)
+    assert noise.degrees == pytest.approx(6.0, rel=0.05)
+    three = replace(one, shares=np.array([1.0, 1, 1, 0, 0, 0]))
+    assert noise_of([three], FREE, Residuals(), MODEL).remembered.noise["0"] == Noise(0.0, 0.0)
+
+
+def test_where_no_residuals_say_otherwise_detections_err_by_a_fifth_of_sigma() -> None:
+    three = sensor("0", np.random.default_rng(0), np.zeros((3, 2)))
+    covariance = noise_of([three], FREE, Residuals(), ALONE).covariance
+    J = three.J.reshape(-1, 6) / 2.0
+    np.testing.assert_allclose(covariance, 0.04 * np.linalg.inv(J.T @ J), rtol=1e-6)
+
+
+def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:
+    one = sensor("0", np.random.default_rng(0), np.full((8, 2), 0.2))
+    alone = noise_of([one], FREE, Residuals(), MODEL).remembered.noise["0"]
+    joined = noise_of([one], FREE, known(40 * 0.01, 40.0), MODEL).remembered.noise["0"]
+    # the blur at which offsets are weighted is another with what is remembered
+    assert joined.squares == pytest.approx(0.95 * 0.4 + alone.squares, rel=0.02)
+    assert joined.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
+
+
+def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
+    rng = np.random.default_rng(1)
+    one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))  # 0.1 σ; ten degrees of freedom
+    before = known(40 * 0.02**2, 40.0)
+    found = noise_of([one], FREE, before, ALONE)
+    own = noise_of([one], FREE, Residuals(), ALONE)
+    np.testing.assert_allclose(found.covariance, own.covariance)
+    assert found.remembered.noise["0"].degrees == pytest.approx(0.8 * 40.0)
+
+
+def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:
+    rng = np.random.default_rng(2)
+    offsets = rng.normal(0, 0.1, (12, 2))
+    whole = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, Residuals(), ALONE)
+    offsets[4] = [1.5, -1.0]
+    cut = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, Residuals(), ALONE)
+    # one of twelve tells nothing: the other eleven fix the pose, two degrees of freedom fewer
+    ratio = np.diag(cut.covariance) / np.diag(whole.covariance)
+    assert ratio.max() < 2.5
+
+
+def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance() -> None:
+    rng = np.random.default_rng(5)
+    residuals, errors, plain = Residuals(), [], []
+    for _ in range(200):
+        found = []
+        for name in "01234":
+            one = sensor(name, rng, np.zeros((12, 2)))
+            shift = np.zeros((12, 2, 6))
+            shift[...] = rng.normal(0, 1, (2, 6))  # nearly alike for all features of a sensor
+            found.append(replace(one, J=shift + 0.3 * one.J))
+        made = [rng.normal(0, 0.3, 2) + rng.normal(0, 0.1, (12, 2)) for _ in found]
+        left, off = fitted(found, made)
+        noise = noise_of(left, FREE, residuals, ALONE)
+        residuals = noise.remembered
+        errors.append(off @ np.linalg.solve(noise.covariance, off) / 6)
+        J = np.concatenate([one.J.reshape(-1, 6) for one in left])
+        r = np.concatenate([one.offsets.ravel() for one in left])
+        plain.append(off @ (J.T @ J) @ off / (r @ r / (len(r) - 6)) / 6)
+    # least squares takes errors for independent and is far too sure; 1 would be right, and of 80
+    # degrees of freedom, spread unevenly over frames, the variance is known to a quarter
+    assert np.mean(plain[20:]) > 5.0
+    assert 0.5 < np.mean(errors[20:]) < 2.0
