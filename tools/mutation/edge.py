@@ -224,8 +224,8 @@ _RUNNER = (
     Mutant(
         "runner-worse-than-before-convinces",
         "runner.py",
-        "if step.convinces and are_as_good(step.track.tallies, track.tallies):",
-        "if step.convinces:",
+        "are_as_good(one.track.tallies, before.tallies) for one, before in after",
+        "True for one, before in after",
         "features that left the window are not looked for",
     ),
     Mutant(

@@ -195,8 +195,8 @@ _EVALUATION = (
     Mutant(
         "poses-symmetries-of-the-poses-first",
         "poses/evaluate.py",
-        "symmetries = {**poses.symmetries, **truth.symmetries}",
-        "symmetries = {**truth.symmetries, **poses.symmetries}",
+        "symmetries = {**poses.symmetries, **truth.symmetries}\n    answers",
+        "symmetries = {**truth.symmetries, **poses.symmetries}\n    answers",
         "poses excuse themselves by symmetries that the truth denies",
     ),
     Mutant(
@@ -215,7 +215,7 @@ _EVALUATION = (
     ),
     Mutant(
         "poses-symmetries-keep-their-unit",
-        "poses/evaluate.py",
+        "poses/units.py",
         "symmetries = {name: scaled(motions) for name, motions in file.symmetries.items()}",
         "symmetries = dict(file.symmetries)",
         "symmetries of a truth in another unit are far off",

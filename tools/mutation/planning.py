@@ -128,8 +128,8 @@ _DESIGN = (
     Mutant(
         "design-new-camera-looks-away",
         "design/advice.py",
-        "    forward = -direction\n",
-        "    forward = direction\n",
+        "seen_at = np.array([0.0, 0.0, abs(depth)])",
+        "seen_at = np.array([0.0, 0.0, -abs(depth)])",
         "the advice is to put a camera with its back to the body",
     ),
 )

@@ -107,6 +107,7 @@ class Atlas:
             plane[v : last_v + 1, u : last_u + 1] = _PENDING
         pages = self._detections.squares.size + len(self._grids) * self.plane.squares
         self._columns = min(math.isqrt(pages) + 1, _LARGEST // self.plane.side)
+        self._rows = min(pages // self._columns + 1, _LARGEST // self.plane.side)
         self.values = np.zeros((self.plane.side, self._columns * self.plane.side, 3), np.float32)
         self._drawn = 1  # the page of squares without anything
 
@@ -144,7 +145,9 @@ class Atlas:
         self._drawn += count
         rows, side = -(-self._drawn // self._columns), self.plane.side
         if rows * side > len(self.values):
-            values = np.empty((2 * rows * side, *self.values.shape[1:]), dtype=np.float32)
+            # so large that allocators keep it from frame to frame
+            rows = max(min(4 * rows, self._rows), rows)
+            values = np.empty((rows * side, *self.values.shape[1:]), dtype=np.float32)
             values[: len(self.values)] = self.values
             self.values = values
         return number
