@@ -56,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
     | {"frames", "session"},
     "importing": GROUND | {"session"},
-    "report": GROUND | {"frames", "pictures", "poses", "runner", "session"},
+    "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }
 MAY_IMPORT["design"] = GROUND | {
     "sensors",

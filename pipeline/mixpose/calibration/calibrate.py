@@ -15,12 +15,13 @@ from mixpose.calibration.choice import held_back
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import neighbours
+from mixpose.calibration.latecomers import placed
 from mixpose.calibration.matching import clock_of
 from mixpose.calibration.residuals import met_share, residuals_of, sights_of
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.calibration.start import Start, searched, start_from_cameras, start_together
+from mixpose.calibration.start import Start, searched, start_from_cameras, starts_together, without
 from mixpose.calibration.task import Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
@@ -50,16 +51,25 @@ def calibrate(
     """
     if task.cameras:
         known = searched(task, rules, progress, {} if found is None else found)
-        start = start_from_cameras(task, known, rules)
+        starts = iter([start_from_cameras(task, known, rules)])
     else:
-        start = start_together(task, rules, progress)
-    if not len(start.poses):
+        starts = starts_together(task, rules, progress)
+    best: Calibration | None = None
+    for start in starts:
+        if not len(start.poses):
+            continue
+        one = _Run(task, start, rules, progress).result()
+        off = float((one.noise / task.sigmas).max())
+        if best is None or off < float((best.noise / task.sigmas).max()):
+            best = one
+        if off < rules.failed:
+            break
+    if best is None:
         raise RecordingError(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
             "check` finds its features"
         )
-    free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
-    return _Run(replace(task, free=free), start, rules, progress).result()
+    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +83,12 @@ class _Part:
         kept = np.flatnonzero(mask)
         return _Part(tuple(self.frames[k] for k in kept), self.poses[kept])
 
+    def joined(self, other: _Part) -> _Part:
+        frames = self.frames + other.frames
+        order = sorted(range(len(frames)), key=lambda k: frames[k].number)
+        poses = np.concatenate([self.poses, other.poses])
+        return _Part(tuple(frames[k] for k in order), poses[order])
+
 
 class _Run:
     """One calibration: what stays the same during it."""
@@ -85,12 +101,20 @@ class _Run:
         self._pose_free = task.pose_free & (not self._known)
         times = [f.time_s for f in start.frames if f.time_s is not None]
         steps = np.diff(np.unique(times)) if len(times) > 1 else np.ones(1)
-        self._blocks = blocks_of(
-            start.rig,
-            task.free,
-            body=task.body_free,
-            length=_size_of(start.rig, start.poses),
-            interval=float(np.median(steps)),
+        self._interval = float(np.median(steps))
+        self._asked = task.free
+        self._late: dict[int, Floats] = {}
+        free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
+        self._task = replace(task, free=free)
+        self._blocks = self._laid_out()
+
+    def _laid_out(self) -> tuple[Block, ...]:
+        return blocks_of(
+            self._start.rig,
+            self._task.free,
+            body=self._task.body_free,
+            length=_size_of(self._start.rig, self._start.poses),
+            interval=self._interval,
         )
 
     def result(self) -> Calibration:
@@ -99,15 +123,16 @@ class _Run:
         everything = _Part(self._start.frames, self._start.poses)
         mask = held_back(len(everything.poses), rules, runs=task.times_matter)
         training = everything.only(~mask)
-        self._progress("adjusting all sensors together", 0, 3)
+        self._progress("adjusting all sensors together", 0, 4)
         adjusted = self._adjusted(training, self._start.rig, None)
         good = met_share(adjusted, training.frames, task) > rules.least_met
         bad = [f.number for f, ok in zip(training.frames, good, strict=True) if not ok]
         if bad and good.any():
             training = _Part(training.frames, adjusted.poses).only(good)
-            self._progress("adjusting without bad frames", 1, 3)
+            self._progress("adjusting without bad frames", 1, 4)
             adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
-        self._progress("looking at the frames held back", 2, 3)
+        self._place_latecomers(training, adjusted)
+        self._progress("looking at the frames held back", 2, 4)
         held = everything.only(mask)
         held_fit = None
         if len(held.poses):
@@ -116,7 +141,53 @@ class _Run:
             bad += [f.number for f, ok in zip(held.frames, good, strict=True) if not ok]
             held = _Part(held.frames, held_fit.poses).only(good)
             held_fit = self._posed(held, adjusted.rig, adjusted.noise) if good.any() else None
-        return self._told(training, adjusted, held, held_fit, sorted(bad))
+        training = _Part(training.frames, adjusted.poses)
+        told = self._residuals(training, adjusted, held, held_fit)
+        if held_fit is not None or self._late:
+            self._progress("adjusting with all frames", 3, 4)
+            if held_fit is not None:
+                training = training.joined(_Part(held.frames, held_fit.poses))
+            training, rig = self._completed(training, adjusted.rig)
+            adjusted = self._adjusted(training, rig, rules.blur * adjusted.noise * 2)
+        numbers = tuple(f.number for f in held.frames) if held_fit is not None else ()
+        return self._told(training, adjusted, numbers, told, sorted(bad))
+
+    def _place_latecomers(self, training: _Part, adjusted: Adjusted) -> None:
+        """Place cameras that could not be linked by what they see alone."""
+        task, start = self._task, self._start
+        if not start.unlinked:
+            return
+        numbers = {frame.number: frame for frame in task.frames}
+        frames = tuple(numbers[frame.number] for frame in training.frames)
+        linked = [s for s in task.cameras if s not in start.unlinked]
+        for sensor in start.unlinked:
+            T = placed(
+                task,
+                adjusted.rig,
+                sensor,
+                linked,
+                frames,
+                adjusted.poses,
+                adjusted.noise,
+                self._rules,
+            )
+            if T is not None:
+                self._late[sensor] = T
+
+    def _completed(self, part: _Part, rig: Rig) -> tuple[_Part, Rig]:
+        """Frames with what the cameras that came late saw, and the rig with them."""
+        task = self._task
+        if not self._late:
+            return part, rig
+        rest = {s for s in self._start.unlinked if s not in self._late}
+        numbers = {frame.number: frame for frame in task.frames}
+        frames = tuple(without(numbers[f.number], rest) for f in part.frames)
+        for sensor, T in self._late.items():
+            rig = rig.placed(sensor, T)
+        free = {s: kinds for s, kinds in self._asked.items() if s not in rest}
+        self._task = replace(task, free=free)
+        self._blocks = self._laid_out()
+        return _Part(frames, part.poses), rig
 
     def _bundle(self, part: _Part, blocks: tuple[Block, ...]) -> Bundle:
         near = neighbours([f.time_s for f in part.frames], self._rules.gap)
@@ -147,28 +218,35 @@ class _Run:
             noise=noise,
         )
 
+    def _residuals(
+        self, training: _Part, adjusted: Adjusted, held: _Part, held_fit: Adjusted | None
+    ) -> dict[int, Residual]:
+        """Residuals before and after, of frames that were calibrated from and held back."""
+        task = self._task
+        none = dict.fromkeys(range(len(task.rig.sensors)), float("nan"))
+        told = []
+        for part, fit in ((training, adjusted), (held, held_fit)):
+            if fit is None:
+                told += [none, none]
+                continue
+            bundle = self._bundle(part, ())
+            told.append(residuals_of(bundle, task.rig, fit.poses, fit, climb=True))
+            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit, climb=False))
+        return {s: Residual(*(each[s] for each in told)) for s in none}
+
     def _told(
         self,
-        training: _Part,
+        part: _Part,
         adjusted: Adjusted,
-        held: _Part,
-        held_fit: Adjusted | None,
+        held: tuple[int, ...],
+        residuals: dict[int, Residual],
         bad: list[int],
     ) -> Calibration:
         task = self._task
-        bundle = self._bundle(training, ())
-        after = residuals_of(bundle, adjusted.rig, adjusted.poses, adjusted, climb=False)
-        before = residuals_of(bundle, task.rig, adjusted.poses, adjusted, climb=True)
-        none = dict.fromkeys(range(len(task.rig.sensors)), np.nan)
-        held_after, held_before = none, none
-        if held_fit is not None:
-            own = self._bundle(held, ())
-            held_after = residuals_of(own, adjusted.rig, held_fit.poses, held_fit, climb=False)
-            held_before = residuals_of(own, task.rig, held_fit.poses, held_fit, climb=True)
-        freedom = Freedom(self._pose_free, training.poses)
+        freedom = Freedom(self._pose_free, part.poses)
         _, gauge = gauge_rows(adjusted.rig, self._blocks, freedom, task.length)
-        deviations, refused = _determined(self._blocks, adjusted, task.rig.names, self._rules)
-        numbers = [f.number for f in training.frames]
+        deviations, refused = _determined(self._blocks, adjusted, task.rig.names)
+        numbers = [f.number for f in part.frames]
         return Calibration(
             before=task.rig,
             after=adjusted.rig,
@@ -178,20 +256,17 @@ class _Run:
             refused=refused,
             gauge=gauge,
             through=self._start.through,
-            unlinked=self._start.unlinked,
+            unlinked=tuple(s for s in self._start.unlinked if s not in self._late),
             used=tuple(numbers),
-            held=tuple(f.number for f in held.frames) if held_fit is not None else (),
+            held=held,
             bad=tuple(bad),
             recorded=len(task.frames),
-            residuals={
-                s: Residual(before[s], after[s], held_before[s], held_after[s])
-                for s in range(len(task.rig.sensors))
-            },
+            residuals=residuals,
             noise=adjusted.noise,
             inflation=adjusted.inflation,
             sights=sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.poses, strict=True)),
-            frames=training.frames,
+            frames=part.frames,
         )
 
 
@@ -204,7 +279,7 @@ def _size_of(rig: Rig, poses: Floats) -> float:
 
 
 def _determined(
-    blocks: Sequence[Block], adjusted: Adjusted, names: Sequence[str], rules: CalibrationRules
+    blocks: Sequence[Block], adjusted: Adjusted, names: Sequence[str]
 ) -> tuple[Floats, tuple[str, ...]]:
     """Standard deviations, infinite where not determined, and what is refused in words."""
     deviations = np.sqrt(np.maximum(np.diag(adjusted.covariance), 0.0))

@@ -161,7 +161,10 @@ def _conditions(
         change = _body_change(rig.points)
         text = "the body's own frame stays where its features are on average"
         found += [(row(body.place, change[:, k]), text) for k in range(6, 12)]
-        if length is None:
+        if length is not None:
+            text = "the known length between two sensors stays"
+            found.append((_length_row(rig, blocks, length, row, count), text))
+        else:
             text = "the body keeps its size: cameras alone do not tell scale"
             found.append((row(body.place, change[:, 12]), text))
     for direction in Z.T:
@@ -169,6 +172,24 @@ def _conditions(
             text = "the rig as a whole stays where it is: no data tell where it stands"
             found.append((direction, text))
     return found
+
+
+def _length_row(
+    rig: Rig, blocks: Sequence[Block], length: tuple[int, int], row: Any, count: int
+) -> Floats:
+    """The change of the distance between two sensors by a step of the parameters."""
+    centres = [centre_of(rig.sensors[k]) for k in length]
+    along = (centres[1] - centres[0]) / np.linalg.norm(centres[1] - centres[0])
+    out = np.zeros(count)
+    for index, sign in zip(length, (-1.0, 1.0), strict=True):
+        for block in blocks:
+            if block.sensor == index and block.kind == "position":
+                out += row(block.place, sign * along)
+            elif block.sensor == index and block.kind == "pose":
+                sensor: Any = rig.sensors[index]
+                turned = -sign * sensor.T_sensor_world[:3, :3] @ along
+                out += row(block.place, np.concatenate([turned, np.zeros(3)]))
+    return out
 
 
 def _range_conditions(rig: Rig, positions: Sequence[Block], row: Any) -> list[tuple[Floats, str]]:

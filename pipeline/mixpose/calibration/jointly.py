@@ -1,7 +1,7 @@
 """Where the body is for all sensors together, where none knows it alone: ranges, parallel beams.
 
 The sensors are then believed to stand about where the session has them.  Blurs wider than σ_ε
-forgive what they are off; the narrowest with which most frames convince is taken.
+forgive what they are off, until the rig can be adjusted to what was found.
 """
 
 from __future__ import annotations
@@ -24,27 +24,25 @@ from mixpose.tracking import Tracker
 
 def joint_poses(
     task: Task, rules: CalibrationRules, progress: Progress
-) -> tuple[tuple[SeenFrame, ...], Floats]:
-    """Frames whose pose all sensors together know, and the poses (K, 4, 4)."""
-    best: list[tuple[SeenFrame, Floats]] = []
-    total = len(task.frames) * len(rules.widened)
-    for turn, factor in enumerate(rules.widened):
-        before = turn * len(task.frames)
-        found = []
-        for done, posed in enumerate(_tracked(task, factor)):
-            progress("searching the body with all sensors", before + done, total)
+) -> Iterator[tuple[tuple[SeenFrame, ...], Floats]]:
+    """Frames whose pose all sensors together know, and the poses (K, 4, 4), blur after blur."""
+    for factor in rules.widened:
+        sure: list[tuple[SeenFrame, Floats]] = []
+        doubtful: list[tuple[SeenFrame, Floats]] = []
+        for done, (posed, is_sure) in enumerate(_tracked(task, factor)):
+            progress("searching the body with all sensors", done, len(task.frames))
             if posed is not None:
-                found.append(posed)
-        if len(found) > len(best):
-            best = found
-        if len(best) >= rules.convinced * len(task.frames):
-            break
-    poses = np.array([T for _, T in best]).reshape(-1, 4, 4)
-    return tuple(frame for frame, _ in best), poses
+                (sure if is_sure else doubtful).append(posed)
+        # where hardly any pose is believed, the likeliest are a start, and deviations will tell
+        few = len(sure) < rules.believed * len(task.frames)
+        found = sorted(sure + doubtful, key=lambda one: one[0].number) if few else sure
+        if found:
+            poses = np.array([T for _, T in found])
+            yield tuple(frame for frame, _ in found), poses
 
 
-def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | None]:
-    """Each frame with a pose that is believed, sensors blurred by a factor more than σ_ε."""
+def _tracked(task: Task, factor: float) -> Iterator[tuple[tuple[SeenFrame, Floats] | None, bool]]:
+    """Each frame with its pose, and whether it is believed, at a factor times σ_ε."""
     free = tuple(name for name, is_free in zip(TWIST_NAMES, task.pose_free, strict=True) if is_free)
     turn, distance = task.around
     options = EstimatorOptions(free=free, fuse=task.fuse)
@@ -56,7 +54,7 @@ def _tracked(task: Task, factor: float) -> Iterator[tuple[SeenFrame, Floats] | N
                 track, frame.number, frame.time_s, _views(task, frame, factor)
             )
         T = estimate.T_world_object
-        yield None if T is None or estimate.status != "ok" else (frame, T)
+        yield None if T is None else (frame, T), estimate.status == "ok"
 
 
 def _views(task: Task, frame: SeenFrame, factor: float) -> list[View]:

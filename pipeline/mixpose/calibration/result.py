@@ -20,9 +20,9 @@ class Residual:
     Attributes
     ----------
     before, after : float
-        Of the frames that were calibrated from, with the calibration before and after.
+        Of the frames that were calibrated from first, with the calibration before and after.
     held_before, held_after : float
-        Of the frames held back.
+        Of the frames held back meanwhile.
     """
 
     before: float
@@ -70,7 +70,8 @@ class Calibration:
     through : mapping of int to (int or None, int)
     unlinked : tuple of int
     used, held, bad : tuple of int
-        Frame numbers: calibrated from, held back, left out as bad.
+        Frame numbers: calibrated from in the end; held back until the residuals were taken, and
+        part of `used` then; left out as bad.
     recorded : int
         Frames of the recording with detections.
     residuals : mapping of int to Residual

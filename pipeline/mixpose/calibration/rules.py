@@ -36,17 +36,28 @@ class CalibrationRules:
     most_frames: int = constant(120, "taken; chosen by information where a recording has more")
     most_candidates: int = constant(240, "frames among which those are chosen")
     least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
-    bad_frame: float = constant(4.0, "residual of a frame by the median of all: it is left out")
     undetermined: float = constant(
         0.25,
         "standard deviation by the size of what is sought (the rig, a focal length, a turn of "
         "1 rad): nothing is known of such a direction",
     )
     widened: tuple[float, ...] = constant(
-        (1.0, 4.0, 12.0), "σ_ε with which sensors that know no pose alone are tried together"
+        (1.0, 2.5, 6.0),
+        "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "
+        "adjusted: sensors 30 mm off need the second where σ_ε is 5 mm",
     )
-    convinced: float = constant(0.8, "of the frames: then no wider blur is tried")
+    failed: float = constant(
+        1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"
+    )
+    believed: float = constant(0.3, "of the frames: with fewer, doubtful poses are a start too")
+    explained: float = constant(
+        0.5, "of a late camera's detections that poses known by then must explain"
+    )
+    least_detections: int = constant(8, "explained likewise: four points fit many places")
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")
     moved: float = constant(
-        4.0, "standard deviations, and twice the typical residual, by which a bumped sensor is off"
+        4.0, "standard deviations: a sensor that did not move is never that far off in simulation"
+    )
+    worse: float = constant(
+        1.5, "times the residual of a new calibration, from which an old one no longer holds"
     )

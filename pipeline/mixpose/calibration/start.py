@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.calibration.alone import Hypotheses, hypotheses
+from mixpose.calibration.biases import biased
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.jointly import joint_poses
 from mixpose.calibration.linking import Link, agreed, link_all
@@ -95,24 +96,25 @@ def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Sta
         unlinked = tuple(s for s in unlinked if s in movable)
     return Start(
         rig,
-        tuple(_without(task.frames[k], unlinked) for k in kept),
+        tuple(without(task.frames[k], unlinked) for k in kept),
         poses[kept],
         {s: (a, n) for s, (a, n) in through.items()},
         unlinked,
     )
 
 
-def start_together(task: Task, rules: CalibrationRules, progress: Progress) -> Start:
+def starts_together(task: Task, rules: CalibrationRules, progress: Progress) -> Iterator[Start]:
     """Poses that all sensors together know, or that are known anyway."""
     if task.known is None:
-        frames, poses = joint_poses(task, rules, progress)
-        return Start(task.rig, frames, poses, {}, ())
+        for frames, poses in joint_poses(task, rules, progress):
+            yield Start(task.rig, frames, poses, {}, ())
+        return
     frames = tuple(frame for frame in task.frames if frame.number in task.known)
     poses = np.array([task.known[frame.number] for frame in frames]).reshape(-1, 4, 4)
-    return Start(task.rig, frames, poses, {}, ())
+    yield Start(biased(task, frames, poses), frames, poses, {}, ())
 
 
-def _without(frame: SeenFrame, sensors: tuple[int, ...]) -> SeenFrame:
+def without(frame: SeenFrame, sensors: Collection[int]) -> SeenFrame:
     """A frame without what some sensors saw."""
     points = {s: y for s, y in frame.points.items() if s not in sensors}
     return replace(frame, points=points)
@@ -137,7 +139,7 @@ def _from_known_poses(
         rig = rig.placed(sensor, link.T_a_b)
         through[sensor] = (None, link.frames)
     gone = tuple(unlinked)
-    frames = tuple(_without(task.frames[k], gone) for k in kept)
+    frames = tuple(without(task.frames[k], gone) for k in kept)
     return Start(rig, frames, poses, through, gone)
 
 

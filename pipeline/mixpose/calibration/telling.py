@@ -6,8 +6,10 @@ from collections import Counter
 
 import numpy as np
 
+from mixpose.calibration.checking import displacements
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block, centre_of
+from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
 from mixpose.rigid import rotation_angle_deg
 
@@ -38,10 +40,11 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
 
 
 def _frames_line(found: Calibration) -> str:
-    parts = [f"{len(found.used)} calibrated from", f"{len(found.held)} held back"]
+    first = len(found.used) - len(found.held)
+    parts = [f"{first} calibrated from", f"{len(found.held)} held back, then taken too"]
     if found.bad:
         parts.append(f"{len(found.bad)} bad")
-    rest = found.recorded - len(found.used) - len(found.held) - len(found.bad)
+    rest = found.recorded - len(found.used) - len(found.bad)
     if rest > 0:
         parts.append(f"{rest} not needed or without the body")
     return f"{'frames':<10}{', '.join(parts)}"
@@ -198,3 +201,26 @@ def _where(counts: Floats) -> str:
     }
     empty = [name for name, row in sides.items() if not row.any()]
     return ", ".join(empty) if empty else "some corners or gaps"
+
+
+def check_lines(found: Calibration, unit: str) -> list[str]:
+    """Whether the calibration that a session has still holds, and which sensor was bumped."""
+    told = displacements(found, CalibrationRules())
+    bumped = [one.name for one in told if one.moved]
+    lines = [_frames_line(found)]
+    for index, one in enumerate(told):
+        of = "px" if found.after.sensors[index].unit == "px" else unit
+        lines.append(
+            f"{one.name:<20}turned by {one.turn_deg:.3g} ± {one.turn_deviation_deg:.2g} deg, moved "
+            f"by {one.shift:.3g} ± {one.shift_deviation:.2g} {unit}; residual "
+            f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"
+            + ("  MOVED" if one.moved and len(told) > 2 else "")
+        )
+    lines += [f"{'not known':<20}{found.after.names[k]}: shares no view" for k in found.unlinked]
+    if not bumped:
+        lines.append("the calibration holds")
+    elif len(told) == 2:
+        lines.append("the calibration no longer holds: of two sensors no one can tell which moved")
+    else:
+        lines.append(f"the calibration no longer holds: {', '.join(bumped)} moved")
+    return lines

@@ -42,8 +42,7 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     if any(block.kind == "body" for block in found.blocks):
         _put_body(document["object"], found, session)
     text = str(tomlkit.dumps(document))
-    used = f"{len(found.used)} frames, {len(found.held)} held back"
-    return f"{MARK} {version} from {session.path.name}: {used}.\n{text}"
+    return f"{MARK} {version} from {session.path.name}, {len(found.used)} frames.\n{text}"
 
 
 def _put_sensor(table: Any, found: Calibration, index: int, kinds: Sequence[Kind]) -> None:

@@ -30,6 +30,22 @@ def calibrate(
             "positions of range sensors.",
         ),
     ] = None,
+    length: Annotated[
+        str | None,
+        typer.Option(metavar="SENSOR:SENSOR=LENGTH", help="A known distance, which gives scale."),
+    ] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SENSOR|body@FRAME", help="Whose frame becomes the world; else it stays."
+        ),
+    ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only say whether the calibration still holds.")
+    ] = False,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="A page with pictures.")
+    ] = None,
     source: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
@@ -47,6 +63,9 @@ def calibrate(
         poses=poses,
         free=parse_free(free or ()),
         sources=tuple(source or ()),
-        report=None,
+        report=report,
+        check=check,
+        length=length,
+        world=world,
     )
     calibrate_session(session, request)

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,8 @@ from mixpose.calibration.recorded import read_frames, require_points
 from mixpose.calibration.saved import MARK as SAVED_MARK
 from mixpose.calibration.saved import Saved
 from mixpose.calibration.task import Progress
-from mixpose.calibration.telling import lines_of
+from mixpose.calibration.telling import check_lines, lines_of
+from mixpose.calibration.world import in_world, with_length
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
@@ -28,6 +29,8 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Floats
+from mixpose.report.calibration import MARK as REPORT_MARK
+from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
 
@@ -45,6 +48,12 @@ class CalibrateRequest:
     sources : tuple of str
         ``NAME=PATH``.
     report : Path or None
+    check : bool
+        Whether an old calibration is only judged.
+    length : str or None
+        ``SENSOR:SENSOR=LENGTH``.
+    world : str or None
+        Whose frame becomes the world's: a sensor's, or ``body@FRAME``.
     """
 
     output: Path | None
@@ -52,6 +61,9 @@ class CalibrateRequest:
     free: tuple[str, ...]
     sources: tuple[str, ...]
     report: Path | None
+    check: bool = False
+    length: str | None = None
+    world: str | None = None
 
 
 def calibrate_session(path: Path, request: CalibrateRequest) -> None:
@@ -66,15 +78,35 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
     """
     session = load_session(path)
     output = request.output
-    if output is None:
-        raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml")
+    if (output is None) is not request.check:
+        raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     inputs = [path] if request.poses is None else [path, request.poses]
-    refuse_to_overwrite_but(output, inputs, MARK)
+    for written, mark in ((output, MARK), (request.report, REPORT_MARK)):
+        if written is not None:
+            refuse_to_overwrite_but(written, inputs, mark)
+    found = _found(session, request, inputs)
+    if request.report is not None:
+        page = render_calibration(found, path.name, session.unit, __version__)
+        _write(request.report, page, "--report")
+    if output is None:
+        sys.stdout.write("\n".join(check_lines(found, session.unit)) + "\n")
+        _warn(found)
+        return
+    _write(output, calibrated_text(session, found, output, __version__), "-o")
+    sys.stdout.write("\n".join(lines_of(found, session.unit)) + "\n")
+    _warn(found)
+    say(f"calibrated from {len(found.used)} frames -> {output}")
+
+
+def _found(session: Session, request: CalibrateRequest, inputs: Sequence[Path]) -> Calibration:
+    """Calibrate; where a file is written, what was searched is kept beside it until the end."""
     rules = CalibrationRules()
     with _watched() as progress:
         task = task_of(session, request, rules, progress)
         say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
-        partial = output.with_name(f"{output.name}.partial")
+        if request.output is None:
+            return calibrate(task, rules, progress=progress)
+        partial = request.output.with_name(f"{request.output.name}.partial")
         refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
         saved = Saved(partial, _key_of(session, task))
         if saved.resumed:
@@ -85,15 +117,17 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
             finished = True
         finally:
             saved.close(finished=finished)
-    text = calibrated_text(session, found, output, __version__)
+    if request.world is not None:
+        found = in_world(found, request.world, session)
+    return found
+
+
+def _write(path: Path, text: str, option: str) -> None:
     try:
-        with appearing_whole(output) as part:
+        with appearing_whole(path) as part:
             part.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
-        raise SessionError(f"-o {output}: cannot be written: {error.strerror}") from error
-    sys.stdout.write("\n".join(lines_of(found, session.unit)) + "\n")
-    _warn(found)
-    say(f"calibrated from {len(found.used)} frames -> {output}")
+        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error
 
 
 def task_of(
@@ -103,8 +137,13 @@ def task_of(
     require_points(session.body)
     setups = session.sensors
     rig = Rig.of([one.name for one in setups], [one.sensor for one in setups], session.body)
+    late = [one.delay if isinstance(one.delay, float | int) else 0.0 for one in setups]
+    rig = replace(rig, delays=np.array(late, dtype=np.float64))
     known = None if request.poses is None else known_poses(request.poses, session)
     free, body = free_parameters(rig, request.free, poses_known=known is not None)
+    pair = None
+    if request.length is not None:
+        rig, pair = with_length(rig, request.length)
     kinds = {kind for each in free.values() for kind in each}
     runs = bool(kinds & {"delay", "drift"})
     frames = read_frames(session, named_sources(request.sources), rules, progress, runs=runs)
@@ -126,6 +165,7 @@ def task_of(
         around=(None, None) if start is None else (start.rotation_deg, start.distance),
         fuse=session.estimator.fuse,
         known=known,
+        length=pair,
     )
 
 

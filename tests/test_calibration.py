@@ -1,0 +1,288 @@
+"""Calibrations of simulated rigs whose truth is known.
+
+Where cameras are adjusted, what each knows alone is given 1 degree and 5 mm off, as searching for
+it takes most of the time and has tests of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mixpose.body import Body, PointFeature
+from mixpose.calibration import CalibrationRules, Rig, SeenFrame, Task, calibrate
+from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.checking import displacements
+from mixpose.calibration.choice import chosen, held_back
+from mixpose.calibration.gauge import Freedom, gauge_rows
+from mixpose.calibration.interpolation import interpolate, neighbours
+from mixpose.calibration.rig import blocks_of
+from mixpose.calibration.saved import Saved
+from mixpose.rigid import (
+    from_parts,
+    from_rotation_vector,
+    inverse,
+    perturb,
+    rotation_angle_deg,
+    transform,
+    twist_between,
+)
+from mixpose.sensors import PinholeCamera, RangeSensor
+
+Floats = np.ndarray
+POINTS = np.array(
+    [[0, 0, 0], [95, 12, -8], [-62, 70, 14], [-38, -84, 22], [41, 48, 76], [58, -57, 45.0]]
+)
+BODY = Body("six", tuple(PointFeature(p) for p in POINTS))
+K = np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]])
+FPS = 30.0
+ALL = np.ones(6, dtype=np.bool_)
+PLACES = np.array([[0, -1000, 0], [1000, 0, 0], [0, 0, 1000.0]])
+
+
+def cameras(count: int) -> list[PinholeCamera]:
+    found = []
+    for angle in np.linspace(-0.7, 0.7, count):
+        turn = from_rotation_vector([0.05, angle, 0.02], [0, 0, 0])
+        T = from_parts(np.eye(3), [5.0, -8.0, 820.0]) @ turn
+        found.append(PinholeCamera(K, resolution=(640, 512), T_sensor_world=T))
+    return found
+
+
+def motion(time: float) -> Floats:
+    way = np.array([3.1, 4.3, 2.3, 3.7, 2.9, 4.9]) * time + np.arange(6)
+    twist = np.sin(way) * [40, 40, 40, 0.5, 0.5, 0.5]
+    return from_rotation_vector(twist[3:], twist[:3])
+
+
+def recording(
+    sensors: Sequence[PinholeCamera | RangeSensor],
+    count: int,
+    noise: float,
+    late: float = 0.0,
+    points: Floats = POINTS,
+) -> tuple[SeenFrame, ...]:
+    """Shuffled detections; the second sensor takes its frames `late` seconds later."""
+    rng = np.random.default_rng(1)
+    frames = []
+    for k in range(count):
+        time = k / FPS
+        seen = {}
+        for index, sensor in enumerate(sensors):
+            T = motion(time + (late if index == 1 else 0.0))
+            y, visible = sensor.project(transform(T, points))
+            y = y[visible] + rng.normal(0, noise, y[visible].shape)
+            seen[index] = rng.permutation(y)
+        frames.append(SeenFrame(k, time, seen, dict.fromkeys(seen, time)))
+    return tuple(frames)
+
+
+def alone(
+    sensors: list[PinholeCamera], frames: tuple[SeenFrame, ...]
+) -> dict[tuple[int, int], Hypotheses]:
+    """What each camera knows alone, a little wrong, and a wrong answer beside it."""
+    rng = np.random.default_rng(2)
+    known = {}
+    for frame in frames:
+        for index in frame.points:
+            T = sensors[index].T_sensor_world @ motion(frame.number / FPS)
+            near = perturb(T, rng.normal(0, [3, 3, 3, 0.01, 0.01, 0.01]))
+            wrong = perturb(T, rng.normal(0, [30, 30, 30, 0.5, 0.5, 0.5]))
+            known[frame.number, index] = Hypotheses(np.array([wrong, near]), np.array([9.0, 8.0]))
+    return known
+
+
+def task_of(
+    sensors: Sequence[PinholeCamera | RangeSensor],
+    frames: tuple[SeenFrame, ...],
+    sigma: float = 1.5,
+    **options: Any,
+) -> Task:
+    names = [f"s{k}" for k in range(len(sensors))]
+    rig = Rig.of(names, sensors, BODY)
+    defaults: dict[str, Any] = {"free": dict.fromkeys(range(1, len(sensors)), ("pose",))}
+    return Task(rig, BODY, frames, np.full(len(sensors), sigma), **{**defaults, **options})
+
+
+def bumped(task: Task, index: int, deg: float, mm: float) -> Task:
+    off = from_rotation_vector(
+        np.radians(deg) * np.array([0.6, 0.64, 0.48]), [mm * 0.6, 0, mm * 0.8]
+    )
+    T = off @ task.rig.sensors[index].T_sensor_world  # type: ignore[attr-defined]
+    return replace(task, rig=task.rig.placed(index, T))
+
+
+def test_a_camera_off_by_2_degrees_and_20_mm_that_is_7_ms_late_is_put_right() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 40, 0.02, late=0.007)
+    task = bumped(task_of(sensors, frames, free={1: ("pose", "delay")}), 1, 2.0, 20.0)
+    found = calibrate(task, found=alone(sensors, frames))
+    T = found.after.sensors[1].T_sensor_world  # type: ignore[attr-defined]
+    truth = sensors[1].T_sensor_world
+    # the standard deviations that are told: 0.003 degrees, 0.04 mm, 0.02 ms
+    assert rotation_angle_deg(T, truth) < 0.02
+    assert np.linalg.norm(inverse(T)[:3, 3] - inverse(truth)[:3, 3]) < 0.1
+    assert abs(found.after.delays[1] - 0.007) < 0.3e-3
+    assert (found.deviations > 0).all()
+    assert found.deviations[6] < 0.1e-3
+    assert found.noise == pytest.approx(0.02, rel=0.2)
+    assert found.residuals[1].held_after < 0.05 < found.residuals[1].held_before
+    assert len(found.held) == 8
+
+
+def test_marker_coordinates_2_mm_off_are_learnt_up_to_the_gauge() -> None:
+    sensors = cameras(2)
+    rng = np.random.default_rng(3)
+    off = rng.normal(size=POINTS.shape)
+    true = POINTS + 2 * off / np.linalg.norm(off, axis=1)[:, None]
+    frames = recording(sensors, 40, 0.02, points=true)
+    task = task_of(sensors, frames, free={}, body_free=True)
+    found = calibrate(task, found=alone(sensors, frames))
+    a, b = (p - p.mean(axis=0) for p in (found.after.points, true))
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    assert np.linalg.norm(a @ (U @ Vt) - b, axis=1).max() < 0.1
+    assert found.gauge == ("the body's own frame stays where its features are on average",)
+
+
+def test_three_range_sensors_30_mm_off_are_found_in_the_papers_gauge() -> None:
+    rng = np.random.default_rng(4)
+    off = rng.normal(size=(3, 3))
+    off *= 30 / np.linalg.norm(off, axis=1)[:, None]
+    frames = recording([RangeSensor(p) for p in PLACES], 40, 0.05)
+    task = task_of(
+        [RangeSensor(p) for p in PLACES + off],
+        frames,
+        5.0,
+        free=dict.fromkeys(range(3), ("position",)),
+        T_held=perturb(motion(0.0), np.array([2, -2, 1, 0.03, 0.02, -0.03])),
+    )
+    found = calibrate(task)
+    places = np.array([s.position for s in found.after.sensors])  # type: ignore[attr-defined]
+
+    def in_gauge(p: Floats) -> list[float]:
+        c, a, b = (float(np.linalg.norm(p[i] - p[j])) for i, j in ((0, 1), (0, 2), (1, 2)))
+        x = (a * a - b * b + c * c) / (2 * c)
+        return [c, x, float(np.sqrt(a * a - x * x))]
+
+    assert np.abs(np.array(in_gauge(places)) - in_gauge(PLACES)).max() < 0.5
+    assert np.array_equal(places[0], (PLACES + off)[0])
+    assert len(found.gauge) == 3
+
+
+def test_range_biases_come_from_known_poses() -> None:
+    sensors = [RangeSensor(p) for p in PLACES]
+    true = [replace(s, range_bias=b) for s, b in zip(sensors, (120.0, 180.0, 260.0), strict=True)]
+    frames = recording(true, 40, 1.0)
+    known = {frame.number: motion(frame.number / FPS) for frame in frames}
+    task = task_of(sensors, frames, 5.0, free=dict.fromkeys(range(3), ("range_bias",)), known=known)
+    found = calibrate(task)
+    biases = [s.range_bias for s in found.after.sensors]  # type: ignore[attr-defined]
+    # 240 ranges of 1 mm noise each: 0.07 mm
+    assert biases == pytest.approx([120, 180, 260], abs=0.3)
+
+
+def test_what_a_body_that_never_moves_does_not_tell_is_refused_by_name() -> None:
+    sensors = [RangeSensor(p) for p in PLACES]
+    frames = recording(sensors, 12, 4.0)
+    still = tuple(replace(frame, points=frames[0].points) for frame in frames)
+    known = {frame.number: motion(0.0) for frame in still}
+    free = {0: ("position", "range_bias")}
+    found = calibrate(task_of(sensors, still, 5.0, free=free, known=known))
+    assert found.refused
+    assert all("s0:" in text for text in found.refused)
+    assert np.isinf(found.deviations).any()
+
+
+def test_a_camera_without_a_common_view_is_named_and_stays() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 10, 0.05)
+    frames = tuple(replace(f, points={k: y for k, y in f.points.items() if k != 2}) for f in frames)
+    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    assert found.unlinked == (2,)
+    assert found.after.sensors[2] is found.before.sensors[2]
+
+
+def test_a_frame_of_clutter_is_left_out_by_number() -> None:
+    sensors = cameras(2)
+    frames = list(recording(sensors, 16, 0.05))
+    known = alone(sensors, tuple(frames))
+    rng = np.random.default_rng(5)
+    noise = {k: rng.uniform(50, 450, (6, 2)) for k in (0, 1)}
+    frames[5] = replace(frames[5], points=noise)
+    task = bumped(task_of(sensors, tuple(frames)), 1, 1.0, 5.0)
+    found = calibrate(task, found=known)
+    assert 5 not in found.used
+    truth = sensors[1].T_sensor_world
+    assert rotation_angle_deg(found.after.sensors[1].T_sensor_world, truth) < 0.03  # type: ignore[attr-defined]
+
+
+def test_a_check_names_the_one_camera_of_three_that_was_bumped() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 14, 0.05)
+    for index in (0, 2):
+        found = calibrate(
+            bumped(task_of(sensors, frames), index, 0.5, 4.0), found=alone(sensors, frames)
+        )
+        told = displacements(found, CalibrationRules())
+        assert [one.name for one in told if one.moved] == [f"s{index}"]
+    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    assert not any(one.moved for one in displacements(found, CalibrationRules()))
+
+
+@pytest.mark.parametrize(
+    ("free", "body", "count"), [((1,), False, 0), ((0, 1), False, 6), ((0, 1), True, 13)]
+)
+def test_as_many_conditions_as_freedoms(free: tuple[int, ...], body: bool, count: int) -> None:
+    rig = Rig.of(("a", "b"), cameras(2), BODY)
+    poses = np.array([motion(time) for time in (0.1, 0.7, 1.6, 2.3)])
+    blocks = blocks_of(rig, dict.fromkeys(free, ("pose",)), body=body, length=800.0, interval=1.0)
+    rows, _ = gauge_rows(rig, blocks, Freedom(ALL, poses))
+    assert len(rows) == count
+    known, _ = gauge_rows(rig, blocks, Freedom(~ALL, poses))
+    assert len(known) == 0
+
+
+def test_motion_between_frames_is_cubic() -> None:
+    times = [k / FPS for k in range(8)]
+    poses = np.array([motion(t) for t in times])
+    near = neighbours(times, 2.5)
+    there = interpolate(near, poses, np.arange(8), np.full(8, 0.007))
+    for k in range(1, 6):
+        error = twist_between(perturb(poses[k], there.twist[k]), motion(times[k] + 0.007))
+        # h^4/4! times the fourth derivative, 4.9^4 * 40 mm
+        assert np.abs(error[:3]).max() < 2e-3
+    assert there.known.all()
+
+
+def test_every_fifth_frame_is_held_back_or_every_fifth_run() -> None:
+    rules = CalibrationRules()
+    assert held_back(40, rules, runs=False).sum() == 8
+    assert held_back(4, rules, runs=False).sum() == 0
+    in_runs = np.flatnonzero(held_back(40, rules, runs=True))
+    assert in_runs.tolist() == [8, 9, 10, 11, 28, 29, 30, 31]
+
+
+def test_frames_that_tell_something_new_are_chosen_first() -> None:
+    directions = np.array([[1, 0], [1, 0.01], [1, -0.01], [0, 1.0]])
+    information = np.einsum("ki,kj->kij", directions, directions)
+    assert 3 in chosen(information, 2).tolist()
+
+
+def test_what_was_searched_is_found_again(tmp_path: Path) -> None:
+    path = tmp_path / "a.partial"
+    first = Saved(path, "key")
+    first[3, 1] = Hypotheses(np.array([motion(0.3)]), np.array([7.0]))
+    first.close(finished=False)
+    again = Saved(path, "key")
+    assert again.resumed == 1
+    assert np.array_equal(again[3, 1].poses[0], motion(0.3))
+    again.close(finished=False)
+    other = Saved(path, "another")
+    assert other.resumed == 0
+    other.close(finished=True)
+    assert not path.exists()
