@@ -1,6 +1,7 @@
 """Frozen records as plain JSON and back, exactly: every bit of every number.
 
-What a record holds may be numbers, text, None, arrays, tuples, mappings and further records.
+What a record holds may be numbers, text, None, arrays, tuples, named ones too, mappings and further
+records.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ T = TypeVar("T")
 _KIND = "is"
 
 
-def encode(value: object) -> Any:
+def encode(value: object) -> Any:  # noqa: PLR0911 - a kind of value, a line
     """A record as what `json.dumps` takes.
 
     Raises
@@ -29,6 +30,8 @@ def encode(value: object) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         held = {each.name: encode(getattr(value, each.name)) for each in dataclasses.fields(value)}
         return {_KIND: type(value).__name__, **held}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):  # named
+        return {_KIND: type(value).__name__, **{k: encode(v) for k, v in value._asdict().items()}}
     if isinstance(value, np.ndarray):
         # sums depend in their last bit on the order in memory
         by_columns = value.flags.f_contiguous and not value.flags.c_contiguous
@@ -92,7 +95,8 @@ def _decoded(data: Any, known: Mapping[str, type]) -> Any:
 
 def _records_in(annotation: Any, known: dict[str, type]) -> dict[str, type]:
     """The records that an annotation names, and those in their fields, by name."""
-    if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
+    named = isinstance(annotation, type) and hasattr(annotation, "_asdict")
+    if isinstance(annotation, type) and (named or dataclasses.is_dataclass(annotation)):
         if annotation.__name__ not in known:
             known[annotation.__name__] = annotation
             for hint in typing.get_type_hints(annotation).values():

@@ -126,12 +126,37 @@ class SensorReport:
         Residual of the explained features, px or length units.
     why : str or None
         Why a sensor with features was not used.
+    residuals : mapping of str to float or None
+        How far off each feature in view was met, px or length units, by what it is called; None
+        where it was not met.
     """
 
     used: bool
     explained: float | None = None
     rms: float | None = None
     why: str | None = None
+    residuals: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """By how much a sensor met the features of a pose; n of them are in view.
+
+    Attributes
+    ----------
+    features : (n,) int
+        Their places in the body.
+    met : (n,) bool
+    offsets : (n, m) float64
+        Observed minus predicted place, sensor units; 0 where it was not met.
+    by_shift : (n, m, 3) float64
+        Derivative of the predicted place by a shift of the body in the world.
+    """
+
+    features: NDArray[np.intp]
+    met: NDArray[np.bool_]
+    offsets: Floats
+    by_shift: Floats
 
 
 @dataclass(frozen=True)
@@ -172,6 +197,10 @@ class Estimate:
     delays : mapping of str to DelaySeen
         How late sensors are beyond what the session says, as far as the frames so far show it; no
         part of the pose line.
+    doubt : str
+        Why a frame is ambiguous whose pose has no rival; no part of it either.
+    offsets : mapping of str to Offsets
+        By sensor, of the best pose.
     """
 
     frame: int
@@ -188,6 +217,8 @@ class Estimate:
     proposer: str = field(default="", compare=False)
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
+    doubt: str = field(default="", compare=False)
+    offsets: Mapping[str, Offsets] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def label(self) -> str:

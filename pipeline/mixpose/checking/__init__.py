@@ -15,6 +15,7 @@ from mixpose.checking.placement import expected_count, placement_lines, placemen
 from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
 from mixpose.checking.sensor_keys import key_warnings
 from mixpose.checking.shared_parts import shared_part_warnings
+from mixpose.checking.trials import explanation
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "advice",
     "depends_on_distance",
     "expected_count",
+    "explanation",
     "image_of",
     "judge",
     "key_warnings",

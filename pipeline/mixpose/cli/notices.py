@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from statistics import median
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # whoever only has to say something need not load them
     from mixpose.frames import Source
-    from mixpose.records import DelaySeen, Estimate, Status
+    from mixpose.objective import View
+    from mixpose.records import DelaySeen, Estimate, FrameSet, Status
     from mixpose.session import Session
 
 _NOTHING = 0.01  # of a sensor's density: below it a sensor takes no part
@@ -64,6 +65,9 @@ class Summary:
             # ranges err as the place has it, and features of a soft body are off theirs
             if setup.sensor.unit == "px" and not any(one.body.spread for one in session.objects)
         }
+        from mixpose.cli.findings import Findings  # noqa: PLC0415 - only a run needs it
+
+        self.findings = Findings(session)
         self.bodies = len(session.labels)
         self.statuses: Counter[Status] = Counter()
         self.posed: Counter[str] = Counter()
@@ -81,6 +85,7 @@ class Summary:
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
+        self.findings.add(estimate)
         self.statuses[estimate.status] += 1
         self.delays = estimate.delays or self.delays
         if estimate.status == "lost":
@@ -100,6 +105,10 @@ class Summary:
                 rms = estimate.sensors[name].rms
                 if rms is not None:
                     residuals.append(rms)
+
+    def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        """Look at what a frame was made from."""
+        self.findings.watch(frame_set, views, estimate)
 
     def text(self) -> str:
         """One line: how many frames came to which status."""
@@ -136,6 +145,9 @@ class Summary:
             apart = set(self.split)
             found.append(self._split_text())
         posed = sum(self.statuses.values()) - self.statuses["lost"]
+        told = self.findings.warnings()
+        # what names the cause stands for what only shows it
+        found = [*told, *(line for line in found if not told)]
         found += [
             f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
             for (name, why), count in self.left_out.items()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
@@ -22,9 +22,10 @@ from mixpose.cli.output import (
 from mixpose.cli.request import RunRequest
 from mixpose.errors import SessionError
 from mixpose.frames import Source
+from mixpose.objective import View
 from mixpose.poses.header import Header
 from mixpose.poses.jsonl import ResumePoint
-from mixpose.records import Estimate
+from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
 from mixpose.tracking.proposers.predicted import predicted
@@ -67,7 +68,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     summary = Summary(session)
     output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
-        watch = _overlay(stack, session, request)
+        watch = _both(summary.watch, _overlay(stack, session, request))
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
@@ -153,6 +154,18 @@ def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch |
     from mixpose.pictures.movie import Overlay  # noqa: PLC0415 - only where it is drawn
 
     return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
+
+
+def _both(first: Watch, second: Watch | None) -> Watch:
+    """Two that look at each frame, one after the other."""
+    if second is None:
+        return first
+
+    def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        first(frame_set, views, estimate)
+        second(frame_set, views, estimate)
+
+    return watch
 
 
 def _is_device(path: Path) -> bool:

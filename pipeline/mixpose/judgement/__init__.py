@@ -12,6 +12,7 @@ from mixpose.judgement.acceptance import (
     is_sure,
 )
 from mixpose.judgement.association import Association, associate
+from mixpose.judgement.contradiction import APART, contradict
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,
@@ -25,6 +26,7 @@ from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, near
 from mixpose.judgement.noise import NoiseModel, Residuals
 
 __all__ = [
+    "APART",
     "AcceptanceRules",
     "Association",
     "DetectionModel",
@@ -37,6 +39,7 @@ __all__ = [
     "Verdict",
     "associate",
     "beliefs",
+    "contradict",
     "convinces",
     "decide",
     "expected_covariance",

@@ -66,6 +66,11 @@ class AcceptanceRules:
         "residual variance over that of the other sensors from which one that meets the body is "
         "left out: five times their deviation; web cams a frame late have three and still help",
     )
+    strange: float = constant(
+        6.25,
+        "the same over that of typical noise, where none is known: half of σ_ε; right geometry "
+        "has 0.2",
+    )
     same_rotation_deg: float = constant(1.0, "poses nearer than this are one, unless both fit")
     same_distance: float = constant(0.02, "the same, of the body's radius")
     same_peak: float = constant(
@@ -87,11 +92,14 @@ class Verdict:
         None where the frame is lost.
     kept : list of (Judged, float)
         Poses worth telling with their beliefs, best first.
+    doubt : str
+        Why a frame is ambiguous whose pose has no rival.
     """
 
     status: Status
     best: Judged | None
     kept: list[tuple[Judged, float]]
+    doubt: str = ""
 
 
 def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:

@@ -98,6 +98,7 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
                 "explained": plain_or_none(report.explained),
                 "rms": plain_or_none(report.rms),
                 **({"why": report.why} if report.why else {}),
+                **({"residuals": _rounded(report.residuals)} if report.residuals else {}),
             }
             for name, report in estimate.sensors.items()
         },
@@ -110,6 +111,11 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
         ],
         "latency_ms": plain(estimate.latency_ms),
     }
+
+
+def _rounded(residuals: Mapping[str, float | None]) -> dict[str, float | None]:
+    """To the digits that anybody looks at."""
+    return {k: None if r is None else float(f"{r:.4g}") for k, r in residuals.items()}
 
 
 @dataclass(frozen=True)

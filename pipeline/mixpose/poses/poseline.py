@@ -70,6 +70,7 @@ class _Sensor(_Line):
     explained: float | None = None
     rms: float | None = None
     why: str | None = None
+    residuals: dict[str, Annotated[float, Field(ge=0)] | None] = {}
 
 
 class _Pose(_Line):
@@ -131,7 +132,9 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         covariance=_covariance(pose.covariance, where),
         score=pose.score,
         sensors={
-            name: SensorReport(report.used, report.explained, report.rms, report.why)
+            name: SensorReport(
+                report.used, report.explained, report.rms, report.why, report.residuals
+            )
             for name, report in pose.sensors.items()
         },
         hypotheses=tuple(

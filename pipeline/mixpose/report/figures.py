@@ -79,6 +79,9 @@ def motion(series: Series, errors: Errors | None) -> list[Chart]:
     return charts
 
 
+_MOST_ROWS = 60  # features of a sensor that are drawn
+
+
 def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
     """Residual and explained share of each sensor over time.
 
@@ -107,6 +110,46 @@ def sensors(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
         alt = f"{_spoken(f'{name}: rms, {unit}', rms)}; {_spoken('explained share', explained)}"
         charts.append(Chart(name, alt, drawn(figure)))
     return charts
+
+
+def features(series: Series, unit_of: Callable[[str], str]) -> list[Chart]:
+    """How far off each sensor met each feature over time, a row per feature.
+
+    Parameters
+    ----------
+    series : Series
+    unit_of : callable
+        Unit of a sensor's residuals, by its name.
+    """
+    charts = []
+    for name, residuals in series.residuals.items():
+        if not residuals:
+            continue
+        rows = np.array(list(residuals.values()))[:_MOST_ROWS]
+        met = np.isfinite(rows)
+        figure, axes = blank()
+        largest = float(np.quantile(rows[met], 0.98)) if met.any() else 1.0
+        steps = np.diff(series.x)
+        half = 0.5 * (float(np.median(steps)) if steps.size else 1.0)
+        x = np.append(series.x - half, series.x[-1] + half)
+        y = np.arange(len(rows) + 1) - 0.5
+        shown = np.ma.masked_invalid(np.where(met, rows, np.nan))
+        mesh = axes.pcolormesh(x, y, shown, vmin=0.0, vmax=largest, cmap="viridis", rasterized=True)
+        unmet = np.ma.masked_where(~np.isinf(rows), np.ones_like(rows))
+        axes.pcolormesh(x, y, unmet, vmin=0.0, vmax=1.0, cmap="Reds", rasterized=True)
+        figure.colorbar(mesh, ax=axes, label=f"off by, {unit_of(name)}")
+        axes.set_yticks(range(len(rows)), list(residuals)[: len(rows)])
+        axes.set_xlabel(series.x_label)
+        axes.set_ylabel("feature; red: not met")
+        worst = max(residuals, key=lambda each: _typical(residuals[each]))
+        alt = f"{name}: how far off each feature is met over time; the farthest off is {worst}"
+        charts.append(Chart(f"{name}: features", alt, drawn(figure)))
+    return charts
+
+
+def _typical(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def latency(series: Series) -> list[Chart]:

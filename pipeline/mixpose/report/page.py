@@ -166,7 +166,9 @@ def _body_content(
         "error_charts": [] if errors is None else figures.errors_over_time(series, errors),
         "trajectory_charts": figures.trajectory(series, errors) if has_poses else [],
         "motion_charts": figures.motion(series, errors) if has_poses else [],
-        "sensor_charts": figures.sensors(series, unit_of) if has_poses else [],
+        "sensor_charts": [*figures.sensors(series, unit_of), *figures.features(series, unit_of)]
+        if has_poses
+        else [],
         "latency_charts": figures.latency(series),
         "overlays": overlays,
         "overlay_notices": overlay_notices,

@@ -57,6 +57,9 @@ class Series:
     score, latency_ms : (n,) float64
     rms, explained : mapping of str to (n,) float64
         By sensor; NaN in lost frames too.
+    residuals : mapping of str to (mapping of str to (n,) float64)
+        By sensor and feature: infinite where it was in view and not met, NaN where it was not in
+        view and in lost frames.
     """
 
     object: str
@@ -75,6 +78,7 @@ class Series:
     latency_ms: Floats
     rms: Mapping[str, Floats]
     explained: Mapping[str, Floats]
+    residuals: Mapping[str, Mapping[str, Floats]]
 
 
 @dataclass(frozen=True)
@@ -134,6 +138,7 @@ def series_of(file: PoseFile) -> Series:
         latency_ms=_numbers([line.latency_ms for line in lines]),
         rms={name: _of_sensor(lines, name, "rms") for name in sensors},
         explained={name: _of_sensor(lines, name, "explained") for name in sensors},
+        residuals={name: _of_features(lines, name) for name in sensors},
     )
 
 
@@ -218,6 +223,18 @@ def _of_sensor(lines: list[PoseLine], name: str, what: str) -> Floats:
             for line in lines
         ]
     )
+
+
+def _of_features(lines: list[PoseLine], name: str) -> dict[str, Floats]:
+    """How far off a sensor met each feature."""
+    found: dict[str, Floats] = {}
+    for k, line in enumerate(lines):
+        if line.status == "lost" or name not in line.sensors:
+            continue
+        for feature, residual in line.sensors[name].residuals.items():
+            values = found.setdefault(feature, np.full(len(lines), np.nan))
+            values[k] = np.inf if residual is None else residual
+    return found
 
 
 def _breaks(frames: Sequence[int]) -> Flags:

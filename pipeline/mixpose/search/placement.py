@@ -95,7 +95,9 @@ def _source(sensor: Sensor, length: float) -> Floats:
     """Where the directions towards a sensor meet (3,), in the sense of least squares."""
     probes = length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     towards = sensor.towards(probes)
-    towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    away = np.linalg.norm(towards, axis=1)
+    # from where the sensor stands it is seen in no direction
+    probes, towards = probes[away > 0], towards[away > 0] / away[away > 0, None]
     across = np.eye(3) - towards[:, :, None] * towards[:, None, :]
     right = (across @ probes[:, :, None]).sum(axis=0)[:, 0]
     return np.asarray(np.linalg.lstsq(across.sum(axis=0), right)[0])

@@ -21,6 +21,9 @@ from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 Floats: TypeAlias = NDArray[np.float64]
 
 
+MIRRORED = "it shows the body's mirror image"
+
+
 def is_reflection(data: FrameData, judged: Judged) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
     if all(one.missed < 0.5 for one in judged.associations) or not data.body.is_exact:

@@ -21,6 +21,9 @@ from mixpose.tracking.static_clutter import StaticClutter
 Floats: TypeAlias = NDArray[np.float64]
 
 
+_MOST = 0.5  # of the features in view: a sensor that meets so many has met the body
+
+
 @dataclass(frozen=True)
 class Branch:
     """One place where the body may be.
@@ -95,6 +98,8 @@ class Track:
         How late sensors are, as far as it was seen.
     doubted : bool
         Whether another body of the scene may have what the last pose meets.
+    agreed : bool
+        Whether two sensors met most of the body in some frame.
     clutter : StaticClutter
         What stayed where it was while the body was lost.
     """
@@ -109,6 +114,7 @@ class Track:
     search: SearchState = SearchState()
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
+    agreed: bool = False
     clutter: StaticClutter = StaticClutter()
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
@@ -250,8 +256,10 @@ def follow(
             else:
                 course = Course.begun(T, deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
+    met = [one for one in tallies.values() if one.met >= _MOST * one.in_view > 0]
+    agreed = track.agreed or len(met) > 1
     parts = tuple(branches), frame, time_s, 0, residuals, walk, tallies
-    return Track(*parts, delays=track.delays, clutter=track.clutter)
+    return Track(*parts, delays=track.delays, clutter=track.clutter, agreed=agreed)
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import Judged, Verdict, decide, insert
+from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert
 from mixpose.objective import View
-from mixpose.records import Estimate, Hypothesis, SensorReport
+from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
-from mixpose.tracking.reflection import is_reflection
+from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
@@ -130,8 +130,14 @@ class Tracker:
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
-        if verdict.best and verdict.status == "ok" and is_reflection(data, verdict.best):
-            verdict = replace(verdict, status="ambiguous")
+        best = verdict.best
+        if best is None or verdict.status != "ok":
+            return verdict
+        if is_reflection(data, best):
+            return replace(verdict, status="ambiguous", doubt=MIRRORED)
+        track, noise = data.track, self.rules.judgement.noise
+        if contradict(best, track.residuals.total, track.agreed, self.rules.acceptance, noise):
+            return replace(verdict, status="ambiguous", doubt=APART)
         return verdict
 
     def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
@@ -202,6 +208,10 @@ class Tracker:
         told = best or (ranked[0] if ranked else None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
+        offsets = _offsets(told, self.body) if told else {}
+        for name, report in (told.sensors if told else {}).items():
+            residuals = _residuals(offsets[name], self.body) if name in offsets else {}
+            reports[name] = replace(report, residuals=residuals)
         return Estimate(
             frame=frame,
             time_s=time_s,
@@ -210,9 +220,11 @@ class Tracker:
             T_world_object=best.T_world_object if best else None,
             covariance=best.covariance if best else None,
             score=told.score if told else 0.0,
-            sensors=reports | (told.sensors if told else {}),
+            sensors=reports,
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
+            doubt=verdict.doubt,
+            offsets=offsets,
             delays=delays.seconds(),
         )
 
@@ -298,6 +310,26 @@ def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
     views = [view for view in data.views if view.name in names]
     rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
     return before.joined(seen, views, expected, max(rest, LEAST_VARIANCE))
+
+
+def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
+    """By how much each sensor met the features of a body whose features are points."""
+    if len(body.nodes.points) != len(body):
+        return {}
+    return {
+        one.name: Offsets(one.features, one.shares > 0, one.offsets, one.J[..., :3])
+        for one in judged.associations
+        if judged.sensors[one.name].used
+    }
+
+
+def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
+    """Lengths of offsets by the name of their feature."""
+    lengths = np.linalg.norm(offsets.offsets, axis=1).tolist()
+    return {
+        body.labels[i]: length if met else None
+        for i, met, length in zip(offsets.features, offsets.met, lengths, strict=True)
+    }
 
 
 def _tallies(judged: Judged) -> dict[str, SensorTally]:

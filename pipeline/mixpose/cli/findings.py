@@ -1,0 +1,265 @@
+"""What a run finds out about its recording on the way: which sensor, marker or frames are at fault.
+
+Everything is kept as sums and stretches of frames, so that a run of any length takes little memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mixpose.checking import explanation
+from mixpose.objective import View
+from mixpose.records import Estimate, Floats, FrameSet, Image
+from mixpose.session import Session
+
+_LONG = 3  # frames in a row that are more than an accident
+_OFTEN = 0.2  # of the frames: what comes in turns is no accident either
+_GONE = 0.25  # of the frames in which a marker should be seen, at their end: it fell off
+_FEWEST = 10  # frames in which a marker should have been seen before anything is said of it
+_MEASURED = 4.0  # times what the other markers are off: a marker that is measured wrong
+_SURE = 100.0  # squared offset in its own noise from which that is no chance
+_KEPT = 2  # frames that are tried with other sessions
+_SHOWN = 3  # stretches that are named
+_PIXELS = 37  # of an image every so many are compared first
+
+
+@dataclass
+class Stretches:
+    """Frames in which something was so, as stretches in the order of the run."""
+
+    count: int = 0
+    found: list[list[int]] = field(default_factory=list)
+    _last: int = -2
+
+    def add(self, frame: int, place: int) -> None:
+        """Add a frame, which is the `place`-th of the run."""
+        if place == self._last:
+            return
+        if place == self._last + 1:
+            self.found[-1][1:] = [frame, self.found[-1][2] + 1]
+        else:
+            self.found.append([frame, frame, 1])
+        self.count, self._last = self.count + 1, place
+
+    @property
+    def longest(self) -> int:
+        """Frames of the longest stretch."""
+        return max((each[2] for each in self.found), default=0)
+
+    @property
+    def last_place(self) -> int:
+        """Place in the run of the last frame."""
+        return self._last
+
+    def text(self) -> str:
+        """The frames for people, the longest stretches if there are many."""
+        chosen = sorted(sorted(self.found, key=lambda each: -each[2])[:_SHOWN])
+        parts = [f"{a}" if a == b else f"{a} to {b}" for a, b, _ in chosen]
+        more = len(self.found) - len(chosen)
+        return ", ".join(parts) + (f" and {more} more" if more else "")
+
+
+class _Marker:
+    """How one marker was met."""
+
+    def __init__(self) -> None:
+        self.expected = self.met = 0
+        self.since: int | None = None  # first frame since which it was not met
+        self.missed_since = 0
+        self.normal, self.pull = np.zeros((3, 3)), np.zeros(3)
+        self.squares, self.views = 0.0, 0
+
+    def shift(self) -> Floats:
+        """Displacement in the body's axes that explains its offsets best (3,)."""
+        scale = max(float(np.trace(self.normal)), 1e-300)
+        inner = self.normal + 1e-9 * scale * np.eye(3)
+        return np.asarray(np.linalg.solve(inner, self.pull))
+
+    def systematic(self) -> float:
+        """Mean squared offset that this displacement takes away."""
+        return float(self.pull @ self.shift()) / max(self.views, 1)
+
+
+class Findings:
+    """What is remembered of the frames of a run."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._places = -1
+        self._ok = 0
+        names = [setup.name for setup in session.sensors]
+        self._no_frame = {name: Stretches() for name in names}
+        self._no_feature = {name: Stretches() for name in names}
+        self._same = {name: Stretches() for name in names}
+        self._images: dict[str, Image] = {}
+        self._again: set[str] = set()
+        self._doubts: dict[str, Stretches] = {}
+        self._markers: dict[str, dict[int, _Marker]] = {}
+        self._frames: list[tuple[int, list[View]]] = []
+        self._agreed_before = 0
+
+    def watch(self, frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
+        """Look at what a frame was made from, before `add`."""
+        if estimate.label != self._session.labels[0]:
+            return
+        self._again = set()
+        place = self._places + 1
+        seen = {view.name for view in views if not view.observation.is_empty}
+        for name in self._no_frame:
+            frame = frame_set.frames.get(name)
+            if frame is None:
+                self._no_frame[name].add(frame_set.number, place)
+            elif name not in seen:
+                self._no_feature[name].add(frame_set.number, place)
+            data = None if frame is None else frame.data
+            if isinstance(data, np.ndarray):
+                if name in seen and _is_same(self._images.get(name), data):
+                    self._again.add(name)
+                self._images[name] = data
+        if estimate.status != "ok" and len(self._frames) < _KEPT and len(seen) > 1:
+            self._frames.append((frame_set.number, list(views)))
+
+    def add(self, estimate: Estimate) -> None:
+        """Count a frame."""
+        if estimate.label == self._session.labels[0]:
+            self._places += 1
+        self._ok += estimate.status == "ok"
+        if estimate.doubt:
+            self._doubts.setdefault(estimate.doubt, Stretches()).add(estimate.frame, self._places)
+            for name in self._again:
+                self._same[name].add(estimate.frame, self._places)
+        elif estimate.status == "ok":
+            self._agreed_before += not self._doubts
+            self._add_markers(estimate)
+
+    def _add_markers(self, estimate: Estimate) -> None:
+        T = estimate.T_world_object
+        assert T is not None
+        markers = self._markers.setdefault(estimate.label, {})
+        met: dict[int, bool] = {}
+        for name, one in estimate.offsets.items():
+            explained = estimate.sensors[name].explained or 0.0
+            if explained < 0.1:  # what it sees is not the body
+                continue
+            for k, i in enumerate(one.features.tolist()):
+                marker = markers.setdefault(i, _Marker())
+                met[i] = met.get(i, False) or bool(one.met[k])
+                if one.met[k]:
+                    J = one.by_shift[k] @ T[:3, :3]
+                    marker.normal += J.T @ J
+                    marker.pull += J.T @ one.offsets[k]
+                    marker.squares += float(one.offsets[k] @ one.offsets[k])
+                    marker.views += 1
+        for i, is_met in met.items():
+            marker = markers[i]
+            marker.expected += 1
+            marker.met += is_met
+            if is_met:
+                marker.since, marker.missed_since = None, 0
+            else:
+                marker.since = estimate.frame if marker.since is None else marker.since
+                marker.missed_since += 1
+
+    def warnings(self) -> list[str]:
+        """What is most likely at fault, a line each."""
+        return [*self._of_sensors(), *self._of_doubts(), *self._of_markers()]
+
+    def _of_sensors(self) -> list[str]:
+        total, lines = self._places + 1, []
+        kinds = (("no frame", self._no_frame), ("no feature", self._no_feature))
+        for what, found in kinds:
+            for name, each in found.items():
+                if each.longest >= _LONG or each.count > _OFTEN * total:
+                    lines.append(
+                        f"sensor {name!r} had {what} in {each.count} of {total} frames: "
+                        f"{each.text()}"
+                    )
+        for name, each in self._same.items():
+            if each.count:
+                lines.append(
+                    f"sensor {name!r} shows the image of the frame before in frames {each.text()}, "
+                    "which contradicts the others: frozen, or frames doubled?"
+                )
+        return lines
+
+    def _of_doubts(self) -> list[str]:
+        total, lines = self._places + 1, []
+        frozen = sum(each.count for each in self._same.values())
+        for doubt, each in self._doubts.items():
+            if each.count <= frozen:
+                continue  # said of the sensor
+            if each.count > total / 2 and each.found[0][2] > 1:
+                change = None
+                if len(self._session.labels) == 1 and self._agreed_before < _LONG:
+                    change = explanation(self._session, self._frames)
+                if change is not None:
+                    lines.append(f"{change}, frames that are not ok would be")
+                    continue
+            goes_on = each.last_place == self._places and each.found[-1][2] >= _LONG
+            if goes_on and self._agreed_before >= _LONG:
+                lines.append(f"{doubt} from frame {each.found[-1][0]} on: was one of them bumped?")
+                continue
+            lines.append(
+                f"{doubt} in {each.count} of {total} frames, {each.text()}: is one of them out of "
+                "step, or its calibration, T_sensor_world or source that of another?"
+            )
+        return lines
+
+    def _of_markers(self) -> list[str]:
+        lines = []
+        bodies = {one.body.name: one.body for one in self._session.objects}
+        for label, markers in self._markers.items():
+            names = [each for each in bodies if label == each or label.startswith(f"{each}-")]
+            if not names:
+                continue
+            name = max(names, key=len)
+            of = f" of {label!r}" if len(self._session.labels) > 1 else ""
+            typical = self._typical(markers)
+            for i, marker in sorted(markers.items()):
+                called = f"marker {bodies[name].labels[i]}{of}"
+                lines += _about(called, marker, typical.get(i, np.inf), self._session.unit)
+        return lines
+
+    @staticmethod
+    def _typical(markers: Mapping[int, _Marker]) -> dict[int, float]:
+        """For each marker the median of the mean squared offsets of the others."""
+        means = {i: one.squares / one.views for i, one in markers.items() if one.views}
+        return {
+            i: float(np.median([each for j, each in means.items() if j != i]))
+            for i in means
+            if len(means) > 2
+        }
+
+
+def _about(called: str, marker: _Marker, typical: float, unit: str) -> list[str]:
+    """What is odd about a marker."""
+    if marker.expected < _FEWEST:
+        return []
+    if not marker.met:
+        return [
+            f"{called} is met in none of {marker.expected} frames where it should be seen: gone, "
+            "or measured wrong?"
+        ]
+    gone = marker.missed_since
+    if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
+        return [f"{called} is not met from frame {marker.since} on, in {gone} frames: gone?"]
+    systematic = marker.systematic()
+    own = max(marker.squares / marker.views - systematic, 1e-12)
+    sure = systematic * marker.views / own > _SURE
+    if sure and systematic > _MEASURED**2 * typical:
+        off = float(np.linalg.norm(marker.shift()))
+        return [
+            f"{called} is met {off:.2g} {unit} off in {marker.met} of {marker.expected} frames: "
+            "measured wrong?"
+        ]
+    return []
+
+
+def _is_same(before: Image | None, now: Image) -> bool:
+    if before is None or before.shape != now.shape:
+        return False
+    few = np.array_equal(before[::_PIXELS, ::_PIXELS], now[::_PIXELS, ::_PIXELS])
+    return few and bool(np.array_equal(before, now))

@@ -1,0 +1,85 @@
+"""Two sensors that contradict each other: no pose of the body is right for both.
+
+Of three sensors the one that disagrees is left out.  Of two, nobody can tell which is wrong: one
+may have been bumped, be a frame late, show an old image, or be calibrated for another place; then
+their common pose is in between, or that of one of them, and is not to be believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import fdtri
+
+from mixpose.density import Noise
+from mixpose.judgement.acceptance import AcceptanceRules
+from mixpose.judgement.association import Association
+from mixpose.judgement.judge import Judged
+from mixpose.judgement.noise import NoiseModel
+
+APART = "two sensors contradict each other"
+
+
+def contradict(
+    judged: Judged, before: Noise, agreed: bool, rules: AcceptanceRules, model: NoiseModel
+) -> bool:
+    """Whether the two sensors of a frame contradict each other.
+
+    Parameters
+    ----------
+    judged : Judged
+        The frame's best pose.
+    before : Noise
+        Residuals of the frames before.
+    agreed : bool
+        Whether two sensors met the body in some frame before: then one may miss it now.
+    rules : AcceptanceRules
+    model : NoiseModel
+    """
+    used = [one for one in judged.associations if judged.sensors[one.name].used]
+    if len(used) != 2 or any(one.J.shape[1] != 2 for one in used):
+        return False
+    return _is_unmet(used, agreed, rules) or _is_between(used, before, rules, model)
+
+
+def _is_unmet(used: Sequence[Association], agreed: bool, rules: AcceptanceRules) -> bool:
+    """One meets most of the body; the other misses it, and sees as much beside it.
+
+    Where the two never agreed, wherever it sees as much.
+    """
+    least, most = sorted(used, key=lambda one: one.coverage)
+    if not least.coverage < rules.agreeing <= most.coverage:
+        return False
+    if not agreed:
+        return least.count >= rules.agreeing * most.met
+    return least.missed > 0 and least.surplus >= rules.agreeing * least.missed
+
+
+def _is_between(
+    used: Sequence[Association], before: Noise, rules: AcceptanceRules, model: NoiseModel
+) -> bool:
+    """Offsets far beyond the noise so far, which a pose of its own takes away in each sensor."""
+    degrees = sum(one.measurements for one in used) - 6
+    squares = sum(one.squares for one in used)
+    apart = [_left_alone(one) for one in used]
+    own = sum(one.measurements - rank for one, (_, rank) in zip(used, apart, strict=True))
+    if degrees < 1 or own < 1:
+        return False
+    known = before.variance if before.degrees >= model.known else model.errors.typical**2
+    times = rules.disagreeing if before.degrees >= model.known else rules.strange
+    if squares / degrees < times * max(known, model.smallest**2):
+        return False
+    alone = sum(left for left, _ in apart)
+    gained = (squares - alone) / max(degrees - own, 1.0)
+    return bool(gained > fdtri(max(degrees - own, 1.0), own, model.by_chance) * alone / own)
+
+
+def _left_alone(one: Association) -> tuple[float, int]:
+    """Squared offsets in σ² that a sensor's best own pose leaves, and what that pose takes up."""
+    weights = np.repeat(np.sqrt(one.shares) / one.sigma, one.J.shape[1])
+    J = one.J.reshape(-1, 6) * weights[:, None]
+    offsets = one.offsets.reshape(-1) * weights
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
+    taken, _, rank, _ = np.linalg.lstsq(J / scale, offsets, rcond=1e-6)
+    return float(((offsets - J / scale @ taken) ** 2).sum()), int(rank)

@@ -1,0 +1,114 @@
+"""Faults in a recording: no wrong pose is ok, and the run names what is at fault."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.cli.findings import Stretches
+from mixpose.density import Noise
+from mixpose.judgement import AcceptanceRules, Association, NoiseModel, Residuals, contradict
+from mixpose.judgement.judge import Judged
+from mixpose.records import SensorReport
+from mixpose.rigid import Floats
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from faults import FAULTS, outcome
+
+RULES, MODEL = AcceptanceRules(), NoiseModel()
+QUIET = Noise(squares=0.01, degrees=100.0)  # offsets of 0.01 σ: far below what is put in below
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["black for 5 frames", "frame doubled", "marker gone", "marker measured 2 mm wrong"],
+)
+def test_a_fault_makes_no_pose_wrong_and_is_named(name: str, tmp_path: Path) -> None:
+    found = outcome(FAULTS[name], tmp_path / "recording")
+    assert found.wrong == 0
+    assert found.is_named, found.said
+    assert found.right >= 39  # of 40
+
+
+def test_a_recording_without_faults_gives_rise_to_no_remark(tmp_path: Path) -> None:
+    found = outcome(FAULTS["nothing"], tmp_path / "recording")
+    assert (found.right, found.said) == (40, [])
+
+
+def test_swapped_cameras_are_told_by_what_they_see(tmp_path: Path) -> None:
+    found = outcome(FAULTS["left and right swapped"], tmp_path / "recording")
+    assert found.right == found.wrong == 0
+    assert any("'left' and 'right' are swapped" in line for line in found.said), found.said
+
+
+def association(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Association:
+    return Association(
+        name=name, explained=0.5, features=np.arange(len(met)), shares=met, offsets=offsets, J=J,
+        places=np.zeros_like(offsets), finest=1.0,
+        expected=float(len(met)), unseen=0.0, sigma=1.0, crowd=1e-5, count=count,
+        surplus=max(count - float(met.sum()), 0.0),
+    )  # fmt: skip
+
+
+def judged_of(*associations: Association) -> Judged:
+    return Judged(
+        T_world_object=np.eye(4), sensors={one.name: SensorReport(True) for one in associations},
+        score=1.0, coverage=1.0, measurements=20.0, covariance=np.eye(6), log_evidence=50.0,
+        residuals=Residuals(), associations=associations, value=1.0,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def jacobians() -> Floats:
+    return np.random.default_rng(0).normal(size=(3, 7, 2, 6))
+
+
+def seen(jacobians: Floats, shifts: list[float], noise: float = 0.01) -> list[Association]:
+    """Sensors that each see the body at a pose of their own."""
+    rng = np.random.default_rng(1)
+    found = []
+    for k, shift in enumerate(shifts):
+        twist = shift * np.array([1.0, -1.0, 0.5, 0.3, 0.2, -0.6])
+        offsets = jacobians[k] @ twist + noise * rng.normal(size=(7, 2))
+        found.append(association(str(k), offsets, jacobians[k], np.ones(7), 7.0))
+    return found
+
+
+def test_sensors_that_see_the_body_at_two_poses_contradict_each_other(jacobians: Floats) -> None:
+    apart = judged_of(*seen(jacobians, [0.2, -0.2]))
+    assert contradict(apart, QUIET, True, RULES, MODEL)
+    assert not contradict(judged_of(*seen(jacobians, [0.0, 0.0])), QUIET, True, RULES, MODEL)
+
+
+def test_one_feature_that_is_far_off_makes_no_contradiction(jacobians: Floats) -> None:
+    one, other = seen(jacobians, [0.0, 0.0])
+    one.offsets[2] = [1.0, -1.0]  # as where it runs into another one
+    assert not contradict(judged_of(one, other), QUIET, True, RULES, MODEL)
+
+
+def test_of_three_sensors_the_majority_tells(jacobians: Floats) -> None:
+    three = judged_of(*seen(jacobians, [0.2, -0.2, 0.0]))
+    assert not contradict(three, QUIET, True, RULES, MODEL)
+
+
+def test_a_sensor_that_never_met_the_body_but_sees_as_much_contradicts(jacobians: Floats) -> None:
+    one, _ = seen(jacobians, [0.0, 0.0])
+    blind = association("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
+    blind = association("1", blind.offsets, blind.J, blind.shares, 5.0)
+    assert contradict(judged_of(one, blind), Noise(), False, RULES, MODEL)
+    empty = association("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 1.0)
+    assert not contradict(judged_of(one, empty), Noise(), False, RULES, MODEL)
+    # once they agreed, what is seen elsewhere may be anything
+    assert not contradict(judged_of(one, empty), QUIET, True, RULES, MODEL)
+
+
+def test_stretches_are_told_with_the_longest_first_in_the_order_of_the_run() -> None:
+    stretches = Stretches()
+    for place, frame in [(0, 3), (1, 4), (5, 10), (9, 20), (10, 22), (11, 23), (20, 50)]:
+        stretches.add(frame, place)
+    assert stretches.text() == "3 to 4, 10, 20 to 23 and 1 more"
+    assert (stretches.count, stretches.longest, stretches.last_place) == (7, 3, 20)

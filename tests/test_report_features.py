@@ -1,0 +1,52 @@
+"""How far off each feature is met: in the pose lines, and in the report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mixpose.cli import main
+from mixpose.poses.jsonl import read_poses
+from mixpose.report.series import series_of
+
+SESSION = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
+
+
+@pytest.fixture(scope="module")
+def poses(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "poses.jsonl"
+    with pytest.raises(SystemExit) as ended:
+        main(["run", str(SESSION), "--stop", "4", "-o", str(path)])
+    assert not ended.value.code
+    return path
+
+
+def test_pose_lines_tell_how_far_off_each_feature_is_met(poses: Path) -> None:
+    line = json.loads(poses.read_text(encoding="utf-8").splitlines()[1])
+    for report in line["sensors"].values():
+        assert list(report["residuals"]) == [str(k) for k in range(1, 8)]
+        met = [each for each in report["residuals"].values() if each is not None]
+        assert np.sqrt(np.mean(np.square(met))) == pytest.approx(report["rms"], rel=1e-3)
+
+
+def test_residuals_are_read_again_with_what_is_not_met_apart(poses: Path) -> None:
+    file = read_poses(poses)
+    series = series_of(file)
+
+    for name, by_feature in series.residuals.items():
+        for feature, values in by_feature.items():
+            said = [line.sensors[name].residuals[feature] for line in file.poses]
+            assert values.tolist() == [np.inf if each is None else each for each in said]
+
+
+def test_a_report_shows_each_sensors_features_over_time(poses: Path, tmp_path: Path) -> None:
+    pytest.importorskip("jinja2")
+    with pytest.raises(SystemExit) as ended:
+        main(["report", str(poses), "-o", str(tmp_path / "report.html")])
+    assert not ended.value.code
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for name in ("left", "right"):
+        assert f"{name}: how far off each feature is met over time" in page

@@ -1,0 +1,337 @@
+"""Recordings with faults, what becomes of their frames, and what the run says of it.
+
+    python tools/faults.py [FAULT ...] [--markdown]
+
+Each fault is put into a copy of the recording of two cameras in `data/synthetic/` (40 frames, seven
+markers), or into its session.  A pose counts as wrong where it is ok and more than `WRONG_DEG` or
+`WRONG_MM` from the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from mixpose.cli.notices import Summary
+from mixpose.poses.jsonl import read_poses
+from mixpose.records import Estimate, Floats
+from mixpose.rigid import from_rotation_vector, rotation_angle_deg
+from mixpose.runner import run
+from mixpose.session import load_session
+
+RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
+FRAMES = range(40)
+WRONG_DEG, WRONG_MM = 1.0, 1.0
+
+Change: TypeAlias = Callable[[Path], None]
+
+
+def image(folder: Path, side: str, frame: int) -> Path:
+    return folder / f"{side}{frame:04d}.png"
+
+
+def redrawn(side: str, frames: range, draw: Callable[[Floats], Floats]) -> Change:
+    """Images of a camera drawn anew."""
+
+    def change(folder: Path) -> None:
+        for frame in frames:
+            path = image(folder, side, frame)
+            before = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert before is not None
+            cv2.imwrite(str(path), draw(before.astype(np.float64)).astype(np.uint8))
+
+    return change
+
+
+def instead(side: str, frames: range, other: Callable[[int], int]) -> Change:
+    """Frames of a camera that show what another frame shows."""
+
+    def change(folder: Path) -> None:
+        kept = {frame: image(folder, side, other(frame)).read_bytes() for frame in frames}
+        for frame, content in kept.items():
+            image(folder, side, frame).write_bytes(content)
+
+    return change
+
+
+def missing(side: str, frames: range) -> Change:
+    def change(folder: Path) -> None:
+        for frame in frames:
+            image(folder, side, frame).unlink()
+
+    return change
+
+
+def torn(side: str, frames: range) -> Change:
+    """Images whose lower half is of the next frame."""
+
+    def change(folder: Path) -> None:
+        images = {
+            frame: cv2.imread(str(image(folder, side, frame)), cv2.IMREAD_GRAYSCALE)
+            for frame in range(frames.start, frames.stop + 3)
+        }
+        for frame in frames:
+            picture = np.array(images[frame])
+            half = len(picture) // 2
+            picture[half:] = np.array(images[frame + 3])[half:]
+            cv2.imwrite(str(image(folder, side, frame)), picture)
+
+    return change
+
+
+def bumped(side: str, frames: range, degrees: float) -> Change:
+    """A camera that has turned about its own y axis: its images, seen through a homography."""
+
+    def change(folder: Path) -> None:
+        setup = next(s for s in load_session(folder / "session.toml").sensors if s.name == side)
+        K = setup.sensor.camera_matrix  # type: ignore[attr-defined]
+        R = from_rotation_vector([0.0, np.radians(degrees), 0.0], [0, 0, 0])[:3, :3]
+        H = K @ R @ np.linalg.inv(K)
+        size = setup.resolution
+        assert size is not None
+
+        def turned(before: Floats) -> Floats:
+            return np.asarray(cv2.warpPerspective(before, H, size, flags=cv2.INTER_CUBIC), float)
+
+        redrawn(side, frames, turned)(folder)
+
+    return change
+
+
+def rewritten(*pairs: tuple[str, str]) -> Change:
+    """A session that says something else."""
+
+    def change(folder: Path) -> None:
+        path = folder / "session.toml"
+        text = path.read_text(encoding="utf-8")
+        for pattern, new in pairs:
+            text, count = re.subn(pattern, new, text, flags=re.MULTILINE)
+            if not count:
+                raise RuntimeError(f"{pattern} is not in the session")
+        path.write_text(text, encoding="utf-8")
+
+    return change
+
+
+def points(changed: Callable[[Floats], Floats]) -> Change:
+    """A body whose points are others than those that were recorded."""
+
+    def change(folder: Path) -> None:
+        body = load_session(folder / "session.toml").body
+        rows = ", ".join(str(row) for row in changed(body.means.copy()).tolist())
+        rewritten((r"points = \[\n(.*\n)*?\]", f"points = [{rows}]"))(folder)
+
+    return change
+
+
+def moved(number: int, by: tuple[float, float, float]) -> Change:
+    def shift(means: Floats) -> Floats:
+        means[number] += by
+        return means
+
+    return points(shift)
+
+
+def gone(means: Floats) -> Floats:
+    """One more marker than the recording shows."""
+    return np.concatenate([means, [[-30.0, 40.0, -70.0]]])
+
+
+NO_START: Change = rewritten((r"\[start\]\n.*\n.*\n", ""))
+
+
+def both(*changes: Change) -> Change:
+    def change(folder: Path) -> None:
+        for each in changes:
+            each(folder)
+
+    return change
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with a recording, and what names it.
+
+    Attributes
+    ----------
+    change : callable
+        Puts it into a folder.
+    named : str
+        Regular expression that one of the warnings in the end must hold; empty: none is needed.
+    has_truth : bool
+        Whether any pose can be right.
+    """
+
+    change: Change
+    named: str = ""
+    has_truth: bool = True
+
+
+FAULTS: dict[str, Fault] = {
+    "nothing": Fault(lambda folder: None),
+    "frames missing": Fault(missing("right", range(10, 16)), "'right' .*no frame.* 10 to 15"),
+    "sensor drops out and returns": Fault(
+        missing("right", range(8, 30)), "'right' .*no frame.* 8 to 29"
+    ),
+    "frame doubled": Fault(instead("right", range(20, 21), lambda k: k - 1), "'right' .*20"),
+    "frozen for 5 frames": Fault(instead("right", range(10, 15), lambda k: 9), "'right' .*froz"),
+    "frozen for 20 frames": Fault(instead("right", range(10, 30), lambda k: 9), "'right' .*froz"),
+    "black for 5 frames": Fault(
+        redrawn("right", range(10, 15), lambda a: 0 * a), "'right' .*no feature.* 10 to 14"
+    ),
+    "black all along": Fault(redrawn("right", FRAMES, lambda a: 0 * a), "'right' .*no feature"),
+    "saturated for 5 frames": Fault(
+        redrawn("right", range(10, 15), lambda a: 0 * a + 255), "'right' .*no feature.* 10 to 14"
+    ),
+    "torn for 5 frames": Fault(torn("right", range(10, 15)), "'right' .*"),
+    "one frame late": Fault(instead("right", range(1, 40), lambda k: k - 1), "'right'"),
+    "bumped by 0.5° from frame 20": Fault(
+        bumped("right", range(20, 40), 0.5), "from frame 20 on.*bumped"
+    ),
+    "bumped by 3° from frame 20": Fault(
+        bumped("right", range(20, 40), 3.0), "from frame 20 on.*bumped"
+    ),
+    "mirrored image": Fault(redrawn("right", FRAMES, lambda a: a[:, ::-1]), "'right'|mirror"),
+    "another camera's calibration": Fault(
+        rewritten(
+            (
+                r"camera_matrix = \[\[812.4, 0.0, 322.7\], \[0.0, 811.9",
+                "camera_matrix = [[912.4, 0.0, 322.7], [0.0, 911.9",
+            )
+        ),
+        "calibration",
+    ),
+    "left and right swapped": Fault(
+        rewritten(
+            (r'source = "left\*.png"', 'source = "x*.png"'),
+            (r'source = "right\*.png"', 'source = "left*.png"'),
+            (r'source = "x\*.png"', 'source = "right*.png"'),
+        ),
+        "swapped",
+    ),
+    "left and right swapped, no start": Fault(
+        both(
+            NO_START,
+            rewritten(
+                (r'source = "left\*.png"', 'source = "x*.png"'),
+                (r'source = "right\*.png"', 'source = "left*.png"'),
+                (r'source = "x\*.png"', 'source = "right*.png"'),
+            ),
+        ),
+        "swapped",
+    ),
+    "points in metres": Fault(both(NO_START, points(lambda m: m / 1000)), "unit", False),
+    "translations in metres": Fault(
+        both(
+            NO_START,
+            rewritten(
+                (r"translation = \[14.0, -9.0, 780.0\]", "translation = [0.014, -0.009, 0.78]"),
+                (r"translation = \[-11.0, 6.0, 820.0\]", "translation = [-0.011, 0.006, 0.82]"),
+            ),
+        ),
+        "unit",
+        False,
+    ),
+    "marker gone": Fault(points(gone), "marker 8 .*gone"),
+    "marker falls off": Fault(lambda folder: fallen(folder, 4, range(20, 40)), "marker 5 .*gone"),
+    "marker measured 20 mm wrong": Fault(moved(3, (12.0, 0.0, 16.0)), "marker 4 .*measured wrong"),
+    "marker measured 2 mm wrong": Fault(moved(3, (1.2, 0.0, 1.6)), "marker 4 .*measured wrong"),
+    "body mirrored": Fault(
+        both(NO_START, points(lambda m: m * [1, 1, -1])), "mirrored", has_truth=False
+    ),
+}
+
+
+def fallen(folder: Path, number: int, frames: range) -> None:
+    """Paint over a marker."""
+    session = load_session(folder / "session.toml")
+    truth = {line.frame: line.T_world_object for line in read_poses(folder / "truth.jsonl").poses}
+    for setup in session.sensors:
+        for frame in frames:
+            T = truth[frame]
+            assert T is not None
+            place = T[:3, :3] @ session.body.means[number] + T[:3, 3]
+            u, v = setup.sensor.project(place[None])[0][0]
+            path = image(folder, setup.name, frame)
+            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert picture is not None
+            dark = int(np.median(picture))
+            cv2.circle(picture, (round(float(u)), round(float(v))), 9, dark, -1)
+            cv2.imwrite(str(path), picture)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a recording with a fault."""
+
+    right: int
+    wrong: int
+    ambiguous: int
+    lost: int
+    said: list[str]
+    is_named: bool
+
+
+def outcome(fault: Fault, folder: Path) -> Result:
+    """Run a copy of the recording with a fault in it."""
+    shutil.copytree(RECORDING, folder)
+    fault.change(folder)
+    truth = {line.frame: line.T_world_object for line in read_poses(folder / "truth.jsonl").poses}
+    session = load_session(folder / "session.toml")
+    summary = Summary(session)
+    counts = {"right": 0, "wrong": 0, "ambiguous": 0, "lost": 0}
+    for estimate in run(session, watch=summary.watch):
+        summary.add(estimate)
+        if estimate.status != "ok":
+            counts[estimate.status] += 1
+        else:
+            counts["right" if fault.has_truth and is_right(estimate, truth) else "wrong"] += 1
+    said = summary.warnings()
+    is_named = any(re.search(fault.named, line) for line in said) if fault.named else not said
+    return Result(**counts, said=said, is_named=is_named)
+
+
+def is_right(estimate: Estimate, truth: dict[int, Floats | None]) -> bool:
+    T, right = estimate.T_world_object, truth[estimate.frame]
+    assert T is not None
+    assert right is not None
+    turned = float(rotation_angle_deg(T, right))
+    return turned < WRONG_DEG and float(np.linalg.norm(T[:3, 3] - right[:3, 3])) < WRONG_MM
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="What becomes of recordings with faults.")
+    parser.add_argument("faults", nargs="*", help=", ".join(FAULTS))
+    parser.add_argument("--markdown", action="store_true")
+    options = parser.parse_args()
+    unknown = {*options.faults} - {*FAULTS}
+    if unknown:
+        parser.error(f"no such fault: {sorted(unknown)[0]}")
+    print("| fault | ok and right | ambiguous | lost | wrong | named |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    good = True
+    for name in options.faults or FAULTS:
+        with tempfile.TemporaryDirectory() as folder:
+            found = outcome(FAULTS[name], Path(folder) / "recording")
+        good &= found.is_named and not found.wrong
+        words = " / ".join(found.said) or "nothing"
+        print(
+            f"| {name} | {found.right} | {found.ambiguous} | {found.lost} | {found.wrong} | "
+            f"{'yes' if found.is_named else 'NO'}: {words} |",
+            flush=True,
+        )
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
