@@ -54,7 +54,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     (line,) = back.poses
     assert line.line == 2
     for name, value in asdict(estimate).items():
-        if name not in ("hypotheses", "proposer", "doubt", "offsets"):
+        if name not in ("hypotheses", "proposer", "doubt", "offsets", "guesses", "delays"):
             assert np.array_equal(np.asarray(asdict(line)[name]), np.asarray(value)), name
     assert np.array_equal(line.hypotheses[0].T_world_object, T)
     assert line.hypotheses[0].weight == 0.7

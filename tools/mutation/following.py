@@ -414,8 +414,10 @@ _TRACKER = (
     Mutant(
         "tracking-sensors-left-out-are-tallied",
         "tracking/tracker.py",
-        "if judged.sensors[one.name].used",
-        "if judged.sensors[one.name].used or True",
+        "one.surplus\n        )\n        for one in judged.associations\n"
+        "        if judged.sensors[one.name].used",
+        "one.surplus\n        )\n        for one in judged.associations\n"
+        "        if judged.sensors[one.name].used or True",
         "the next frame is looked at as a whole although all is well",
         (_STARTS,),
     ),

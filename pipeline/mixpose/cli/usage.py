@@ -51,7 +51,7 @@ def _text(error: typer.TyperException, arguments: Sequence[str]) -> str:
         return message
     names = [*parameter.opts, *parameter.secondary_opts]
     is_option = parameter.param_type_name == "option"
-    name = max(names, key=len) if is_option else parameter.metavar or names[0]
+    name = max(names, key=len) if is_option else (parameter.metavar or names[0]).removesuffix("...")
     if not message:
         return f"{name}: missing"
     found = _typed(names, arguments) if is_option else None
