@@ -136,3 +136,10 @@ def test_profiles_need_their_grid(tmp_path: Path, options: dict[str, object], fo
     save(tmp_path, "p.npy")
     with pytest.raises(SessionError, match=f"'radar': {found}"):
         profiles(tmp_path, "p.npy", **options)
+
+
+def test_values_whose_squares_cannot_be_added_up_are_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text("0,1,2\n0,1e30,2\n")
+    with pytest.raises(RecordingError, match=r"frame 1, bin 1: found 1e\+30, allowed .* 1e\+15"):
+        list(profiles(tmp_path, "p.csv").frames())

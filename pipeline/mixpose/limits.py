@@ -21,6 +21,9 @@ MOST_SAMPLES = 4_000_000
 MOST_BINS = 1_000_000
 """Of a range profile."""
 
+LARGEST_VALUE = 1e15
+"""In a range profile: a million squares of it are still a number in single precision."""
+
 MOST_UNSORTED_ROWS = 1_000_000
 """Of a table whose rows are not in the order of frames: it is read whole."""
 

@@ -23,6 +23,7 @@ Singles: TypeAlias = NDArray[np.float32]
 CUT = 5.0
 """Standard deviations at which sums over a grid end: the tail holds 6e-7."""
 
+_LEAST_VALUE = 1e-30  # of a grid: what is normalised by less overflows in single precision
 _SAMPLES_PER_SIGMA = 4.0  # of a grid that is averaged before a wide blur: sums err by 1e-30
 _HAT = 0.3  # of a grid's step: a narrower blur is linear interpolation
 
@@ -190,5 +191,6 @@ def is_empty(pattern: Pattern) -> bool:
     """Whether a pattern has no feature at all."""
     if isinstance(pattern, PointPattern):
         return len(pattern.points) == 0 or not pattern.weights.sum() > 0
-    # a profile that lies below zero as a whole has no density anywhere
-    return not pattern.values.max() > 0
+    # a profile that lies below zero as a whole has no density anywhere, nor has one that cannot be
+    # normalised in single precision
+    return not pattern.values.max() > _LEAST_VALUE

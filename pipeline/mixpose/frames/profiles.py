@@ -16,7 +16,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.frames.csv_rows import csv_rows, finite
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
-from mixpose.limits import MOST_BINS
+from mixpose.limits import LARGEST_VALUE, MOST_BINS
 from mixpose.records import GridPattern, RawFrame
 
 
@@ -170,15 +170,7 @@ def _npy_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
                 f"{path}: cut short: {len(rows)} of the {promised} profiles that it promises are "
                 f"whole, from 0"
             )
-        with np.errstate(over="ignore"):
-            values = rows[number].astype(np.float32)
-        if not np.isfinite(values).all():
-            at = int(np.argmin(np.isfinite(values)))
-            raise RecordingError(
-                f"{path}: frame {number}, bin {at}: found {rows[number, at]}, allowed are finite "
-                f"numbers"
-            )
-        yield number, values
+        yield number, _moderate(np.asarray(rows[number]), path, number)
 
 
 def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -189,4 +181,16 @@ def _csv_rows(path: Path, wanted: range) -> Iterator[tuple[int, NDArray[np.float
             return
         if number in wanted:
             values = [finite(cell, path, line, f"bin {at}") for at, cell in enumerate(cells)]
-            yield number, np.array(values, dtype=np.float32)
+            yield number, _moderate(np.array(values), path, number)
+
+
+def _moderate(values: NDArray[Any], path: Path, number: int) -> NDArray[np.float32]:
+    """A profile in single precision, in which squares of its values are added up."""
+    allowed = np.abs(values) <= LARGEST_VALUE
+    if not allowed.all():
+        at = int(np.argmin(allowed))
+        raise RecordingError(
+            f"{path}: frame {number}, bin {at}: found {values[at]}, allowed are finite numbers "
+            f"up to {LARGEST_VALUE:g}"
+        )
+    return values.astype(np.float32)
