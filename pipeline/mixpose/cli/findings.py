@@ -189,8 +189,10 @@ class Findings:
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         for doubt, each in self._doubts.items():
-            if each.count <= frozen or each.count < _LONG:
-                continue  # said of the sensor, or of a frame here and there: clutter does that
+            if each.count <= frozen:
+                continue  # said of the sensor
+            if each.count < _LONG and each.count <= total / 2:
+                continue  # a frame here and there: clutter does that
             if each.count > total / 2 and each.found[0][2] > 1:
                 change = None
                 if len(self._session.labels) == 1 and self._agreed_before < _LONG:
