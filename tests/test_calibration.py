@@ -18,7 +18,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.calibration import CalibrationRules, Rig, SeenFrame, Task, calibrate
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.checking import displacements
-from mixpose.calibration.choice import chosen, held_back
+from mixpose.calibration.choice import held_back
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import interpolate, neighbours
 from mixpose.calibration.rig import blocks_of
@@ -265,12 +265,6 @@ def test_every_fifth_frame_is_held_back_or_every_fifth_run() -> None:
     assert held_back(4, rules, runs=False).sum() == 0
     in_runs = np.flatnonzero(held_back(40, rules, runs=True))
     assert in_runs.tolist() == [8, 9, 10, 11, 28, 29, 30, 31]
-
-
-def test_frames_that_tell_something_new_are_chosen_first() -> None:
-    directions = np.array([[1, 0], [1, 0.01], [1, -0.01], [0, 1.0]])
-    information = np.einsum("ki,kj->kij", directions, directions)
-    assert 3 in chosen(information, 2).tolist()
 
 
 def test_what_was_searched_is_found_again(tmp_path: Path) -> None:

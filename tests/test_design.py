@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -107,12 +106,9 @@ def registered(points: Floats, measured: Floats, target: Floats) -> Floats:
     return np.asarray(R @ (target - at) + to)
 
 
-def test_the_tip_of_a_real_tool_errs_as_registrations_of_it_do() -> None:
+def test_the_tip_of_a_real_tool_errs_as_registrations_of_it_do(recordings: Path) -> None:
     """Markers of NDI's tool that err by 0.25 mm in all, and tips 100 and 200 mm from it."""
-    root = Path(os.environ.get("MIXPOSE_RECORDINGS", "")) / "body_files"
-    if not os.environ.get("MIXPOSE_RECORDINGS") or not root.is_dir():
-        pytest.skip("MIXPOSE_RECORDINGS names no folder of recordings")
-    points = read_marker_file(root / "ndi_8700339.rom", "mm").points
+    points = read_marker_file(recordings / "body_files" / "ndi_8700339.rom", "mm").points
     per_axis = 0.25 / np.sqrt(3)
     plan = point_sets(points, 1e-6, per_axis)
     rng = np.random.default_rng(0)
@@ -308,10 +304,8 @@ def test_markers_that_lie_like_those_of_another_body_are_named() -> None:
     assert mirrored is None or len(mirrored.markers) == 3  # three are their own mirror image
 
 
-def test_bodies_of_a_recording_that_are_taken_for_each_other_are_told() -> None:
-    folder = Path(os.environ.get("MIXPOSE_RECORDINGS", "")) / "several_bodies"
-    if not os.environ.get("MIXPOSE_RECORDINGS") or not folder.is_dir():
-        pytest.skip("MIXPOSE_RECORDINGS names no folder of recordings")
+def test_bodies_of_a_recording_that_are_taken_for_each_other_are_told(recordings: Path) -> None:
+    folder = recordings / "several_bodies"
     forearm, arm = (
         load_session(folder / "wheelchair_4_bodies" / f"session_{name}.toml").body
         for name in ("ForearmL", "ArmL")

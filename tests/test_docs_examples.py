@@ -94,20 +94,19 @@ def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
     assert {"left_0.png", "right_0.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_the_page_about_importing_can_be_followed_in_an_empty_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("page", "written"), [("importing", "poses.jsonl"), ("design", "design.png")]
+)
+def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(
+    page: str,
+    written: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    follow("docs/importing.md", capfd)
-    assert (tmp_path / "poses.jsonl").stat().st_size > 0
-
-
-def test_the_page_about_design_can_be_followed_in_an_empty_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    follow("docs/design.md", capfd)
-    assert (tmp_path / "design.png").stat().st_size > 0
+    follow(f"docs/{page}.md", capfd)
+    assert (tmp_path / written).stat().st_size > 0
 
 
 def test_the_first_two_minutes_print_what_the_readme_shows(

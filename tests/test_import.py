@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -354,15 +353,10 @@ def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> 
     assert "are translations in mm?" in done.stdout
 
 
-def recordings() -> Path:
-    folder = os.environ.get("MIXPOSE_RECORDINGS", "")
-    if not folder or not Path(folder).is_dir():
-        pytest.skip("MIXPOSE_RECORDINGS names no folder of recordings")
-    return Path(folder)
-
-
-def test_every_real_calibration_file_is_read_or_refused_in_one_line(tmp_path: Path) -> None:
-    root = recordings() / "calibration_files"
+def test_every_real_calibration_file_is_read_or_refused_in_one_line(
+    recordings: Path, tmp_path: Path
+) -> None:
+    root = recordings / "calibration_files"
     counts: dict[str, int] = {}
     for path in sorted(root.rglob("*")):
         if path.is_dir() or path.name == "README.md":
@@ -395,9 +389,9 @@ def test_every_real_calibration_file_is_read_or_refused_in_one_line(tmp_path: Pa
     }
 
 
-def test_baselines_of_real_rigs(tmp_path: Path) -> None:
+def test_baselines_of_real_rigs(recordings: Path, tmp_path: Path) -> None:
     """Euclid's distance of the makers' stereo cameras: 11 cm of EuRoC, 5 cm of RealSense."""
-    root = recordings() / "calibration_files" / "kalibr"
+    root = recordings / "calibration_files" / "kalibr"
     for name, expected in {"euroc_mav": 110, "kaist_vio": 50, "miluv_ifo001": 50}.items():
         session = imported([root / f"{name}.yaml"], "mm", None, tmp_path / f"{name}.toml")
         second = session.sensors[1].sensor
@@ -406,15 +400,17 @@ def test_baselines_of_real_rigs(tmp_path: Path) -> None:
         assert baseline == pytest.approx(expected, rel=0.01)  # as their data sheets round
 
 
-def test_a_copied_camera_in_a_real_file_is_noticed() -> None:
-    path = recordings() / "calibration_files" / "aniposelib" / "sleap_anipose_duplicate_camera.toml"
+def test_a_copied_camera_in_a_real_file_is_noticed(recordings: Path) -> None:
+    path = recordings / "calibration_files" / "aniposelib" / "sleap_anipose_duplicate_camera.toml"
     warnings = gather([path], "mm", "mm").warnings
     assert any(warning.startswith("side and top are the same camera") for warning in warnings)
 
 
-def test_a_real_rig_agrees_with_a_session_that_was_made_by_hand(tmp_path: Path) -> None:
+def test_a_real_rig_agrees_with_a_session_that_was_made_by_hand(
+    recordings: Path, tmp_path: Path
+) -> None:
     """The four web cams, whose extrinsics were copied from caliscope's file."""
-    folder = recordings() / "webcams4_a"
+    folder = recordings / "webcams4_a"
     path = folder / "caliscope" / "camera_array.toml"
     session = imported([path], "m", None, tmp_path / "s.toml")
     by_hand = load_session(folder / "session_as_found.toml")

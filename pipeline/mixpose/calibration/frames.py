@@ -27,11 +27,3 @@ class SeenFrame:
     time_s: float | None
     points: Mapping[int, Floats]
     times: Mapping[int, float]
-
-
-@dataclass(frozen=True, eq=False)
-class PosedFrame:
-    """A frame and where the body is in it."""
-
-    seen: SeenFrame
-    T_world_object: Floats

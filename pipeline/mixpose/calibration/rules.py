@@ -33,8 +33,7 @@ class CalibrationRules:
     least_link: int = constant(2, "frames that must agree on where two sensors stand")
     held_back: float = constant(0.2, "of the frames, whose residual is that of unseen data")
     least_frames: int = constant(4, "left to calibrate from, else none is held back")
-    most_frames: int = constant(120, "taken; chosen by information where a recording has more")
-    most_candidates: int = constant(240, "frames among which those are chosen")
+    most_candidates: int = constant(240, "frames taken: a longer recording is thinned out evenly")
     least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
     undetermined: float = constant(
         0.25,

@@ -214,11 +214,6 @@ def _run_in(part: Path, job: Job, running: Running, threads: int) -> Outcome:
     return outcome
 
 
-def _reason(lines: list[str]) -> str:
-    """What was said last."""
-    return (lines or ["it said nothing"])[-1].removeprefix("mixpose: ")
-
-
 def _put_in_place(part: Path, job: Job, outcome: Outcome) -> Outcome:
     """Give a whole folder its name, unless another worker was faster."""
     place = Path(job.folder) / job.name

@@ -48,10 +48,6 @@ class Left:
     views: tuple[View, ...]
     kept: Mapping[str, NDArray[np.intp]]
 
-    def is_as(self, other: Left) -> bool:
-        """Whether the same is left."""
-        return all(np.array_equal(each, other.kept[name]) for name, each in self.kept.items())
-
 
 def nobody(views: Sequence[View]) -> Owners:
     """Owners before anything is known; sensors without single detections have none."""
