@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
 from mixpose.report.drawing import BARS, POSE, TRUTH, blank, count_axes, drawn
 from mixpose.report.figures import Chart
-from mixpose.report.page import require_libraries
+from mixpose.report.page import page_templates
 
 MARK = '<meta name="generator" content="mixpose calibration'
 _TEMPLATE = "calibration.html.j2"
@@ -37,16 +36,7 @@ def render_calibration(found: Calibration, name: str, unit: str, version: str) -
     SessionError
         If a library is missing.
     """
-    require_libraries()
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = page_templates()
     sensors = range(len(found.after.names))
     charts = [_sensor_chart(found, index, unit) for index in sensors]
     return environment.get_template(_TEMPLATE).render(

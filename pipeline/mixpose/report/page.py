@@ -48,8 +48,8 @@ class SensorRow:
     unit: str
 
 
-def require_libraries() -> None:
-    """Make sure that what a page is made with is installed.
+def page_templates() -> Environment:
+    """The templates of pages, once what a page is made with is found to be installed.
 
     Raises
     ------
@@ -57,13 +57,20 @@ def require_libraries() -> None:
         Naming the extra that brings it.
     """
     try:
-        import jinja2  # noqa: F401, PLC0415
         import matplotlib  # noqa: F401, PLC0415
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
     except ImportError as error:
         raise SessionError(
             f"report: found no {error.name}, which makes the page; install it with the extra "
             "'report': python -m pip install 'mixpose[report]'"
         ) from error
+    return Environment(
+        loader=FileSystemLoader(Path(__file__).parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) -> str:
@@ -85,16 +92,7 @@ def render(poses: PoseFile, truth: PoseFile | None, *, cut: bool, version: str) 
     RecordingError
         If the poses cannot be compared with the truth.
     """
-    require_libraries()
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # noqa: PLC0415
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = page_templates()
     return environment.get_template(_TEMPLATE).render(
         mark=MARK, version=version, **_content(poses, truth, cut, environment)
     )
