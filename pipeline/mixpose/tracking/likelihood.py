@@ -39,8 +39,14 @@ from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.course import Expected, unknown
-from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion
-from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
+from mixpose.tracking.delays import (
+    Offsets,
+    fit_in_motion,
+    is_timed,
+    offsets_of,
+    seen_in_motion,
+    with_motion_unknown,
+)
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
