@@ -151,6 +151,7 @@ LIVE = SearchBudget(
     min_shortlist=6,
     finalists=4,
     max_rays=12,
+    max_pairs=200,
     subsample=6,
     descent_features=16,
 )
