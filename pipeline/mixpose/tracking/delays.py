@@ -12,22 +12,18 @@ J v τ more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.fit import Fit
-from mixpose.judgement import Association, Judged, nearest_alike
+from mixpose.judgement import Association
 from mixpose.objective import View
 from mixpose.records import DelaySeen
 from mixpose.sensors import Motion, in_motion, moments
 from mixpose.tracking.course import Expected
-
-if TYPE_CHECKING:
-    from mixpose.tracking.likelihood import FrameData
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -37,9 +33,6 @@ TYPICAL = 0.2  # residuals in σ_ε, as two features would say: what a frame alo
 _TYPICAL_DEGREES = 4.0
 LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
 _ROUNDING = 1e-9
-
-ROUNDS = 5
-SETTLED = 1e-3  # of σ_ε: features that a better velocity moves by less stay where they are
 
 UNKNOWN_S = 0.1  # standard deviation of a delay of which nothing is known
 
@@ -117,23 +110,22 @@ def seen_in_motion(views: Sequence[View], motion: Motion) -> list[View]:
     ]
 
 
-def offsets_of(
-    found: Sequence[Association], views: Sequence[View], places: Sequence[Floats]
-) -> Offsets:
-    """Rows for least squares.
+def offsets_of(found: Sequence[Association], views: Sequence[View], blurs: Floats) -> Offsets:
+    """Rows for least squares, in which features count as they pull.
 
     Parameters
     ----------
     found : sequence of Association
     views : sequence of View
         As they stand, in the same order.
-    places : sequence of (n, m) array
-        Where the features in view are predicted.
+    blurs : (L,) array
+        In σ_ε, at which features pull: what is far off counts for nothing.
     """
     rows, late, offsets, sensor = [], [], [], []
-    for k, (one, view, y) in enumerate(zip(found, views, places, strict=True)):
-        m = one.J.shape[1]
-        root = np.repeat(np.sqrt(one.shares) / one.sigma, m)
+    for k, (one, view, blur) in enumerate(zip(found, views, blurs.tolist(), strict=True)):
+        m, y = one.J.shape[1], one.places
+        pull = np.sqrt(one.shares * np.exp(-0.25 * one.squared / blur**2))
+        root = np.repeat(pull / one.sigma, m)
         rows.append(one.J.reshape(-1, 6) * root[:, None])
         offsets.append(one.offsets.reshape(-1) * root)
         late.append(np.repeat(moments(view.sensor, y, view.delay, view.readout), m))
@@ -146,6 +138,15 @@ def offsets_of(
         np.concatenate(sensor),
         unsure,
     )
+
+
+def unsure_by(J: Floats, y: Floats, view: View, velocity: Expected) -> float:
+    """How far features at places (n, m) may be off by velocity and delay, in σ_ε; J (n, m, 6)."""
+    late = moments(view.sensor, y, view.delay, view.readout)
+    speed = np.hypot(velocity.velocity, velocity.deviation) * (view.unsure or 0.0)
+    ways = np.hypot(late[:, None] * velocity.deviation, speed)
+    squares = ((J * ways[:, None]) ** 2).sum(axis=(1, 2)).max(initial=0.0)
+    return float(np.sqrt(squares)) / view.observation.sigma
 
 
 def together(
@@ -333,41 +334,3 @@ class DelayEvidence:
         information[:before, :before], vector[:before] = self.information, self.vector
         vector += columns.T @ offsets / variance + frame @ used
         return DelayEvidence(reference, tuple(names), information + frame, vector)
-
-
-def fit_in_motion(
-    data: FrameData, T_start: Floats, climb: Callable[[FrameData, Floats], Fit]
-) -> Fit:
-    """Climb to the most likely pose and velocity near a start.
-
-    Parameters
-    ----------
-    data : FrameData
-        Of sensors that see features at moments of their own.
-    T_start : (4, 4) array
-    climb : callable
-        Takes a frame as of the common time and a pose to the best pose near it.
-    """
-    motion = data.motion(T_start)
-    T = T_start
-    for _ in range(ROUNDS):
-        seen = data.in_motion(motion)
-        fit = climb(seen, T)
-        T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
-        offsets = seen.offsets(T)
-        expected = data.expected(T)
-        both = together(offsets, motion.velocity, expected, data.free)
-        moved = np.abs(offsets.rows @ both.change * offsets.late)
-        motion = Motion(T, motion.velocity + both.change, expected.acceleration)
-        if moved.max(initial=0.0) < SETTLED:
-            break
-    return replace(fit, T_world_object=T, motion=motion)
-
-
-def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judged:
-    """A judged pose, as sure as its velocity lets it be."""
-    T = judged.T_world_object
-    offsets = data.offsets(T, [one for one in judged.associations if judged.sensors[one.name].used])
-    expected = data.expected(T)
-    wider = widened(judged.covariance, offsets, motion.velocity, expected, data.free)
-    return replace(judged, covariance=wider)
