@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import Atlas
-from mixpose.density.atlas import MAX_PAGES, REACH
+from mixpose.density.atlas import MAX_PAGES, PAGE, REACH
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -200,6 +200,19 @@ def test_grey_values_drawn_finely_have_their_gradients_to_the_last_digits() -> N
         # single precision and the cut at 6 sigma are left
         np.testing.assert_allclose(value, C, rtol=2e-5)
         np.testing.assert_allclose(gradient, slope, atol=2e-5 * C.max())
+
+
+def test_pages_are_drawn_half_a_page_around_a_place_and_no_farther() -> None:
+    points = far_apart(12, side=3)
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    half = PAGE / 2 * SIGMA / STEPS_PER_SIGMA
+    pending = int(np.count_nonzero(atlas.table < 0))
+    looked_up(atlas, points)
+    drawn = pending - int(np.count_nonzero(atlas.table < 0))
+    assert drawn == 4 * len(points)
+    for turn in np.linspace(0, 2 * np.pi, 9):
+        looked_up(atlas, points + 0.99 * half * np.array([np.cos(turn), np.sin(turn)]))
+    assert pending - int(np.count_nonzero(atlas.table < 0)) == drawn
 
 
 def test_pages_join_without_a_seam() -> None:

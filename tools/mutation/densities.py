@@ -55,6 +55,13 @@ _ATLAS = (
         "places of features are drawn to cells",
     ),
     Mutant(
+        "density-pages-on-one-side-only",
+        "density/atlas.py",
+        "(index[where] * (1.0 / self.plane.page) - 0.5)",
+        "(index[where] * (1.0 / self.plane.page))",
+        "a fit that goes on by a pixel draws its densities twice",
+    ),
+    Mutant(
         "density-pages-begin-anywhere",
         "density/atlas.py",
         "origin = page * np.floor((lower - (reach + page + 0.5)) / page)",

@@ -48,10 +48,34 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "clear = (offsets.squared <= limits) | (offsets.shares == 0)",
-        "clear = offsets.squared < np.inf",
+        "clear = squared <= (errors.outlying**2 * seen.variances)[sensor]",
+        "clear = squared < np.inf",
         "a cut spot bends the pose",
-        ("test_tracking_outliers.py",),
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-narrows-for-nothing",
+        "fit/near.py",
+        "< rules.moved**2:",
+        "< 0.0:",
+        "fits of large bodies draw every density three times",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-move-without-the-noise",
+        "fit/near.py",
+        "weights, J = shares / variances[sensor], self.J[..., free]",
+        "weights, J = shares, self.J[..., free]",
+        "how far narrower blurs move the pose is told in σ_ε, not in standard deviations",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-offsets-before-the-last-step",
+        "fit/near.py",
+        "away -= J @ ascent.step",
+        "away -= 0.0 * J @ ascent.step",
+        "offsets are those of a pose that was left",
+        ("test_fit_noise.py",),
     ),
 )
 

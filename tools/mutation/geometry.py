@@ -437,8 +437,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-always-converged",
         "optimise/newton.py",
-        "return Ascent(state, here.value, False, options.iterations)",
-        "return Ascent(state, here.value, True, options.iterations)",
+        "return Ascent(state, here.value, False, options.iterations, here)",
+        "return Ascent(state, here.value, True, options.iterations, here)",
         "an ascent that ran out of iterations counts as done",
     ),
     Mutant(
@@ -451,8 +451,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-last-step-not-taken",
         "optimise/newton.py",
-        "return Ascent(move(state, step), here.value + gain, True, iteration)",
-        "return Ascent(state, here.value, True, iteration)",
+        "return Ascent(move(state, step), here.value + gain, True, iteration, here, step)",
+        "return Ascent(state, here.value, True, iteration, here)",
         "the state is a step short of the maximum",
     ),
 )

@@ -61,6 +61,14 @@ class Overlaps(NamedTuple):
     away: Floats
 
 
+class Match(NamedTuple):
+    """Features that are predicted at H poses, C and its gradient there (L, H, n, 3), and ⟨h, h⟩."""
+
+    at: Projected
+    sampled: Floats
+    over: Overlaps
+
+
 def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
     """How far the predicted features overlap.
 
