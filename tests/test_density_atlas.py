@@ -215,6 +215,21 @@ def test_pages_are_drawn_half_a_page_around_a_place_and_no_farther() -> None:
     assert pending - int(np.count_nonzero(atlas.table < 0)) == drawn
 
 
+def test_many_detections_looked_up_a_few_at_a_time_are_all_there() -> None:
+    # more pages than one column of the array takes, in pieces of one row and of several
+    points = far_apart(13, side=18)
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    assert atlas.values.shape[1] > atlas.plane.side
+    rng = np.random.default_rng(13)
+    top = peak(len(points))
+    for some in np.split(rng.permutation(len(points)), [1, 3, 10, 40, 41, 100]):
+        y = points[some] + rng.uniform(-0.5, 0.5, (len(some), 2)) * SIGMA
+        value, _ = looked_up(atlas, y)
+        off = 2 * spline_error(STEPS_PER_SIGMA, THIRD) * top
+        np.testing.assert_allclose(value, exact(points, y)[0], atol=off)
+    np.testing.assert_allclose(looked_up(atlas, points)[0], top, rtol=0.02)
+
+
 def test_pages_join_without_a_seam() -> None:
     points = far_apart(6, side=4)
     atlas = points_only(points, STEPS_PER_SIGMA)

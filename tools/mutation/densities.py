@@ -381,14 +381,14 @@ _ERRORS = (
     Mutant(
         "density-errors-cut-by-the-blur",
         "density/extraction_error.py",
-        "factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))",
-        "factor = np.ones(count)",
+        "factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))",
+        "factor = 1.0",
         "the noise seems smaller than it is",
     ),
     Mutant(
         "density-errors-of-all-detections-alike",
         "density/extraction_error.py",
-        "weights = shares * np.exp(-0.25 * squared / blurs[sensor] ** 2)",
+        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])",
         "weights = shares",
         "a cut spot is noise of all others",
     ),

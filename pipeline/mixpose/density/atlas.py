@@ -165,13 +165,22 @@ class Atlas:
     def _draw(self, squares: Indices) -> None:
         """Draw the pages of pending squares of the table, none of which is twice."""
         side, columns = self.plane.side, self._columns
-        at_once = max(_AT_ONCE // side**2, 1)
-        for begin in range(0, len(squares), at_once):
-            some = squares[begin : begin + at_once]
-            pages = self._room(-(-len(some) // columns))
-            self.table[some] = np.arange(self._drawn, self._drawn + len(some))
+        at_once = max(_AT_ONCE // side**2, columns)
+        if len(squares) > at_once:  # pages of as many detections are drawn together
+            reached = np.bincount(self._detections.squares.ravel(), minlength=len(self.table))
+            squares = squares[np.argsort(reached[squares], kind="stable")]
+        self._reserve(len(squares))
+        while len(squares):
+            row, column = divmod(self._drawn, columns)
+            whole = 0 if column else min(len(squares), at_once) // columns
+            count = whole * columns or min(len(squares), columns - column)
+            some, squares = squares[:count], squares[count:]
+            room = self.values[row * side : (row + max(whole, 1)) * side]
+            room = room.reshape(-1, side, columns, 3 * side).swapaxes(1, 2)
+            pages = room if whole else room[:, column : column + count]
+            self.table[some] = np.arange(self._drawn, self._drawn + count)
             sensor, square = np.divmod(some, self.plane.squares)
-            corner = np.empty((len(some), 2))
+            corner = np.empty((count, 2))
             rows_columns = corner[:, 1], corner[:, 0]
             np.divmod(square, self.plane.shape[0], out=rows_columns, casting="unsafe")
             corner *= self.plane.page
@@ -179,22 +188,21 @@ class Atlas:
             self._draw_detections(corner, pages)
             for k in self._grids:
                 for i in np.flatnonzero(sensor == k).tolist():
-                    page = pages[i // columns, i % columns].reshape(side, side, 3)
-                    page[...] = self._of_grid(k, corner[i])
-            self._drawn += len(pages) * columns
+                    page = pages[i // pages.shape[1], i % pages.shape[1]]
+                    page[...] = self._of_grid(k, corner[i]).reshape(page.shape)
+            self._drawn += count
 
-    def _room(self, rows: int) -> Singles:
-        """Room for rows of further pages (rows, columns, side, 3 side), in place in the array."""
-        side, first = self.plane.side, self._drawn // self._columns
-        if (first + rows) * side > len(self.values):
+    def _reserve(self, pages: int) -> None:
+        """Make room for further pages."""
+        side, columns = self.plane.side, self._columns
+        rows = -(-(self._drawn + pages) // columns)
+        if rows * side > len(self.values):
             # so large that allocators keep it from frame to frame; memory that is not written to
             # is free
-            most = min(4 * (first + rows), self._most // self._columns + 2)
-            values = np.empty((max(most, first + rows) * side, *self.values.shape[1:]), np.float32)
-            values[: first * side] = self.values[: first * side]
+            most = max(min(4 * rows, self._most // columns + 2), rows)
+            values = np.empty((most * side, *self.values.shape[1:]), dtype=np.float32)
+            values[: len(self.values)] = self.values
             self.values = values
-        free = self.values[first * side : (first + rows) * side]
-        return free.reshape(rows, side, self._columns, 3 * side).swapaxes(1, 2)
 
     def _draw_detections(self, corner: Floats, pages: Singles) -> None:
         """Draw pages with corners (P, 2) in cells, the next ones, in place.
@@ -202,7 +210,7 @@ class Atlas:
         They hold exact Gaussians: sums, over the detections that reach a page, of products of one
         along v and one along u, in three channels side by side.
         """
-        side, found, count = self.plane.side, self._detections, pages.shape[0] * pages.shape[1]
+        side, found, count = self.plane.side, self._detections, len(corner)
         number = self.table[found.squares] - self._drawn
         of, which = np.nonzero(number >= 0)
         number = number[of, which]

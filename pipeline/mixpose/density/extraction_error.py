@@ -131,7 +131,7 @@ def errors_seen(
     blurs = np.ones(len(offsets.dimensions))
     while True:
         seen = _seen_at(blurs, offsets, free, known, rules)
-        if (seen.blurs > 0.9 * blurs).all():
+        if all((seen.blurs > 0.9 * blurs).tolist()):
             return seen
         blurs = np.minimum(seen.blurs, blurs)
 
@@ -139,21 +139,24 @@ def errors_seen(
 def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
     squared, shares, sensor, dimensions, finest = offsets
-    count = len(dimensions)
-    weights = shares * np.exp(-0.25 * squared / blurs[sensor] ** 2)
-    total = dimensions * np.bincount(sensor, weights, count)
-    q = np.bincount(sensor, weights * squared, count) / np.maximum(total, 1e-12)
-    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
-    factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))
-    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
-    degrees = factor ** (dimensions / 2) * total
-    most = float(degrees.sum())
+    weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])
+    totals = np.bincount(sensor, weights, len(dimensions)).tolist()
+    sums = np.bincount(sensor, weights * squared, len(dimensions)).tolist()
+    squares, degrees = [], []
+    for total, weighted, m, blur in zip(totals, sums, dimensions.tolist(), blurs.tolist()):
+        q = weighted / max(m * total, 1e-12)
+        # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+        factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))
+        # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+        degrees.append(factor ** (m / 2) * m * total)
+        squares.append(factor * q * degrees[-1])
+    most = sum(degrees)
     left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
-    own = np.array([(left > 0) * factor * q * degrees, left * degrees])
+    own = np.array([squares, degrees]) * [[left > 0], [left]]
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
-    blurs = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))
-    return Seen(own, variances, np.clip(blurs, finest, 1.0))
+    narrow = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))
+    return Seen(own, variances, np.minimum(np.maximum(narrow, finest), 1.0))
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
@@ -162,8 +165,9 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
     that of all sensors, in degrees of freedom.
     """
-    squares, degrees = sums
-    most = float(degrees.sum()) + typical
-    common = (float(squares.sum()) + typical * rules.typical**2) / max(most, 1e-12)
+    squares, degrees = sums.tolist()
+    most = sum(degrees) + typical
+    common = (sum(squares) + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, 1e-12))
+    pairs = zip(squares, degrees)
+    return np.array([(one + pull * common) / max(d + pull, 1e-12) for one, d in pairs])
