@@ -16,7 +16,6 @@ from mixpose.density.features_met import AssociationRules, crowding, features_me
 from mixpose.density.grid import FAR, FLOOR, Density, Window
 from mixpose.density.observation import Observation, matched_atlas
 from mixpose.density.overlap import close_pairs, peak, self_overlap
-from mixpose.density.weighting import weighted
 
 __all__ = [
     "FAR",
@@ -40,5 +39,4 @@ __all__ = [
     "render",
     "self_overlap",
     "surplus",
-    "weighted",
 ]
