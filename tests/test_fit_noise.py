@@ -65,8 +65,9 @@ def test_a_spot_that_is_cut_hardly_bends_the_pose(
     whole = fitted(views, EIGHT, NEVER)
     cut = bent(views, by_px)
     assert apart(views, EIGHT, fitted(cut, EIGHT, NEVER), whole) > 1.5
-    # what least squares lose by one of sixteen detections, and by Welsch's loss in its place
-    assert apart(views, EIGHT, fitted(cut, EIGHT), whole) < 1.0
+    # what least squares lose by one of sixteen detections, √(2 · 6/32 / (1 - 6/32)) = 0.7, and by
+    # Welsch's loss in its place, √(0.05 · 6) = 0.55
+    assert apart(views, EIGHT, fitted(cut, EIGHT), whole) < 1.25
 
 
 def test_an_outlier_among_many_detections_is_left_where_it_moves_nothing(
@@ -84,18 +85,19 @@ def test_an_outlier_among_many_detections_is_left_where_it_moves_nothing(
     assert drawn == [[1.5, 1.5]]
     narrow = fitted(views, MANY, ALWAYS)
     assert len(drawn) > 2
-    assert 0 < apart(views, MANY, T, narrow) < FitRules().moved * 1.2
+    # foreseen by one step of several
+    assert 0 < apart(views, MANY, T, narrow) < FitRules().moved * 1.4
 
 
 def test_how_far_narrower_blurs_move_the_pose_is_known_before(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    errors, rules, known = ErrorRules(), FitRules(), np.zeros((2, 2))
+    errors, known = ErrorRules(), np.zeros((2, 2))
     for seed, body in ((1, EIGHT), (2, EIGHT), (3, MANY)):
         views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=seed), 1.2)
         objective, ascent = at_sigma(views, body)
         sigmas = np.array([view.observation.sigma for view in views])
-        met = near._met(objective, ascent, sigmas, errors, rules)
+        met = near._met(objective, ascent, sigmas, errors)
         seen = errors_seen(met.offsets, 6, known, errors)
         expected = met.moved(ALL_FREE, np.ones(2), seen.blurs, seen.variances)
         narrow = matched_objective(views, body, (seen.blurs * sigmas).tolist())
@@ -113,7 +115,7 @@ def test_offsets_are_those_at_the_end_of_an_ascent_whose_last_step_is_not_looked
     objective, ascent = at_sigma(views, EIGHT)
     assert ascent.step is not None
     sigmas = np.array([view.observation.sigma for view in views])
-    found = near._met(objective, ascent, sigmas, ErrorRules(), FitRules()).away
+    found = near._met(objective, ascent, sigmas, ErrorRules()).away
     at, sampled, _ = objective.match(ascent.state[None])
     there = 2 * sigmas[:, None, None] * sampled[:, 0, :, 1:] / sampled[:, 0, :, :1]
     shift = np.abs(at.J[:, 0] @ ascent.step).max() / 1.5

@@ -48,7 +48,7 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "clear = squared <= (errors.outlying**2 * seen.variances)[sensor]",
+        "clear = squared <= (errors.outlying**2 * variances)[sensor]",
         "clear = squared < np.inf",
         "a cut spot bends the pose",
         ("test_fit_noise.py",),
@@ -56,8 +56,8 @@ _NARROW = (
     Mutant(
         "fit-narrows-for-nothing",
         "fit/near.py",
-        "< rules.moved**2:",
-        "< 0.0:",
+        "< rules.moved**2",
+        "< 0.0",
         "fits of large bodies draw every density three times",
         ("test_fit_noise.py",),
     ),
@@ -215,8 +215,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "return bool(ratio > fdtri(degrees, known, model.by_chance))",
-        "return False",
+        "return ratio / float(fdtri(degrees, known, model.by_chance))",
+        "return 0.0",
         "a frame of large residuals is as sure as those before it",
     ),
     Mutant(

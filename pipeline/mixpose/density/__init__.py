@@ -10,6 +10,8 @@ from mixpose.density.extraction_error import (
     Offsets,
     Seen,
     errors_seen,
+    known_blurs,
+    log_likelihood,
     pooled,
 )
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
@@ -33,6 +35,8 @@ __all__ = [
     "crowding",
     "errors_seen",
     "features_met",
+    "known_blurs",
+    "log_likelihood",
     "matched_atlas",
     "peak",
     "pooled",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs, log_likelihood
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -54,9 +54,6 @@ class FitRules:
 
     schedule: ScheduleRules = ScheduleRules()
     misfit: MisfitRules = MisfitRules()
-    met: float = constant(
-        3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
-    )
     narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
     moved: float = constant(
         0.5,
@@ -188,15 +185,28 @@ def _to_the_noise(
     """The ascent from σ_ε on, while offsets that are no noise of the detections move the pose."""
     known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in objective.views])
-    blurs = np.ones(len(sigmas))
+    blurs, count = np.ones(len(sigmas)), int(free.sum())
+    likeliest, best = -np.inf, ascent
     while True:
-        met = _met(objective, ascent, sigmas, errors, rules)
-        seen = errors_seen(met.offsets, int(free.sum()), known, errors)
-        narrower = np.minimum(seen.blurs, blurs)
-        if (narrower > rules.narrower * blurs).all() or met.is_noise(seen, errors):
+        met = _met(objective, ascent, sigmas, errors)
+        seen = errors_seen(met.offsets, count, known, errors)
+        # offsets of a bent pose hide how small the noise is
+        least = known_blurs(met.offsets.finest, known, errors)
+        variances = np.minimum(seen.variances, (least / errors.blur) ** 2)
+        end = np.minimum(np.minimum(seen.blurs, least), blurs)
+        narrower = np.maximum(end, blurs / rules.schedule.ratio)
+        is_end = (
+            met.is_noise(variances, errors)
+            or all((narrower > rules.narrower * blurs).tolist())
+            or met.moved(free, blurs, end, variances) < rules.moved**2
+        )
+        if is_end and best is ascent:
             return ascent
-        if met.moved(free, blurs, narrower, seen.variances) < rules.moved**2:
-            return ascent
+        likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
+        if likelihood > likeliest:
+            likeliest, best = likelihood, ascent
+        if is_end:
+            return best
         blurs = narrower
         # a fine grid has to hold no more than what was detected around the features
         near = [
@@ -226,10 +236,10 @@ class _Met(NamedTuple):
     J: Floats
     places: list[Floats]
 
-    def is_noise(self, seen: Seen, errors: ErrorRules) -> bool:
-        """Whether all offsets are as large as the noise lets them be."""
+    def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
+        """Whether no offset is larger than noise of variances (L,) lets it be."""
         squared, shares, sensor, _, _ = self.offsets
-        clear = squared <= (errors.outlying**2 * seen.variances)[sensor]
+        clear = squared <= (errors.outlying**2 * variances)[sensor]
         return bool((clear | (shares == 0)).all())
 
     def moved(
@@ -251,7 +261,6 @@ def _met(
     ascent: Ascent[Floats],
     sigmas: Floats,
     errors: ErrorRules,
-    rules: FitRules,
 ) -> _Met:
     """How far off features are met, as the density around them shows it: v ∇C / C.
 
@@ -268,7 +277,7 @@ def _met(
     if ascent.step is not None:
         away -= J @ ascent.step
     squared = (away * away).sum(axis=1)
-    shares = np.where(squared < rules.met**2, at.weights[sensor, 0, feature], 0.0)
+    shares = np.where(squared < errors.met**2, at.weights[sensor, 0, feature], 0.0)
     dimensions = objective.projection.dimensions
     places = [
         y[0, seen[0], :m] for y, seen, m in zip(at.y, at.seen, dimensions.tolist(), strict=True)
