@@ -195,12 +195,8 @@ def _to_the_noise(
         variances = np.minimum(seen.variances, (least / errors.blur) ** 2)
         end = np.minimum(np.minimum(seen.blurs, least), blurs)
         narrower = np.maximum(end, blurs / rules.schedule.ratio)
-        is_end = (
-            met.is_noise(variances, errors)
-            or all((narrower > rules.narrower * blurs).tolist())
-            or met.moved(free, blurs, end, variances) < rules.moved**2
-        )
-        if is_end and best is ascent:
+        is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
+        if best is ascent and (is_end or met.moved(free, blurs, end, variances) < rules.moved**2):
             return ascent
         likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
         if likelihood > likeliest:
