@@ -103,6 +103,7 @@ def fit_near(
     *,
     finest: MatchedObjective | None = None,
     noise: Sequence[Noise] | None = None,
+    least: Floats | None = None,
     errors: ErrorRules = ErrorRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
@@ -123,6 +124,8 @@ def fit_near(
         At σ_ε, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
+    least : (L,) array or None
+        Standard deviation of what else features of each view are off by, in σ_ε.
     errors : ErrorRules
     rules : FitRules
     """
@@ -140,7 +143,8 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     if finest and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
-        ascent = _to_the_noise(ascent, finest, free, known, errors, rules)
+        beside = np.zeros(len(views)) if least is None else least
+        ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
@@ -179,6 +183,7 @@ def _to_the_noise(
     objective: MatchedObjective,
     free: NDArray[np.bool_],
     noise: Sequence[Noise],
+    beside: Floats,
     errors: ErrorRules,
     rules: FitRules,
 ) -> Ascent[Floats]:
@@ -188,7 +193,7 @@ def _to_the_noise(
     blurs, count = np.ones(len(sigmas)), int(free.sum())
     likeliest, best = -np.inf, ascent
     while True:
-        met = _met(objective, ascent, sigmas, errors)
+        met = _met(objective, ascent, sigmas, beside, errors)
         seen = errors_seen(met.offsets, count, known, errors)
         # offsets of a bent pose hide how small the noise is
         least = known_blurs(met.offsets.finest, known, errors)
@@ -256,6 +261,7 @@ def _met(
     objective: MatchedObjective,
     ascent: Ascent[Floats],
     sigmas: Floats,
+    beside: Floats,
     errors: ErrorRules,
 ) -> _Met:
     """How far off features are met, as the density around them shows it: v ∇C / C.
@@ -282,5 +288,6 @@ def _met(
         view.observation.narrowest(errors.narrowest, one)
         for view, one in zip(objective.views, places, strict=True)
     ]
-    offsets = Offsets(squared, shares, sensor, dimensions, np.array(finest))
+    least = np.minimum(np.maximum(errors.blur * beside, finest), 1.0)
+    offsets = Offsets(squared, shares, sensor, dimensions, least)
     return _Met(offsets, away, J, places)
