@@ -84,7 +84,9 @@ class Joint:
     def solve(self) -> None:
         """Find the poses of all members."""
         self._follow([k for k in range(len(self.members)) if self._is_trusted(k)])
-        self._look_for([k for k in range(len(self.members)) if k not in self._claims])
+        left = [k for k in range(len(self.members)) if k not in self._claims]
+        self._look_for([k for k in left if not self._is_forgotten(k)])
+        self._look_for([k for k in left if self._is_forgotten(k)])
         self._part()
         owners = self._owned()
         for k in range(len(self.members)):
@@ -182,6 +184,8 @@ class Joint:
         if self._is_forgotten(k):
             track = replace(track, branches=())
         data = tracker.data(track, self._frame, self._time_s, left.views)
+        if self._is_away(k):
+            data = replace(data, options=replace(data.options, search="live"))
         if expected is not None and self._may_share(data, left, expected):
             data = replace(data, shared=self._shared)
         if start:
@@ -242,6 +246,11 @@ class Joint:
         """Whether where the body was says nothing any more."""
         track = self.tracks[k]
         return not track.branches or track.misses > self._rules.forgotten
+
+    def _is_away(self, k: int) -> bool:
+        """Whether a body was looked for everywhere, and a look here and there will do."""
+        rules, misses = self._rules, self.tracks[k].misses
+        return misses > rules.forgotten and misses % rules.thorough != 0
 
     def _is_same(self, a: int, b: int) -> bool:
         """Whether two are identical and nothing tells which is which."""

@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
@@ -239,7 +240,8 @@ class Tracker:
         found = [
             Found(
                 one.T_world_object,
-                weight,
+                # what may be mere clutter counts as little in the next frame
+                weight * float(expit(one.log_evidence)),
                 one.spread if self.options.fuse else None,
                 np.sqrt(np.diagonal(one.covariance)) if is_timed(data.views) else None,
             )
