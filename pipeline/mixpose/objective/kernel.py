@@ -60,6 +60,14 @@ class Overlaps(NamedTuple):
     bells: Floats
     away: Floats
 
+    def of(self, k: int, n: int) -> Overlaps:
+        """The same at one of the poses, of the first n features."""
+        norm, kept = self.norm[:, k : k + 1], (self.pairs < n).all(axis=1)
+        if not kept.any():
+            return Overlaps(norm, _NO_PAIRS, norm, norm)
+        bells, away = self.bells[:, k : k + 1, kept], self.away[:, k : k + 1, kept]
+        return Overlaps(norm, self.pairs[kept], bells, away)
+
 
 def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
     """How far the predicted features overlap.
