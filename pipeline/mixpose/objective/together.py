@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Quadratic
-from mixpose.objective.matched import MatchedObjective
+from mixpose.objective.kernel import NEGLIGIBLE_BELL, Overlaps, overlaps, slopes
+from mixpose.objective.matched import Match, MatchedObjective
 from mixpose.objective.projection import BodyProjection
 from mixpose.sensors import Sensor
 
@@ -33,13 +34,12 @@ class BodiesProjection(BodyProjection):
     def __init__(self, sensors: Sequence[Sensor], bodies: Sequence[Body]) -> None:
         super().__init__(sensors, max(bodies, key=lambda body: len(body.nodes.points)))
         most = len(self.body.nodes.points)
-        self.counts = [len(body.nodes.points) for body in bodies]
-        fill = [np.minimum(np.arange(most), n) % n for n in self.counts]
-        nodes = [body.nodes for body in bodies]
-        self._points = np.array([one.points[i] for one, i in zip(nodes, fill, strict=True)])
+        self._points = np.zeros((len(bodies), most, 3))
         self._weights = np.zeros((len(bodies), most))
-        for row, one in zip(self._weights, nodes, strict=True):
-            row[: len(one.weights)] = one.weights
+        for points, weights, nodes in zip(self._points, self._weights, (b.nodes for b in bodies)):
+            points[:] = nodes.points[0]
+            points[: len(nodes.points)] = nodes.points
+            weights[: len(nodes.points)] = nodes.weights
 
 
 @lru_cache(maxsize=64)
@@ -73,23 +73,41 @@ class Together:
 
     def models(self, poses: Sequence[Floats]) -> list[Quadratic]:
         """Value, gradient and curvature of each objective at a pose (4, 4) of its own."""
-        found = self.joint.slopes(np.array(poses))
-        return [Quadratic(float(v), g, c) for v, g, c in zip(*found, strict=True)]
+        joint = self.joint
+        found = at, sampled, over = joint.match(np.array(poses))
+        scales = joint.weights / joint.energies
+        apart = over._replace(pairs=over.pairs[:0])
+        every = slopes(at, sampled, apart, joint.variances, joint.tops, scales)
+        models = [Quadratic(float(v), g, c) for v, g, c in zip(*every, strict=True)]
+        for k in self._overlapping(over):  # these step otherwise
+            own = self._own(found, k)
+            value, g, c = slopes(*own, joint.variances, joint.tops, scales[:, k : k + 1])
+            models[k] = Quadratic(float(value[0]), g[0], c[0])
+        return models
+
+    def _overlapping(self, over: Overlaps) -> list[int]:
+        """Bodies of which features overlap."""
+        if not len(over.pairs):
+            return []
+        near = over.bells > NEGLIGIBLE_BELL * self.joint.tops[..., None]
+        return np.flatnonzero(near.any(axis=(0, 2))).tolist()
 
     def match(self, poses: Sequence[Floats]) -> None:
         """Let each objective have at hand what it sees at a pose (4, 4) of its own."""
-        at, sampled, over = self.joint.match(np.array(poses))
-        counts = project_bodies(
-            self.joint.projection.sensors, tuple(one.projection.body for one in self.each)
-        ).counts
-        for k, (one, T, n) in enumerate(zip(self.each, poses, counts, strict=True)):
-            own = at.of(k, n)
-            kept = (over.pairs < n).all(axis=1)
-            pairs = over.pairs[kept]
-            norm = over.norm[:, k : k + 1]
-            bells, away = norm, norm
-            if len(pairs):
-                bells, away = over.bells[:, k : k + 1, kept], over.away[:, k : k + 1, kept]
-            one.last[:] = [
-                (T, (own, sampled[:, k : k + 1, :n], type(over)(norm, pairs, bells, away)))
-            ]
+        found = self.joint.match(np.array(poses))
+        for k, (one, T) in enumerate(zip(self.each, poses, strict=True)):
+            one.last[:] = [(T, self._own(found, k))]
+
+    def _own(self, found: Match, k: int) -> Match:
+        """What one of the bodies has of what all match."""
+        at, sampled, over = found
+        n = len(self.each[k].projection.body.nodes.points)
+        own, norm = at.of(k, n), over.norm[:, k : k + 1]
+        if len(over.pairs):
+            joint = self.joint
+            return (
+                own,
+                sampled[:, k : k + 1, :n],
+                overlaps(own.y, own.weights, joint.variances, joint.tops),
+            )
+        return own, sampled[:, k : k + 1, :n], over._replace(norm=norm, bells=norm, away=norm)
