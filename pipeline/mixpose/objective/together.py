@@ -80,7 +80,7 @@ class Together:
         every = slopes(at, sampled, apart, joint.variances, joint.tops, scales)
         models = [Quadratic(float(v), g, c) for v, g, c in zip(*every, strict=True)]
         for k in self._overlapping(over):  # these step otherwise
-            own = self._own(found, k)
+            own = self._own(found, k, alone=False)
             value, g, c = slopes(*own, joint.variances, joint.tops, scales[:, k : k + 1])
             models[k] = Quadratic(float(value[0]), g[0], c[0])
         return models
@@ -95,19 +95,20 @@ class Together:
     def match(self, poses: Sequence[Floats]) -> None:
         """Let each objective have at hand what it sees at a pose (4, 4) of its own."""
         found = self.joint.match(np.array(poses))
+        overlapping = self._overlapping(found[2])
         for k, (one, T) in enumerate(zip(self.each, poses, strict=True)):
-            one.last[:] = [(T, self._own(found, k))]
+            one.last[:] = [(T, self._own(found, k, alone=k not in overlapping))]
 
-    def _own(self, found: Match, k: int) -> Match:
-        """What one of the bodies has of what all match."""
+    def _own(self, found: Match, k: int, *, alone: bool) -> Match:
+        """What one of the bodies has of what all match; none of its features overlap if alone."""
         at, sampled, over = found
         n = len(self.each[k].projection.body.nodes.points)
         own, norm = at.of(k, n), over.norm[:, k : k + 1]
-        if len(over.pairs):
+        if not alone:
             joint = self.joint
             return (
                 own,
                 sampled[:, k : k + 1, :n],
                 overlaps(own.y, own.weights, joint.variances, joint.tops),
             )
-        return own, sampled[:, k : k + 1, :n], over._replace(norm=norm, bells=norm, away=norm)
+        return own, sampled[:, k : k + 1, :n], Overlaps(norm, over.pairs[:0], norm, norm)

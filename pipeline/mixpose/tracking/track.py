@@ -101,6 +101,8 @@ class Track:
         Whether another body of the scene may have what the last pose meets.
     agreed : bool
         Whether two sensors met most of the body in some frame.
+    known : bool
+        Whether the body was told from things that have three markers alike.
     clutter : StaticClutter
         What stayed where it was while the body was lost.
     """
@@ -116,6 +118,7 @@ class Track:
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
     agreed: bool = False
+    known: bool = False
     clutter: StaticClutter = StaticClutter()
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
