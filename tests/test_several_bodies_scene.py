@@ -250,7 +250,7 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
     fresh = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
     together.match(poses)
     for one, other, T in zip(each, fresh, poses, strict=True):
-        assert one.last[0][0] is T
+        assert one.at_hand[0][0] is T
         at_hand, sampled, over = one.match(T[None])
         seen, looked_up, apart = other.match(T[None])
         np.testing.assert_allclose(at_hand.y, seen.y)

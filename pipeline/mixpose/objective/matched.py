@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
 from mixpose.objective.base import Quadratic, View
-from mixpose.objective.kernel import Overlaps, Slopes, overlaps, slopes
-from mixpose.objective.projection import BodyProjection, Projected, project_body
+from mixpose.objective.kernel import Match, Slopes, overlaps, slopes
+from mixpose.objective.projection import BodyProjection, project_body
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -33,6 +33,7 @@ what the best centres of blobs err by."""
 
 FINE_STEPS = 48.0
 """The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
+
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
@@ -45,9 +46,6 @@ def look_up_error(steps_per_sigma: float) -> float:
 def value_error(steps_per_sigma: float) -> float:
     """Relative error of looked-up values: along each of two axes, and squared."""
     return 4 * look_up_error(steps_per_sigma)
-
-
-Match: TypeAlias = tuple[Projected, Floats, Overlaps]
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +68,8 @@ class MatchedObjective:
         ⟨g, g⟩.
     weights : (L, 1) float64
         ω_l.
-    last : list of (pose, Match)
-        The last lone pose, and what is seen there: where a fit ends is where it is judged.
+    at_hand : list of (pose, Match)
+        Where several bodies were looked up at once: the body's pose, and what it has there.
     """
 
     views: tuple[View, ...]
@@ -81,7 +79,7 @@ class MatchedObjective:
     tops: Floats
     energies: Floats
     weights: Floats
-    last: list[tuple[Floats, Match]] = field(default_factory=list, init=False)
+    at_hand: list[tuple[Floats, Match]] = field(default_factory=list, init=False)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
@@ -106,32 +104,26 @@ class MatchedObjective:
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
 
     def match(self, poses: Floats) -> Match:
-        """The predicted features at poses (H, 4, 4), C with its gradient there, and ⟨h, h⟩."""
-        if len(poses) == 1 and self.last and np.array_equal(poses[0], self.last[0][0]):
-            return self.last[0][1]
+        """What is predicted at poses (H, 4, 4), and what is there."""
+        if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0][0]):
+            return self.at_hand[0][1]
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
-        found = at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
-        if len(poses) == 1:
-            self.last[:] = [(poses[0].copy(), found)]
-        return found
+        return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
-        if len(poses) == 1:
-            return self._slopes(poses)
-        parts = [self._slopes(some) for some in self._blocks(poses)]
+        parts = [self._slopes(self.match(some)) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _slopes(self, poses: Floats) -> Slopes:
-        at, sampled, over = self.match(poses)
-        scales = self.weights / self.energies
-        return slopes(at, sampled, over, self.variances, self.tops, scales)
+    def _slopes(self, match: Match) -> Slopes:
+        return slopes(*match, self.variances, self.tops, self.weights / self.energies)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and curvature at one pose (4, 4)."""
-        value, gradient, curvature = self.slopes(T_world_object[None])
-        return Quadratic(float(value[0]), gradient[0], curvature[0])
+        match = self.match(T_world_object[None])
+        value, gradient, curvature = self._slopes(match)
+        return Quadratic(float(value[0]), gradient[0], curvature[0], match=match)
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Quadratic
-from mixpose.objective.kernel import NEGLIGIBLE_BELL, Overlaps, overlaps, slopes
-from mixpose.objective.matched import Match, MatchedObjective
+from mixpose.objective.kernel import NEGLIGIBLE_BELL, Match, Overlaps, overlaps, slopes
+from mixpose.objective.matched import MatchedObjective
 from mixpose.objective.projection import BodyProjection
 from mixpose.sensors import Sensor
 
@@ -77,12 +77,20 @@ class Together:
         found = at, sampled, over = joint.match(np.array(poses))
         scales = joint.weights / joint.energies
         apart = over._replace(pairs=over.pairs[:0])
-        every = slopes(at, sampled, apart, joint.variances, joint.tops, scales)
-        models = [Quadratic(float(v), g, c) for v, g, c in zip(*every, strict=True)]
-        for k in self._overlapping(over):  # these step otherwise
-            own = self._own(found, k, alone=False)
-            value, g, c = slopes(*own, joint.variances, joint.tops, scales[:, k : k + 1])
-            models[k] = Quadratic(float(value[0]), g[0], c[0])
+        values, gradients, curvatures = slopes(
+            at, sampled, apart, joint.variances, joint.tops, scales
+        )
+        overlapping = self._overlapping(over)
+        models = []
+        for k in range(len(poses)):
+            own = self._own(found, k, alone=k not in overlapping)
+            if k in overlapping:  # it steps otherwise
+                terms = joint.variances, joint.tops, scales[:, k : k + 1]
+                lone = slopes(*own, *terms)
+                models.append(Quadratic(float(lone[0][0]), lone[1][0], lone[2][0], match=own))
+                continue
+            value = float(values[k])
+            models.append(Quadratic(value, gradients[k], curvatures[k], match=own))
         return models
 
     def _overlapping(self, over: Overlaps) -> list[int]:
@@ -97,7 +105,7 @@ class Together:
         found = self.joint.match(np.array(poses))
         overlapping = self._overlapping(found[2])
         for k, (one, T) in enumerate(zip(self.each, poses, strict=True)):
-            one.last[:] = [(T, self._own(found, k, alone=k not in overlapping))]
+            one.at_hand[:] = [(T, self._own(found, k, alone=k not in overlapping))]
 
     def _own(self, found: Match, k: int, *, alone: bool) -> Match:
         """What one of the bodies has of what all match; none of its features overlap if alone."""
@@ -106,9 +114,7 @@ class Together:
         own, norm = at.of(k, n), over.norm[:, k : k + 1]
         if not alone:
             joint = self.joint
-            return (
-                own,
-                sampled[:, k : k + 1, :n],
-                overlaps(own.y, own.weights, joint.variances, joint.tops),
-            )
-        return own, sampled[:, k : k + 1, :n], Overlaps(norm, over.pairs[:0], norm, norm)
+            over = overlaps(own.y, own.weights, joint.variances, joint.tops)
+        else:
+            over = Overlaps(norm, over.pairs[:0], norm, norm)
+        return Match(own, sampled[:, k : k + 1, :n], over)
