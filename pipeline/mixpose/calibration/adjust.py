@@ -1,7 +1,9 @@
 """Maximise the matched objective over rig and poses, through narrowing blurs.
 
 At each blur the objective is climbed by Gauss-Newton; the blurs end at twice the noise that the
-residuals show, which is learnt on the way.
+residuals show, which is learnt on the way.  Pairs are known by then, and the last steps weigh them
+as Cauchy errors: where sensors are out of step, a frame that is far off is less wrong than it is
+far, and a Gaussian kernel would drop it.
 """
 
 from __future__ import annotations
@@ -107,12 +109,11 @@ def adjust(
             break
         blur = np.maximum(blur * rules.narrowing, last)
     for _ in range(rules.last_steps):
-        blur = rules.blur * learnt
-        weighted, _ = _weighted(bundle, rig, poses, blur, learnt, rules)
+        weighted, _ = _weighted(bundle, rig, poses, rules.blur * learnt, learnt, rules, last=True)
         rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
         before = learnt
         if noise is None:
-            learnt = _noise(bundle, rig, poses, blur, sigmas, rules)
+            learnt = _noise(bundle, rig, poses, rules.blur * learnt, sigmas, rules)
         if size < rules.converged and np.allclose(before, learnt, rtol=1e-3):
             break
     return _finished(bundle, rig, poses, gauge_of, learnt, rules)
@@ -125,16 +126,22 @@ def _weighted(
     blur: Floats,
     noise: Floats,
     rules: CalibrationRules,
+    *,
+    last: bool = False,
 ) -> tuple[list[Weighted], list[Floats]]:
     """Pairs of all sensors, weighted by the objective and the noise; and by the objective alone."""
     found: list[Weighted] = []
     alone: list[Floats] = []
+    faintest = rules.faintest_last if last else rules.faintest
     for sensor in range(len(rig.sensors)):
-        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], rules.faintest)
+        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], faintest)
         rows = rows_of(bundle, rig, poses, sensor, pairs)
         squared = (rows.residual**2).sum(axis=1)
-        weight = pairs.share * np.exp(-squared / (4 * blur[sensor] ** 2)) * rows.known
+        share = pairs.share * rows.known
+        weight = share * np.exp(-squared / (4 * blur[sensor] ** 2))
         alone.append(weight)
+        if last:
+            weight = share / (1 + squared / (rules.tail * noise[sensor]) ** 2)
         found.append((sensor, pairs, rows, weight / noise[sensor] ** 2))
     return found, alone
 
@@ -209,19 +216,32 @@ def _finished(
     noise: Floats,
     rules: CalibrationRules,
 ) -> Adjusted:
-    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules)
+    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
     normal = normal_equations(bundle, len(poses), weighted, 0.0)
     step = solved(bundle, normal, gauge_of(rig), len(poses))
-    m = float(np.mean([eye.dimension for eye in rig.sensors]))
-    a = 1 / (2 * rules.blur) ** 2
-    # of an M-estimator whose weights are Gaussian, against the inverse of its curvature
-    covariance = step.covariance * (1 + 2 * a) ** (m / 2 + 2) / (1 + 4 * a) ** (m / 2 + 1)
+    dimension = float(np.mean([eye.dimension for eye in rig.sensors]))
+    covariance = step.covariance * _of_cauchy(dimension, rules.tail)
     inflation = _inflation(bundle, weighted, covariance, len(poses))
     parts = tuple(
         (pairs, rows.residual, weight)
         for (_, pairs, rows, _), weight in zip(weighted, alone, strict=True)
     )
     return Adjusted(rig, poses, noise, covariance * inflation, step.unknown, parts, inflation)
+
+
+def _of_cauchy(dimension: float, tail: float) -> float:
+    """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations.
+
+    Of Gaussian errors with radius r in units of their deviation, whose weight is w = 1/(1 + r²/c²):
+    E[w² r²/m] E[w] / E[w + w' r/m]².
+    """
+    r = np.linspace(0, 10, 2001)
+    density = r ** (dimension - 1) * np.exp(-(r**2) / 2)
+    density /= density.sum()
+    weight = 1 / (1 + (r / tail) ** 2)
+    slope = weight - 2 * (r / tail) ** 2 * weight**2 / dimension
+    spread = density @ (weight * r) ** 2 / dimension
+    return float(spread * (density @ weight) / (density @ slope) ** 2)
 
 
 def _inflation(

@@ -230,8 +230,8 @@ class _Run:
                 told += [none, none]
                 continue
             bundle = self._bundle(part, ())
-            told.append(residuals_of(bundle, task.rig, fit.poses, fit, climb=True))
-            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit, climb=False))
+            told.append(residuals_of(bundle, task.rig, fit.poses, fit))
+            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit))
         return {s: Residual(*(each[s] for each in told)) for s in none}
 
     def _told(

@@ -13,8 +13,13 @@ class CalibrationRules:
 
     blur: float = constant(
         2.0,
-        "last blur by the noise that residuals show: the maximum of the objective is then 97 % as "
-        "precise as least squares, and a detection 6 standard deviations off has no pull",
+        "last blur by the noise that residuals show: a detection between two features 6 standard "
+        "deviations apart is shared",
+    )
+    tail: float = constant(
+        3.0,
+        "scale of the Cauchy weights of the last steps, by the noise: 97 % as precise as least "
+        "squares where errors are Gaussian",
     )
     narrowing: float = constant(0.5, "of a blur to the next: halving loses no frame of any case")
     first_blur: float = constant(2.0, "of the median distance to the nearest feature at the start")
@@ -23,6 +28,9 @@ class CalibrationRules:
     last_steps: int = constant(40, "most at the last blur; most cases need 6")
     converged: float = constant(1e-3, "standard deviations moved in a step: then it is the last")
     faintest: float = constant(0.02, "weight below which a pair of detection and feature is left")
+    faintest_last: float = constant(
+        1e-6, "the same in the last steps: 15 standard deviations, whose Cauchy weight is 0.04"
+    )
     margin: float = constant(12.0, "log-odds behind the best pose of a sensor: less likely is none")
     hypotheses: int = constant(6, "poses kept for a sensor's frame: flat bodies have two or four")
     turn_deg: float = constant(
