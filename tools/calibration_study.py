@@ -4,11 +4,11 @@
                                       [--free pose,delay] [--workers 2 | --scheduler ADDRESS]
 
 Each rig has two cameras about a body of seven markers, of which the second is believed to stand
-2 degrees and 20 mm from where it does (and to have another lens and clock, where those are free), or
-with ``--free position`` three range sensors, each believed to be 30 mm off.  Some detections are
-hidden, some false.  Printed are errors; the share of the true parameters that the 95 % intervals
-hold; and errors over the least that they can be, the Cramer-Rao bound of who knows which detection is
-which marker, by numerical derivatives of OpenCV's projection.
+2 degrees and 20 mm from where it does (and to have another lens and clock where those are free);
+with ``--free position`` it has three range sensors, each believed to be 30 mm off.  Some detections
+are hidden, some false.  Printed are errors; the share of the true parameters that the 95 %
+intervals hold; and errors over the least that they can be, the Cramer-Rao bound of who knows which
+detection is which marker, by numerical derivatives of OpenCV's projection.
 """
 
 from __future__ import annotations
@@ -288,7 +288,8 @@ def told(outcomes: Sequence[Outcome], case: Case) -> None:
     deviations = np.array([one.deviations for one in outcomes])
     bounds = np.array([one.bound for one in outcomes])
     print(
-        f"{len(errors)} rigs of {case.frames} frames, {case.noise:g} noise, free: {','.join(case.free)}"
+        f"{len(errors)} rigs of {case.frames} frames, {case.noise:g} noise, "
+        f"free: {','.join(case.free)}"
     )
     parts = [("shift, mm", slice(0, 3), 1.0)]
     parts += [] if "position" in case.free else [("turn, deg", slice(3, 6), 180 / np.pi)]

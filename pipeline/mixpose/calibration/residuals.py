@@ -18,9 +18,7 @@ _MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
 _CLIMBS = 12
 
 
-def residuals_of(
-    bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted
-) -> dict[int, float]:
+def residuals_of(bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted) -> dict[int, float]:
     """Root mean square residual of each sensor over the pairs that a calibration met.
 
     Poses are fitted to the rig by least squares first, so that two rigs are held to the same.

@@ -27,6 +27,14 @@ class CalibrationRules:
     steps: int = constant(4, "Gauss-Newton steps at each blur but the last")
     last_steps: int = constant(40, "most at the last blur; most cases need 6")
     converged: float = constant(1e-3, "standard deviations moved in a step: then it is the last")
+    alike: float = constant(
+        20.0, "coordinates of a sensor by which its own noise weighs as much as that of its kind"
+    )
+    unlike: float = constant(
+        1.4,
+        "times the noise of its kind that a sensor's may be, or that may be its, where errors of "
+        "detections are independent",
+    )
     faintest: float = constant(0.02, "weight below which a pair of detection and feature is left")
     faintest_last: float = constant(
         1e-6, "the same in the last steps: 15 standard deviations, whose Cauchy weight is 0.04"
@@ -52,6 +60,9 @@ class CalibrationRules:
         (1.0, 2.5, 6.0),
         "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "
         "adjusted: sensors 30 mm off need the second where σ_ε is 5 mm",
+    )
+    probes: int = constant(
+        10, "frames by which that blur is chosen where each is searched by itself: 0.7 s each"
     )
     failed: float = constant(
         1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"

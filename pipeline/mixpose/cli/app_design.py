@@ -56,6 +56,17 @@ def design(
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write all numbers here.")] = None,
     plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
+    workers: Annotated[
+        int, typer.Option(min=1, help="How many poses are simulated at a time.")
+    ] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Simulate on a dask.distributed cluster: the address of its scheduler, or local "
+            "for one on this machine.",
+        ),
+    ] = None,
 ) -> None:
     """Predict the accuracy of planned systems, side by side, and what would improve them."""
     from mixpose.cli.design import DesignRequest, design_sessions  # noqa: PLC0415
@@ -72,5 +83,7 @@ def design(
         tolerance=tolerance,
         json=json,
         plot=plot,
+        workers=workers,
+        scheduler=scheduler,
     )
     design_sessions(sessions, request)
