@@ -49,7 +49,10 @@ class CalibrationRules:
     least_link: int = constant(2, "frames that must agree on where two sensors stand")
     held_back: float = constant(0.2, "of the frames, whose residual is that of unseen data")
     least_frames: int = constant(4, "left to calibrate from, else none is held back")
-    most_candidates: int = constant(240, "frames taken: a longer recording is thinned out evenly")
+    most_read: int = constant(720, "frames read: a longer recording is thinned out evenly")
+    most_candidates: int = constant(
+        240, "of them are searched: those that add most information; a camera's takes 0.1 to 1 s"
+    )
     least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
     undetermined: float = constant(
         0.25,
