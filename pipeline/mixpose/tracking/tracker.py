@@ -258,7 +258,9 @@ class Tracker:
             motion,
             self.rules.course,
         )
-        if verdict.status != "ok":
+        # sensors whose delays are not known contradict each other until they are
+        late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
+        if verdict.status != "ok" and not late:
             return followed
         return replace(followed, delays=_delays(data, best, frame))
 
@@ -305,7 +307,7 @@ def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
     expected = data.expected(T) if timed else data.steady(T)
     if not expected.gain.any():
         return before
-    seen = data.offsets(T, used)
+    seen = data.offsets(T, found=used)
     names = [one.name for one in used]
     views = [view for view in data.views if view.name in names]
     rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
