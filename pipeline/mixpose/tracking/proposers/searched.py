@@ -9,7 +9,7 @@ from functools import partial
 from mixpose.judgement import Judged
 from mixpose.search import Candidate, search_frame
 from mixpose.tracking.likelihood import FrameData, Start
-from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.predicted import is_doubtful
 
 
 def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
@@ -48,6 +48,8 @@ def candidates_of(data: FrameData) -> list[Candidate]:
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
-    """Where fits of candidates begin."""
+    """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
     close = data.start_uncertainty / data.rules.proposals.narrowing**2
-    return [Start(one.T_world_object, close) for one in candidates]
+    for one in candidates:
+        yield Start(one.T_world_object)
+        yield Start(one.T_world_object, close)
