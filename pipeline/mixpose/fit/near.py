@@ -91,7 +91,7 @@ def fit_near(
     *,
     finest: MatchedObjective | None = None,
     noise: Sequence[Noise] | None = None,
-    least: Floats | None = None,
+    beside: float = 0.0,
     errors: ErrorRules = ErrorRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
@@ -112,8 +112,8 @@ def fit_near(
         At σ_ε, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
-    least : (L,) array or None
-        Standard deviation of what else features of each view are off by, in σ_ε.
+    beside : float
+        Standard deviation of what else features are off by, in σ_ε.
     errors : ErrorRules
     rules : FitRules
     """
@@ -130,7 +130,6 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     if matched and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
-        beside = np.zeros(len(views)) if least is None else least
         ascent = _to_the_noise(views, body, ascent, free, finest, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
@@ -172,7 +171,7 @@ def _to_the_noise(
     free: NDArray[np.bool_],
     finest: MatchedObjective | None,
     noise: Sequence[Noise],
-    beside: Floats,
+    beside: float,
     errors: ErrorRules,
     rules: FitRules,
 ) -> Ascent[Floats]:
