@@ -13,7 +13,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.proposal_rules import ProposalRules
+from mixpose.tracking.rules import ProposalRules
 
 Floats = NDArray[np.float64]
 
