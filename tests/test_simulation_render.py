@@ -15,14 +15,14 @@ from mixpose.simulation.render import (
     render_image,
     render_profile,
 )
-from mixpose.simulation.sighting import Sighting
+from mixpose.simulation.visible_spots import VisibleSpots
 
 Floats = NDArray[np.float64]
 
 
-def sighting_of(points: Floats, levels: Floats | None = None) -> Sighting:
+def spots_at(points: Floats, levels: Floats | None = None) -> VisibleSpots:
     levels = np.ones(len(points)) if levels is None else levels
-    return Sighting(points, levels, np.arange(len(points)))
+    return VisibleSpots(points, levels, np.arange(len(points)))
 
 
 def centroid(image: NDArray[np.generic]) -> Floats:
@@ -60,7 +60,10 @@ def test_centroid_survives_eight_bits() -> None:
     errors = []
     for point in np.random.default_rng(2).uniform(20, 21, (40, 2)):
         image = render_image(
-            sighting_of(point[None]), ImageFormat((42, 42), 1.6), options, np.random.default_rng(0)
+            spots_at(point[None]),
+            ImageFormat((42, 42), 1.6),
+            options,
+            np.random.default_rng(0),
         )
         assert image.dtype == np.uint8
         errors.append(centroid(image) - point)
@@ -70,13 +73,13 @@ def test_centroid_survives_eight_bits() -> None:
 
 def test_noise_has_the_variance_of_pixels_plus_photons_plus_rounding() -> None:
     options = SimulationOptions(frames=1, background=20, noise=3.0, shot_noise=0.1)
-    empty = sighting_of(np.zeros((0, 2)))
+    empty = spots_at(np.zeros((0, 2)))
     image = render_image(empty, ImageFormat((400, 400), 1.6), options, np.random.default_rng(0))
     assert image.mean() == pytest.approx(20, abs=0.05)
     assert image.var() == pytest.approx(3.0**2 + 1 / 12, rel=0.02)
     # a spot so wide that it is flat in its middle: 100 levels add 10 to the variance
     bright = SimulationOptions(frames=1, background=20, noise=3.0, shot_noise=0.1, brightness=100)
-    seen = sighting_of(np.array([[200.0, 200.0]]))
+    seen = spots_at(np.array([[200.0, 200.0]]))
     flat = ImageFormat((400, 400), 4000.0)
     lit = render_image(seen, flat, bright, np.random.default_rng(0))
     assert lit.mean() == pytest.approx(120, abs=0.3)
@@ -85,7 +88,7 @@ def test_noise_has_the_variance_of_pixels_plus_photons_plus_rounding() -> None:
 
 def test_dark_features_are_the_negative_of_bright_ones() -> None:
     options = SimulationOptions(frames=1)
-    seen = sighting_of(np.array([[12.0, 9.0]]))
+    seen = spots_at(np.array([[12.0, 9.0]]))
     forms = ImageFormat((32, 24), 1.6), ImageFormat((32, 24), 1.6, "dark")
     bright, dark = (render_image(seen, f, options, np.random.default_rng(5)) for f in forms)
     assert np.array_equal(bright, 255 - dark)
@@ -94,7 +97,7 @@ def test_dark_features_are_the_negative_of_bright_ones() -> None:
 
 def test_what_is_too_bright_is_white() -> None:
     options = SimulationOptions(frames=1, brightness=400)
-    seen = sighting_of(np.array([[12.0, 9.0]]))
+    seen = spots_at(np.array([[12.0, 9.0]]))
     image = render_image(seen, ImageFormat((32, 24), 1.6), options, np.random.default_rng(5))
     assert image.max() == 255
 
@@ -109,7 +112,7 @@ def test_profile_peaks_have_their_place_and_their_area() -> None:
 def test_profile_bins_count_from_range_min() -> None:
     options = SimulationOptions(frames=1, range_snr=1e6)
     form = ProfileFormat(bins=100, range_min=700.0, bin_size=0.5, width=4.0)
-    seen = sighting_of(np.array([[731.0]]))
+    seen = spots_at(np.array([[731.0]]))
     profile = render_profile(seen, form, options, np.random.default_rng(0))
     ranges = 700.0 + 0.5 * np.arange(100)
     assert profile.dtype == np.float32
@@ -120,7 +123,7 @@ def test_profile_bins_count_from_range_min() -> None:
 def test_profile_noise_is_one_over_the_signal_to_noise_ratio() -> None:
     options = SimulationOptions(frames=1, range_snr=5.0)
     form = ProfileFormat(bins=20000, range_min=0.0, bin_size=1.0, width=1.0)
-    empty = sighting_of(np.zeros((0, 1)))
+    empty = spots_at(np.zeros((0, 1)))
     profile = render_profile(empty, form, options, np.random.default_rng(0))
     # the half below 0 is cut off: the mean square is half the variance
     assert profile.min() == 0

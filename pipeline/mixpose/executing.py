@@ -90,7 +90,7 @@ def in_threads(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def in_processes(workers: int | None = None) -> Iterator[Executor]:
-    """The same in processes, as many as there are processors if not said: for tasks that reckon.
+    """The same in processes, as many as there are processors if not said: for tasks that compute.
 
     The linear algebra of each has one thread.
     """

@@ -7,21 +7,21 @@ from mutation.mutant import Mutant
 _SIMULATION = (
     Mutant(
         "simulation-averted-features-are-seen",
-        "simulation/sighting.py",
+        "simulation/visible_spots.py",
         "* sensor.towards(points)).sum(axis=-1) > 0)",
         "* sensor.towards(points)).sum(axis=-1) < 0)",
         "recordings show the back of the body",
     ),
     Mutant(
         "simulation-nothing-hidden-for-certain",
-        "simulation/sighting.py",
+        "simulation/visible_spots.py",
         "hidden[rng.permutation(count)[: options.hidden_count]] = True",
         "hidden[rng.permutation(count)[:0]] = True",
         "hidden_count does nothing",
     ),
     Mutant(
         "simulation-deformed-in-world-axes",
-        "simulation/sighting.py",
+        "simulation/visible_spots.py",
         "M[:3, 3] += M[:3, :3] @ offset",
         "M[:3, 3] += offset",
         "features are displaced by another spread than the body's once it turns",
@@ -78,8 +78,8 @@ _SIMULATION = (
     Mutant(
         "simulation-profiles-begin-at-zero",
         "simulation/render.py",
-        "(sighting.points[:, 0] - form.range_min) / form.bin_size",
-        "sighting.points[:, 0] / form.bin_size",
+        "(visible.points[:, 0] - form.range_min) / form.bin_size",
+        "visible.points[:, 0] / form.bin_size",
         "peaks are beside their ranges by range_min",
     ),
     Mutant(
@@ -98,7 +98,7 @@ _SIMULATION = (
     ),
     Mutant(
         "simulation-false-features-in-one-half",
-        "simulation/sighting.py",
+        "simulation/visible_spots.py",
         "rng.uniform(view.lowest, view.highest,",
         "rng.uniform(view.lowest, view.highest / 2,",
         "clutter is thinner where the body is",

@@ -1,4 +1,4 @@
-"""Mutants of what reckons with poses: `rigid`, `records`, `sensors`, `body`, `optimise`."""
+"""Mutants of what computes with poses: `rigid`, `records`, `sensors`, `body`, `optimise`."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ NUMBERS = ("φ1 °", "φ2 °", "φ3 °", "w1", "w2", "w3")
 def collect(runs: int, seed: int, scheduler: str | None = None) -> list[Errors]:
     """Errors of all runs, in order, with a progress bar on a terminal.
 
-    They are reckoned here on all cores, or on the cluster of a scheduler.
+    They are computed here on all cores, or on the cluster of a scheduler.
     """
     return in_order(partial(run, seed), range(runs), "runs", scheduler)
 

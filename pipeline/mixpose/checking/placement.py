@@ -13,7 +13,7 @@ from mixpose.rigid import Floats, inverse, rotation_angle_deg, transform
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.sensors.base import Mask
 from mixpose.session import SensorSetup, Session
-from mixpose.simulation.sighting import facing
+from mixpose.simulation.visible_spots import facing
 
 Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
 

@@ -23,7 +23,7 @@ from mixpose.records import Floats, PointPattern, RawFrame
 
 _COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
 
-# Squares of larger numbers, and shares of smaller weights, can't be reckoned with.
+# Squares of larger numbers overflow; shares of smaller weights are lost beside others.
 _LARGEST = 1e12
 _SMALLEST_WEIGHT = 1e-12
 

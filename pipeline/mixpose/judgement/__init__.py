@@ -16,7 +16,7 @@ from mixpose.judgement.contradiction import APART, contradict
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,
-    Sighting,
+    SensorMatches,
     flat_prior,
     odds_of,
     paid_by_count,
@@ -35,7 +35,7 @@ __all__ = [
     "NoiseModel",
     "Prior",
     "Residuals",
-    "Sighting",
+    "SensorMatches",
     "Verdict",
     "associate",
     "beliefs",

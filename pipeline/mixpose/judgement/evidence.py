@@ -92,7 +92,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class SensorMatches:
     """What one sensor has at the N features of a body at H poses.
 
     Attributes
@@ -172,8 +172,8 @@ def log_evidence(
     """
     if not any(one.met for one in associations):
         return -np.inf
-    sightings = _sightings(associations, variances)
-    odds = odds_of(sightings, np.ones(1), size, detection)
+    matches = _matches_of(associations, variances)
+    odds = odds_of(matches, np.ones(1), size, detection)
     unseen = sum(one.unseen for one in associations) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
@@ -182,17 +182,17 @@ def log_evidence(
     by_volume = float(odds.gained[0] + odds.missed[0]) + laplace + prior.log_density
     if not detection.by_count:
         return by_volume
-    return max(by_volume, float(paid_by_count(odds, sightings, free)[0]))
+    return max(by_volume, float(paid_by_count(odds, matches, free)[0]))
 
 
 def odds_of(
-    sightings: Sequence[Sighting], variance: Floats, size: float, detection: DetectionModel
+    matches: Sequence[SensorMatches], variance: Floats, size: float, detection: DetectionModel
 ) -> Odds:
     """Odds of H poses against clutter, as if they had not been chosen to fit.
 
     Parameters
     ----------
-    sightings : sequence of Sighting
+    matches : sequence of SensorMatches
         One per sensor.
     variance : (H,) array
         Of offsets, in σ_ε².
@@ -200,10 +200,10 @@ def odds_of(
         Of the body, length units.
     detection : DetectionModel
     """
-    shape = sightings[0].weights.shape
+    shape = matches[0].weights.shape
     gained, missed, coordinates = np.zeros((3, *shape))
     near: list[NDArray[np.bool_]] = []
-    for one in sightings:
+    for one in matches:
         m = one.offsets.shape[2]
         squares = (one.offsets**2).sum(axis=2)
         density = one.crowd * (2 * np.pi * variance) ** (m / 2)
@@ -216,7 +216,7 @@ def odds_of(
         near.append((gain > 0) & (m == 2))
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
-        space, share = _in_space(sightings, near, together, variance, size)
+        space, share = _in_space(matches, near, together, variance, size)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -226,7 +226,7 @@ def odds_of(
 
 
 def _in_space(
-    sightings: Sequence[Sighting],
+    matches: Sequence[SensorMatches],
     near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
     variance: Floats,
@@ -239,7 +239,7 @@ def _in_space(
     A = np.tile(np.eye(3) / size**2, (len(chosen[0]), 1, 1))
     b, share = np.zeros((len(A), 3)), np.zeros(len(A))
     log_rarity = np.full(len(A), -np.inf)
-    for one, is_near in zip(sightings, near, strict=True):
+    for one, is_near in zip(matches, near, strict=True):
         if one.offsets.shape[2] != 2:
             continue
         J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
@@ -256,19 +256,19 @@ def _in_space(
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
 
 
-def paid_by_count(odds: Odds, sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floats:
+def paid_by_count(odds: Odds, matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> Floats:
     """Evidence (H,) of poses that pay for their freedom by the features that fix them."""
     spare = 1.0 - int(free.sum()) / np.maximum(odds.coordinates, 1.0)
     return np.asarray(
-        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(sightings, free)
+        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(matches, free)
     )
 
 
-def _log_choices(sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floats:
+def _log_choices(matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> Floats:
     """Logarithm (H,) of the number of ways to fix a pose by observed features."""
-    expected = np.array([one.weights.sum(axis=1) for one in sightings])
-    counts = np.array([[one.count] for one in sightings])
-    pins = -(-int(free.sum()) // max(one.offsets.shape[2] for one in sightings))
+    expected = np.array([one.weights.sum(axis=1) for one in matches])
+    counts = np.array([[one.count] for one in matches])
+    pins = -(-int(free.sum()) // max(one.offsets.shape[2] for one in matches))
     observed = np.maximum((counts * (expected > 0)).sum(axis=0), pins)
     features = np.maximum(expected.max(axis=0), pins)
     ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
@@ -276,7 +276,7 @@ def _log_choices(sightings: Sequence[Sighting], free: NDArray[np.bool_]) -> Floa
     return np.asarray(ways + assigned + math.log(2))
 
 
-def _sightings(associations: Sequence[Association], variances: Floats) -> list[Sighting]:
+def _matches_of(associations: Sequence[Association], variances: Floats) -> list[SensorMatches]:
     """Associations of one pose, each feature in a column of its own.
 
     Their noise stands in the place of σ_ε, so that their variance is 1.
@@ -293,7 +293,7 @@ def _sightings(associations: Sequence[Association], variances: Floats) -> list[S
         offsets[0, one.features] = one.offsets / unit
         by_world[0, one.features] = one.J[..., :3] / unit
         crowd = np.array([one.crowd * unit**m])
-        found.append(Sighting(weights, shares, offsets, by_world, crowd, one.count))
+        found.append(SensorMatches(weights, shares, offsets, by_world, crowd, one.count))
     return found
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.density import AssociationRules, ErrorRules
-from mixpose.judgement import DetectionModel, Sighting, odds_of, paid_by_count
+from mixpose.judgement import DetectionModel, SensorMatches, odds_of, paid_by_count
 from mixpose.rigid import transform
 from mixpose.search.detections import SensorDetections
 from mixpose.sensors import facing
@@ -40,22 +40,22 @@ def evidence(
     gate : float
         Within which a detection is met, in σ_ε.
     """
-    sightings = [_sighting(one, body, poses, gate) for one in detections if len(one.points)]
+    matches = [_matches_of(one, body, poses, gate) for one in detections if len(one.points)]
     squares, coordinates, met = np.zeros((3, len(poses)))
-    for one in sightings:
+    for one in matches:
         squares += (one.offsets**2).sum(axis=(1, 2))
         found = one.shares.sum(axis=1)
         coordinates += one.offsets.shape[2] * found
-        met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(sightings)
+        met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(matches)
     spare = np.maximum(coordinates - free.sum(), 0.0)
     degrees = _ERRORS.typical_degrees
     variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
-    odds = odds_of(sightings, variance, 2 * body.radius, _DETECTION)
-    return paid_by_count(odds, sightings, free), met
+    odds = odds_of(matches, variance, 2 * body.radius, _DETECTION)
+    return paid_by_count(odds, matches, free), met
 
 
-def _sighting(seen: SensorDetections, body: Body, poses: Floats, gate: float) -> Sighting:
+def _matches_of(seen: SensorDetections, body: Body, poses: Floats, gate: float) -> SensorMatches:
     sensor, points, sigma = seen.view.sensor, seen.points, seen.sigma
     world = transform(poses, body.means)
     y, by_world, visible = sensor.linearise(world)
@@ -72,7 +72,7 @@ def _sighting(seen: SensorDetections, body: Body, poses: Floats, gate: float) ->
     shares[pose, feature] = 1.0
     offsets[pose, feature] = (found - y[pose, feature]) / sigma
     crowd = _crowd(points, y, visible, sigma) * sigma ** y.shape[-1]
-    return Sighting(
+    return SensorMatches(
         visible.astype(float), shares, offsets, by_world / sigma, crowd, float(len(points))
     )
 

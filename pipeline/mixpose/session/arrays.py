@@ -19,7 +19,7 @@ _WIDEST = 1_000_000  # px; more than any image library reads
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
-    """Whether a value is a finite number to reckon with (true and false are none)."""
+    """Whether a value is a finite number (true and false are none)."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return -LARGEST <= value <= LARGEST  # false for NaN, and for integers beyond float64

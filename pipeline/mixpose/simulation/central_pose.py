@@ -17,7 +17,7 @@ from mixpose.rigid import Floats, from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.draws import Purpose, generator
-from mixpose.simulation.sighting import facing
+from mixpose.simulation.visible_spots import facing
 
 _SIDE_FILLED = 0.5  # of the image's smaller side: a quarter of the area
 _SIDE_VISIBLE = 0.05  # smaller than this the body could not be told from a blob

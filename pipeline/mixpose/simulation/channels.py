@@ -20,7 +20,7 @@ from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.render import ImageFormat, ProfileFormat
 from mixpose.simulation.scenery import Scenery
 from mixpose.simulation.shutter import Shutter
-from mixpose.simulation.sighting import View, brightness_levels
+from mixpose.simulation.visible_spots import View, brightness_levels
 from mixpose.simulation.writers import (
     DetectionWriter,
     ImageWriter,

@@ -21,7 +21,7 @@ from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.motion import Motion, plan_motion
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.scenery import Actor, motion_pose
-from mixpose.simulation.sighting import brightness_levels
+from mixpose.simulation.visible_spots import brightness_levels
 
 _APART = 1.1  # sums of radii between bodies at rest
 _TRIES = 48  # places at each distance

@@ -26,7 +26,7 @@ from mixpose.simulation.options import DEFAULT_FPS, SimulationOptions
 from mixpose.simulation.scenery import motion_pose, plan_scenery
 from mixpose.simulation.session_copy import SESSION_NAME, SessionCopy, copy_session
 from mixpose.simulation.shutter import PoseAfter
-from mixpose.simulation.sighting import Sighting, displacements, look
+from mixpose.simulation.visible_spots import VisibleSpots, displacements, look
 from mixpose.simulation.writers import SensorWriter
 
 TRUTH_NAME = "truth.jsonl"
@@ -273,7 +273,7 @@ def _record_frame(
         if is_missing and channel.files.may_lack_frames:
             continue
         rng = generator(options.seed, Purpose.FRAME, number, i)
-        sighting = look(
+        visible = look(
             channel.view,
             body,
             T_world_object,
@@ -285,8 +285,8 @@ def _record_frame(
             is_away=is_away,
         )
         if is_missing:
-            sighting = _nothing(sighting)
-        writer.write(number, _time(plan, number) + channel.step_s, sighting, rng)
+            visible = _nothing(visible)
+        writer.write(number, _time(plan, number) + channel.step_s, visible, rng)
         recorded = True
     return recorded and not is_away
 
@@ -296,8 +296,8 @@ def _after(motion: Motion, moment: float) -> PoseAfter:
     return lambda seconds: pose(moment + seconds)
 
 
-def _nothing(sighting: Sighting) -> Sighting:
-    return Sighting(sighting.points[:0], sighting.levels[:0], sighting.features[:0])
+def _nothing(visible: VisibleSpots) -> VisibleSpots:
+    return VisibleSpots(visible.points[:0], visible.levels[:0], visible.features[:0])
 
 
 def _header(plan: _Plan) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""From sightings to grey images and range profiles.
+"""From spots to grey images and range profiles.
 
 A spot is a Gaussian integrated over each pixel or bin, so that its centroid is where the feature
 projects to, without a bias toward pixel centres.
@@ -18,7 +18,7 @@ from scipy.special import erf
 from mixpose.records import Floats
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.outlines import coverage
-from mixpose.simulation.sighting import Sighting
+from mixpose.simulation.visible_spots import VisibleSpots
 
 _REACH = 5.0  # standard deviations up to which a spot is drawn: the rest is below 1e-6 of it
 _WHITE = 255.0
@@ -105,7 +105,7 @@ class ProfileFormat:
 
 
 def render_image(
-    sighting: Sighting,
+    visible: VisibleSpots,
     form: ImageFormat,
     options: SimulationOptions,
     rng: np.random.Generator,
@@ -114,7 +114,7 @@ def render_image(
 
     Parameters
     ----------
-    sighting : Sighting
+    visible : VisibleSpots
         In px.
     form : ImageFormat
     options : SimulationOptions
@@ -129,7 +129,7 @@ def render_image(
     """
     width, height = form.resolution
     image = np.zeros((height, width), dtype=np.float32)
-    draw_light(image, sighting, options.brightness, form.spot_sigma)
+    draw_light(image, visible, options.brightness, form.spot_sigma)
     gains = _mosaic(image.shape) if options.bayer else None
     if gains is not None:
         image *= gains
@@ -156,24 +156,24 @@ def render_image(
 
 
 def draw_light(
-    image: NDArray[np.float32], sighting: Sighting, brightness: float, sigma: float
+    image: NDArray[np.float32], visible: VisibleSpots, brightness: float, sigma: float
 ) -> None:
     """Add all that shines to an image, and take away what something dark stands before.
 
     Spots without a size are Gaussians of `sigma`; the others are evenly bright within their edges,
     blurred by as much.
     """
-    sized = sighting.outlines
-    plain = np.array([k not in sized for k in range(len(sighting))], dtype=np.bool_)
-    peaks = brightness * sighting.levels
-    draw_spots(image, sighting.points[plain], peaks[plain], sigma)
+    sized = visible.outlines
+    plain = np.array([k not in sized for k in range(len(visible))], dtype=np.bool_)
+    peaks = brightness * visible.levels
+    draw_spots(image, visible.points[plain], peaks[plain], sigma)
     if sized:
         disks = np.zeros(image.shape, dtype=np.float32)
         for k, edge in sized.items():
             rows, columns, shares = coverage(edge, image.shape)
             disks[rows, columns] += np.float32(peaks[k]) * shares.astype(np.float32)
         image += cv2.GaussianBlur(disks, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-    for cover in sighting.covers:
+    for cover in visible.covers:
         rows, columns, shares = coverage(cover, image.shape)
         image[rows, columns] *= (1 - shares).astype(np.float32)
 
@@ -186,7 +186,7 @@ def _mosaic(shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def render_profile(
-    sighting: Sighting,
+    visible: VisibleSpots,
     form: ProfileFormat,
     options: SimulationOptions,
     rng: np.random.Generator,
@@ -195,7 +195,7 @@ def render_profile(
 
     Parameters
     ----------
-    sighting : Sighting
+    visible : VisibleSpots
         In length units.
     form : ProfileFormat
     options : SimulationOptions
@@ -209,8 +209,8 @@ def render_profile(
         1 at the peak of a mean feature; never below 0, as amplitudes are not.
     """
     profile = np.zeros(form.bins)
-    places = (sighting.points[:, 0] - form.range_min) / form.bin_size
-    draw_profile(profile, places, sighting.levels, form.width / form.bin_size)
+    places = (visible.points[:, 0] - form.range_min) / form.bin_size
+    draw_profile(profile, places, visible.levels, form.width / form.bin_size)
     profile += rng.standard_normal(form.bins) / options.range_snr
     return np.maximum(profile, 0.0).astype(np.float32)
 

@@ -19,7 +19,7 @@ from mixpose.simulation.render import (
     render_image,
     render_profile,
 )
-from mixpose.simulation.sighting import Sighting
+from mixpose.simulation.visible_spots import VisibleSpots
 
 # Runs and no filter: the best for noise, and fast.
 _PNG = (
@@ -35,7 +35,7 @@ class SensorWriter(Protocol):
     """Writes what one sensor records; used in a ``with`` statement."""
 
     def write(
-        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Record one frame; numbers ascend."""
 
@@ -79,10 +79,10 @@ class ImageWriter(_Closing):
         self._form = form
 
     def write(
-        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Draw and write one image."""
-        image = render_image(sighting, self._form, self._options, rng)
+        image = render_image(visible, self._form, self._options, rng)
         path = self._folder / self._files.name(number)
         path.parent.mkdir(parents=True, exist_ok=True)
         suffix = path.suffix.casefold()
@@ -121,10 +121,10 @@ class VideoWriter(_Closing):
             )
 
     def write(
-        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Draw one image and append it."""
-        image = render_image(sighting, self._form, self._options, rng)
+        image = render_image(visible, self._form, self._options, rng)
         self._video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
 
     def close(self) -> None:
@@ -150,10 +150,10 @@ class ProfileWriter(_Closing):
             np.lib.format.write_array_header_1_0(self._file, header)
 
     def write(
-        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Draw one profile and append it."""
-        profile = render_profile(sighting, self._form, self._options, rng)
+        profile = render_profile(visible, self._form, self._options, rng)
         self._file.write(_row_of(profile) if self._is_text else profile.astype("<f4").tobytes())
 
     def close(self) -> None:
@@ -178,12 +178,12 @@ class DetectionWriter(_Closing):
         self._file.write(",".join(["frame", "time_s", *coordinates, "weight"]) + "\n")
 
     def write(
-        self, number: int, time_s: float, sighting: Sighting, rng: np.random.Generator
+        self, number: int, time_s: float, visible: VisibleSpots, rng: np.random.Generator
     ) -> None:
         """Append the detections of one frame."""
-        noise = self._noise * rng.standard_normal(sighting.points.shape)
-        shown = ~np.array([_is_covered(point, sighting) for point in sighting.points], dtype=bool)
-        points, weights = (sighting.points + noise)[shown], sighting.levels[shown]
+        noise = self._noise * rng.standard_normal(visible.points.shape)
+        shown = ~np.array([_is_covered(point, visible) for point in visible.points], dtype=bool)
+        points, weights = (visible.points + noise)[shown], visible.levels[shown]
         if not len(points):
             points, weights = np.zeros((1, len(self._coordinates))), np.zeros(1)
         for i in rng.permutation(len(points)):
@@ -195,10 +195,10 @@ class DetectionWriter(_Closing):
         self._file.close()
 
 
-def _is_covered(point: NDArray[np.float64], sighting: Sighting) -> bool:
+def _is_covered(point: NDArray[np.float64], visible: VisibleSpots) -> bool:
     """Whether something dark stands before a spot."""
     u, v = (float(x) for x in point) if len(point) == 2 else (0.0, 0.0)
-    corners = [cover.astype(np.float32) for cover in sighting.covers]
+    corners = [cover.astype(np.float32) for cover in visible.covers]
     return any(cv2.pointPolygonTest(one, (u, v), False) >= 0 for one in corners)
 
 

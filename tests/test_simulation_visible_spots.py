@@ -10,7 +10,7 @@ from mixpose.rigid import from_rotation_vector, transform
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.render import ImageFormat, render_image
-from mixpose.simulation.sighting import View, displacements, facing, look
+from mixpose.simulation.visible_spots import View, displacements, facing, look
 
 K = np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]])
 CAMERA = PinholeCamera(K, resolution=(640, 512))

@@ -32,7 +32,7 @@ _PIECES = 32  # in which a line's image is measured
 
 
 @dataclass(frozen=True)
-class Sighting:
+class VisibleSpots:
     """Spots in sensor coordinates.
 
     Attributes
@@ -105,7 +105,7 @@ def look(
     pose_after: PoseAfter | None = None,
     time_s: float = 0.0,
     is_away: bool = False,
-) -> Sighting:
+) -> VisibleSpots:
     """Decide what a sensor sees of a body.
 
     Parameters
@@ -153,7 +153,7 @@ def look(
             spots.add(view, actor.body, i, owner, later, actor.levels[i], None, actor.mirror)
     late = time_s + view.shutter.late_s
     covers = [arm.outline(view.unbounded, late) for arm in view.scenery.arms]
-    return spots.sighting(tuple(one for one in covers if len(one)))
+    return spots.visible(tuple(one for one in covers if len(one)))
 
 
 def _solid(
@@ -199,7 +199,7 @@ def _later(pose: PoseAt, time_s: float) -> PoseAfter:
 
 @dataclass
 class _Spots:
-    """Spots of one sighting, while they are put together."""
+    """All that one sensor sees of a frame, while they are put together."""
 
     points: list[Floats]
     levels: list[Floats]
@@ -237,10 +237,10 @@ class _Spots:
             self.levels.append(level * shares / len(poses))
             self.owners += [owner] * len(y)
 
-    def sighting(self, covers: tuple[Floats, ...]) -> Sighting:
+    def visible(self, covers: tuple[Floats, ...]) -> VisibleSpots:
         """All of them."""
         points, levels = np.concatenate(self.points), np.concatenate(self.levels)
-        return Sighting(points, levels, np.array(self.owners, np.intp), self.outlines, covers)
+        return VisibleSpots(points, levels, np.array(self.owners, np.intp), self.outlines, covers)
 
 
 def facing(
