@@ -100,6 +100,8 @@ class Track:
         Whether another body of the scene may have what the last pose meets.
     agreed : bool
         Whether two sensors met most of the body in some frame.
+    believed : int
+        Frames whose pose was ok.
     clutter : StaticClutter
         What stayed where it was while the body was lost.
     """
@@ -115,6 +117,7 @@ class Track:
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
     agreed: bool = False
+    believed: int = 0
     clutter: StaticClutter = StaticClutter()
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:

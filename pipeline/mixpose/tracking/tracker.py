@@ -259,8 +259,8 @@ class Tracker:
             self.rules.course,
         )
         if verdict.status != "ok":
-            return followed
-        return replace(followed, delays=_delays(data, best, frame))
+            return replace(followed, believed=track.believed)
+        return replace(followed, believed=track.believed + 1, delays=_delays(data, best, frame))
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
