@@ -84,7 +84,7 @@ def test_less_than_even_odds_are_told_where_most_of_the_body_is_met(
     assert status(replace(SURE, coverage=coverage, log_evidence=log_evidence)) == expected
 
 
-@pytest.mark.parametrize(("lead", "expected"), [(2.3, "ambiguous"), (2.1, "lost")])
+@pytest.mark.parametrize(("lead", "expected"), [(1.6, "ambiguous"), (1.4, "lost")])
 def test_a_pose_about_as_good_as_others_is_one_of_many_that_meet_by_chance(
     lead: float, expected: str
 ) -> None:
@@ -92,6 +92,12 @@ def test_a_pose_about_as_good_as_others_is_one_of_many_that_meet_by_chance(
     best = replace(SURE, log_evidence=-1.0)
     rival = replace(SURE, T_world_object=ELSEWHERE, log_evidence=-1.0 - lead - np.log(2))
     assert status(best, rival, rival) == expected
+
+
+@pytest.mark.parametrize(("met", "expected"), [(5, "ambiguous"), (4, "lost")])
+def test_one_feature_more_than_fixes_a_pose_is_met_by_chance(met: int, expected: str) -> None:
+    # three features of two coordinates each fix the six of a pose
+    assert status(replace(SURE, log_evidence=-1.0, measurements=2.0 * met)) == expected
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from mixpose.errors import SessionError
 from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search import Candidate, SearchBudget, SearchState, search_frame
+from mixpose.search import THOROUGH, Candidate, SearchBudget, SearchState, search_frame
 from mixpose.search.alignment import align_triples
 from mixpose.sensors import ParallelBeam
 
@@ -112,6 +113,16 @@ def test_a_limited_search_goes_on_in_the_next_frame_where_it_stopped() -> None:
     # the last batch is finished, which makes up to 4 guesses of each of 4,096 problems
     assert max(made) < 5000 + 4 * 4096
     assert states[0].batch > 0
+
+
+def test_poses_that_the_best_leaves_no_chance_are_no_candidates() -> None:
+    frame = trial(Row("2 pinhole", 8, 2, 4, 0.99), 0)
+    evidence = [one.evidence for one in found(frame)]
+    assert min(evidence) > evidence[0] - THOROUGH.outdone
+    everyone = replace(THOROUGH, outdone=np.inf)
+    result = search_frame(frame.views, frame.body, free=ALL, T_reference=None, budget=everyone)
+    assert len(result.candidates) > len(evidence)
+    assert result.candidates[0].evidence == evidence[0]
 
 
 def test_what_a_search_cost_is_counted() -> None:

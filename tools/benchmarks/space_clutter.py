@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.search_cases import CUBE, DISTANCE, NOISE_PX, SENSORS, SIGMA_PX, Trial
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
+from mixpose.judgement import expected_covariance
 from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import from_parts, transform
@@ -87,7 +88,9 @@ def scene_trial(scene: Scene, seed: int, *, present: bool = True) -> Trial:
         views.append(View(f"camera{k}", sensor, Observation(PointPattern(y, weights), SIGMA_PX)))
     alone = scene.sensors == "1 pinhole" or (scene.blind and scene.sensors == "2 pinhole")
     limits = (3.0, 0.02) if alone else (1.0, 0.005)
-    return Trial(views, body, T, DISTANCE, *limits)
+    seeing = sensors[1:] if scene.blind else sensors
+    known, _ = expected_covariance(seeing, [NOISE_PX] * len(seeing), body, T, np.ones(6, bool))
+    return Trial(views, body, T, DISTANCE, *limits, covariance=known)
 
 
 def _anywhere(points: Floats, shift: float, rng: np.random.Generator) -> Floats:

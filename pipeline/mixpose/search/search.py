@@ -154,10 +154,13 @@ class _Run:
         return batches
 
     def candidates(self, count: int) -> list[Candidate]:
-        """Distinct poses, best first."""
+        """Distinct poses, best first, without those that the best leaves no chance."""
         kept = first_of_each(
             self._body, self._poses, self._ranks, count, self._budget.descent.alike
         )
+        if self._by_evidence and kept:
+            least = self._ranks[kept[0]] - self._budget.outdone
+            kept = [k for k in kept if self._ranks[k] > least]
         return [Candidate(self._poses[k], float(self._ranks[k])) for k in kept]
 
     def _keep(self, poses: Floats) -> None:

@@ -13,7 +13,7 @@ from mixpose.tracking.proposers.doubt import is_doubtful
 
 
 def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
-    """Candidates of the search where nothing convinces yet, as they are and fitted."""
+    """Candidates of the search where nothing convinces yet."""
     return starts_at(data, candidates_of(data)) if is_doubtful(data, ranked) else []
 
 
@@ -48,8 +48,6 @@ def candidates_of(data: FrameData) -> list[Candidate]:
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
-    """Candidates as they are, and fitted."""
+    """Where fits of candidates begin."""
     close = data.start_uncertainty / data.rules.proposals.narrowing**2
-    for candidate in candidates:
-        yield Start(candidate.T_world_object)
-        yield Start(candidate.T_world_object, close)
+    return [Start(one.T_world_object, close) for one in candidates]
