@@ -61,3 +61,32 @@ def test_without_offsets_to_spare_the_noise_is_the_typical_one() -> None:
 def test_no_blur_is_narrower_than_a_density_can_be_drawn() -> None:
     seen = errors_seen(offsets_of(np.full((50, 2), 1e-4), finest=0.2), 0, NOTHING, RULES)
     assert seen.blurs[0] == pytest.approx(0.2)
+
+
+def test_half_of_offsets_far_off_are_no_noise_where_the_rest_is_as_small_as_before() -> None:
+    rng = np.random.default_rng(3)
+    away = rng.normal(0, 0.02, (16, 2))
+    before = np.array([[200 * 0.02**2], [200.0]])
+    away[:7] += rng.uniform(0.4, 1.2, (7, 2))
+    seen = errors_seen(offsets_of(away), 6, before, RULES)
+    assert seen.variances[0] == pytest.approx(0.02**2, rel=0.3)
+    # by chance no nine of sixteen offsets are within 0.05 of a wide noise
+    assert seen.log_likelihood > 20
+    unknown = errors_seen(offsets_of(away), 6, NOTHING, RULES)
+    assert unknown.log_likelihood < seen.log_likelihood
+
+
+def test_sensors_are_weighed_half_by_what_all_of_them_err_by() -> None:
+    rng = np.random.default_rng(4)
+    away = rng.normal(0, np.repeat([[0.05], [0.2]], 2000, axis=0), (4000, 2))
+    both = Offsets(
+        (away**2).sum(axis=1),
+        np.ones(4000),
+        np.repeat([0, 1], 2000),
+        np.array([2, 2]),
+        np.full(2, 0.01),
+    )
+    seen = errors_seen(both, 0, np.zeros((2, 2)), RULES)
+    mean = (0.05**2 + 0.2**2) / 2
+    for blur, s in zip(seen.blurs, (0.05, 0.2), strict=True):
+        assert blur == pytest.approx(1.5 * np.sqrt((s**2 + mean) / 2), rel=0.06)

@@ -94,7 +94,11 @@ def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
     found = noise_of([one], FREE, before, ALONE)
     own = noise_of([one], FREE, Residuals(), ALONE)
     np.testing.assert_allclose(found.covariance, own.covariance)
-    assert found.remembered.noise["0"].degrees == pytest.approx(0.8 * 40.0)
+    # remembered as the largest that chance makes: F of 10 and 40 degrees is 3.87 at 99.9 %
+    kept, alone = found.remembered.noise["0"], own.remembered.noise["0"]
+    assert kept.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
+    limit = 3.87 * 0.02**2 * alone.degrees
+    assert kept.squares == pytest.approx(0.95 * 40 * 0.02**2 + limit, rel=0.02)
 
 
 def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:

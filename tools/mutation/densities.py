@@ -388,9 +388,23 @@ _ERRORS = (
     Mutant(
         "density-errors-of-a-frame-forgotten",
         "density/extraction_error.py",
-        "np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))",
-        "np.sqrt(variances)",
+        "np.maximum(variances, pooled(own, rules, 0.0))",
+        "variances.copy()",
         "a frame that is not like those before it is looked at too narrowly",
+    ),
+    Mutant(
+        "density-errors-from-above-only",
+        "density/extraction_error.py",
+        "return max(seen, narrow, key=lambda one: one.log_likelihood)",
+        "return seen",
+        "where half of the spots are merged all offsets are noise",
+    ),
+    Mutant(
+        "density-errors-each-sensor-for-itself",
+        "density/extraction_error.py",
+        "wide += rules.shared *",
+        "wide += 0.0 *",
+        "sensors weigh by their own noise alone",
     ),
 )
 

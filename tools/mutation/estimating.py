@@ -191,8 +191,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "return bool(ratio > fdtri(degrees, known, model.by_chance))",
-        "return False",
+        "return ratio / float(fdtri(degrees, known, model.by_chance))",
+        "return 0.0",
         "a frame of large residuals is as sure as those before it",
     ),
     Mutant(

@@ -10,6 +10,7 @@ from mixpose.density.extraction_error import (
     Offsets,
     Seen,
     errors_seen,
+    known_blurs,
     pooled,
 )
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
@@ -34,6 +35,7 @@ __all__ = [
     "crowding",
     "errors_seen",
     "features_met",
+    "known_blurs",
     "matched_atlas",
     "peak",
     "pooled",

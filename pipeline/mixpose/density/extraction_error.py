@@ -7,8 +7,9 @@ as out.  Offsets weighted so have the variance q with 1/q = 1/s² + 1/2σ²: bot
 
     σ = 1.5 s,      s² = q / (1 − q / 2σ²)
 
-follow from one another, from the session's σ_ε down to where they agree.  Lengths are in σ_ε of
-their sensor.
+follow from one another, from the session's σ_ε down to where they agree.  Where many offsets are
+not noise, as those of merged spots, they agree at a wide blur, too; so they are also sought from
+what is known upwards, and the likelier noise counts.  Lengths are in σ_ε of their sensor.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from mixpose.constants import constant
 Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
+_NOTHING = 1e-12
+_ALIKE = 1.2  # blurs that differ by less are the same
+_ROUNDS = 4  # from a known noise upwards
 _LEAST_DEGREES = 0.5  # of freedom: fewer are none, but for shares that do not add up to whole ones
 
 
@@ -45,6 +49,17 @@ class ErrorRules:
         9.0,
         "σ_ε around features within which detections count: at σ_ε they are drawn to 6, and the "
         "pose moves by less than the rest",
+    )
+    astray: float = constant(
+        0.1, "chance that an offset within `met` is no noise: a spot cut, merged or another's"
+    )
+    met: float = constant(
+        3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
+    )
+    shared: float = constant(
+        0.5,
+        "of the blur's variance, that of all sensors: what calibrations err by is in no sensor's "
+        "own noise, so that precise ones weigh too much by theirs alone (action cameras)",
     )
     outlying: float = constant(
         3.5, "standard deviations from which an offset is no noise: by chance 2 in 1000 are beyond"
@@ -106,11 +121,14 @@ class Seen(NamedTuple):
         Of each sensor's noise, together with what was known.
     blurs : (L,) float64
         In σ_ε.
+    log_likelihood : float
+        Of the offsets, less that of none being noise; the pose was fitted to them.
     """
 
     own: Floats
     variances: Floats
     blurs: Floats
+    log_likelihood: float = 0.0
 
 
 def errors_seen(
@@ -132,8 +150,23 @@ def errors_seen(
     while True:
         seen = _seen_at(blurs, offsets, free, known, rules)
         if (seen.blurs > 0.9 * blurs).all():
-            return seen
+            break
         blurs = np.minimum(seen.blurs, blurs)
+    blurs = known_blurs(offsets.finest, known, rules)
+    if (seen.blurs <= _ALIKE * blurs).all():
+        return seen
+    for _ in range(_ROUNDS):
+        narrow = _seen_at(blurs, offsets, free, known, rules)
+        if (narrow.blurs <= _ALIKE * blurs).all():
+            break
+        blurs = narrow.blurs
+    return max(seen, narrow, key=lambda one: one.log_likelihood)
+
+
+def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
+    """Blurs (L,) by what was known of the noise before a frame; arguments as of `errors_seen`."""
+    variances = pooled(known, rules, rules.typical_degrees)
+    return np.clip(rules.blur * np.sqrt(variances), finest, 1.0)
 
 
 def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
@@ -152,8 +185,23 @@ def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: E
     own = np.array([(left > 0) * factor * q * degrees, left * degrees])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
-    blurs = rules.blur * np.sqrt(np.maximum(variances, pooled(own, rules, 0.0)))
-    return Seen(own, variances, np.clip(blurs, finest, 1.0))
+    wide = np.maximum(variances, pooled(own, rules, 0.0))
+    wide += rules.shared * (np.average(wide, weights=total + _NOTHING) - wide)
+    blurs = np.clip(rules.blur * np.sqrt(wide), finest, 1.0)
+    return Seen(own, variances, blurs, _log_likelihood(blurs, offsets, free, rules))
+
+
+def _log_likelihood(blurs: Floats, offsets: Offsets, free: int, rules: ErrorRules) -> float:
+    """Of normal offsets and some that are anywhere; what a pose is free to fit is paid for."""
+    m = offsets.dimensions[offsets.sensor]
+    variances = (blurs[offsets.sensor] / rules.blur) ** 2
+    peaks = (2 * np.pi * variances) ** (-0.5 * m)
+    anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
+    odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * offsets.squared / variances)
+    believed = m * offsets.shares * odds / (1 + odds)
+    logs = np.log(2 * np.pi * variances)
+    price = 0.5 * free * float(believed @ logs) / max(float(believed.sum()), _NOTHING)
+    return float(offsets.shares @ np.log1p(odds)) + price
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:

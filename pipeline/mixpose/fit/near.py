@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -47,9 +47,6 @@ class FitRules:
 
     schedule: ScheduleRules = ScheduleRules()
     misfit: MisfitRules = MisfitRules()
-    met: float = constant(
-        3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
-    )
     narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
     near: float = constant(
         0.1,
@@ -177,25 +174,29 @@ def _to_the_noise(
     """The ascent from σ_ε on, while detections are farther off than their noise lets them be."""
     known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in views])
-    blurs = np.ones(len(views))
+    blurs, best = np.ones(len(views)), None
     objective = finest or matched_objective(views, body, sigmas.tolist())
     while True:
-        offsets = _offsets(objective, ascent.state, errors, rules)
+        offsets = _offsets(objective, ascent.state, errors)
         seen = errors_seen(offsets, int(free.sum()), known, errors)
-        limits = errors.outlying**2 * seen.variances[offsets.sensor]
+        if best is None or seen.log_likelihood > best[0]:
+            best = (seen.log_likelihood, ascent)
+        # offsets of a bent pose hide how small the noise is
+        least = known_blurs(offsets.finest, known, errors)
+        noise_seen = np.minimum(seen.variances, (least / errors.blur) ** 2)
+        limits = errors.outlying**2 * noise_seen[offsets.sensor]
         clear = (offsets.squared <= limits) | (offsets.shares == 0)
-        narrower = np.minimum(seen.blurs, blurs)
+        least = np.maximum(least, blurs / rules.schedule.ratio)
+        narrower = np.minimum(np.minimum(seen.blurs, least), blurs)
         if clear.all() or (narrower > rules.narrower * blurs).all():
-            return ascent
+            return best[1]
         blurs = narrower
         near = _around_the_body(objective, ascent.state, errors.reach)
         objective = matched_objective(near, body, (blurs * sigmas).tolist())
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 
-def _offsets(
-    objective: MatchedObjective, T: Floats, errors: ErrorRules, rules: FitRules
-) -> Offsets:
+def _offsets(objective: MatchedObjective, T: Floats, errors: ErrorRules) -> Offsets:
     """How far off features are met, as the density around them shows it: v ∇C / C."""
     at, sampled, _ = objective.match(T[None])
     sensor, feature = np.nonzero(at.seen[:, 0] & (sampled[:, 0, :, 0] > 0))
@@ -203,7 +204,7 @@ def _offsets(
     sigmas = np.array([view.observation.sigma for view in objective.views])
     away = slope * (objective.variances[sensor, 0] / C / sigmas[sensor])[:, None]
     squared = (away * away).sum(axis=1)
-    shares = np.where(squared < rules.met**2, at.weights[sensor, 0, feature], 0.0)
+    shares = np.where(squared < errors.met**2, at.weights[sensor, 0, feature], 0.0)
     dimensions = objective.projection.dimensions
     finest = [
         view.observation.narrowest(errors.narrowest, y[0, seen[0], :m])

@@ -59,7 +59,6 @@ class NoiseModel:
     confidence: float = constant(
         0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
     )
-    forgetting: float = constant(0.8, "the same where they no longer seem to hold: 5 frames count")
     lasting: float = constant(
         0.18,
         "of the noise: an offset that all features of a sensor have in common, before it is seen "
@@ -153,15 +152,17 @@ def noise_of(
     """The noise of a frame, from its residuals and from those before it.
 
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
-    own, and the frames after it forget it.
+    own, and is remembered as one that has the largest that chance makes.
     """
     offsets, count = _offsets(associations), int(free.sum())
     last = [before.noise.get(one.name, Noise()) for one in associations]
     past = np.array([(one.squares, one.degrees) for one in last]).T
-    sums, rest = model.memory * past, None
+    sums = model.memory * past
     seen = errors_seen(offsets, count, sums, model.errors)
-    if _is_outdone(past, seen, model):
-        sums, rest = np.zeros_like(past), model.forgetting * past
+    surplus = _surplus(past, seen, model)
+    told = sums + seen.own / [[max(surplus, 1.0)], [1.0]]
+    if surplus > 1:
+        sums = np.zeros_like(past)
         seen = errors_seen(offsets, count, sums, model.errors)
     sums = sums + seen.own
     degrees = float(sums[1].sum())
@@ -174,7 +175,6 @@ def noise_of(
     factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
     covariance = np.zeros((6, 6))
     covariance[np.ix_(free, free)] = np.tensordot(shares.variances * factors, parts, 1)
-    told = sums if rest is None else rest
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
     return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
 
@@ -190,14 +190,14 @@ def _offsets(associations: Sequence[Association]) -> Offsets:
     )
 
 
-def _is_outdone(past: Floats, seen: Seen, model: NoiseModel) -> bool:
-    """Whether a frame's residuals are larger than chance makes them."""
+def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:
+    """How many times larger a frame's residuals are than chance makes them; 1 is just by chance."""
     known, degrees = float(past[1].sum()), float(seen.own[1].sum())
     if known < model.known or degrees < 1:
-        return False
+        return 0.0
     before = np.maximum(pooled(past, model.errors, 0.0), model.smallest**2)
     ratio = float((seen.own[0] / before).sum()) / degrees
-    return bool(ratio > fdtri(degrees, known, model.by_chance))
+    return ratio / float(fdtri(degrees, known, model.by_chance))
 
 
 class _Shares(NamedTuple):
