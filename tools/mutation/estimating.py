@@ -198,8 +198,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "offsets, count = _offsets(associations), int(free.sum())",
-        "offsets, count = _offsets(associations), 0",
+        "offsets, count = joined_offsets(associations), int(free.sum())",
+        "offsets, count = joined_offsets(associations), 0",
         "noise seems smaller than it is",
     ),
     Mutant(

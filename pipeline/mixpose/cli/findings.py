@@ -186,6 +186,9 @@ class Findings:
         return lines
 
     def _of_doubts(self) -> list[str]:
+        change = self._change()
+        if change is not None:
+            return [f"{change}, frames that are not ok would be"]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         for doubt, each in self._doubts.items():
@@ -193,13 +196,6 @@ class Findings:
                 continue  # said of the sensor
             if each.count < _LONG and each.count <= total / 2:
                 continue  # a frame here and there: clutter does that
-            if each.count > total / 2 and each.found[0][2] > 1:
-                change = None
-                if len(self._session.labels) == 1 and self._agreed_before < _LONG:
-                    change = explanation(self._session, self._frames)
-                if change is not None:
-                    lines.append(f"{change}, frames that are not ok would be")
-                    continue
             goes_on = each.last_place == self._places and each.found[-1][2] >= _LONG
             if goes_on and self._agreed_before >= _LONG:
                 lines.append(f"{doubt} from frame {each.found[-1][0]} on: was one of them bumped?")
@@ -209,6 +205,18 @@ class Findings:
                 "step, or its calibration, T_sensor_world or source that of another?"
             )
         return lines
+
+    def _change(self) -> str | None:
+        """What the session should have said, where most frames are doubted from the beginning."""
+        doubted = sum(each.count for each in self._doubts.values())
+        frozen = sum(each.count for each in self._same.values())
+        if doubted <= max((self._places + 1) / 2, frozen) or self._agreed_before >= _LONG:
+            return None
+        if all(each.longest < 2 for each in self._doubts.values()):
+            return None
+        if len(self._session.labels) > 1:
+            return None
+        return explanation(self._session, self._frames)
 
     def _of_markers(self) -> list[str]:
         lines = []

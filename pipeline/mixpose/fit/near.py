@@ -91,6 +91,7 @@ def fit_near(
     *,
     finest: MatchedObjective | None = None,
     noise: Sequence[Noise] | None = None,
+    least: Floats | None = None,
     errors: ErrorRules = ErrorRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
@@ -111,6 +112,8 @@ def fit_near(
         At σ_ε, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
+    least : (L,) array or None
+        Standard deviation of what else features of each view are off by, in σ_ε.
     errors : ErrorRules
     rules : FitRules
     """
@@ -127,7 +130,8 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     if matched and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
-        ascent = _to_the_noise(views, body, ascent, free, finest, known, errors, rules)
+        beside = np.zeros(len(views)) if least is None else least
+        ascent = _to_the_noise(views, body, ascent, free, finest, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
@@ -168,6 +172,7 @@ def _to_the_noise(
     free: NDArray[np.bool_],
     finest: MatchedObjective | None,
     noise: Sequence[Noise],
+    beside: Floats,
     errors: ErrorRules,
     rules: FitRules,
 ) -> Ascent[Floats]:
@@ -178,6 +183,8 @@ def _to_the_noise(
     objective = finest or matched_objective(views, body, sigmas.tolist())
     while True:
         offsets = _offsets(objective, ascent.state, errors)
+        finest_blurs = np.clip(errors.blur * beside, offsets.finest, 1.0)
+        offsets = offsets._replace(finest=finest_blurs)
         seen = errors_seen(offsets, int(free.sum()), known, errors)
         if best is None or seen.log_likelihood > best[0]:
             best = (seen.log_likelihood, ascent)

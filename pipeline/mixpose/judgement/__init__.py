@@ -23,7 +23,7 @@ from mixpose.judgement.evidence import (
 )
 from mixpose.judgement.expected_covariance import expected_covariance, invert_information
 from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
-from mixpose.judgement.noise import NoiseModel, Residuals
+from mixpose.judgement.noise import NoiseModel, Residuals, joined_offsets
 
 __all__ = [
     "APART",
@@ -49,6 +49,7 @@ __all__ = [
     "is_far_off",
     "is_possible",
     "is_sure",
+    "joined_offsets",
     "judge",
     "nearest_alike",
     "odds_of",

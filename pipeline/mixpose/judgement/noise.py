@@ -154,7 +154,7 @@ def noise_of(
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    offsets, count = _offsets(associations), int(free.sum())
+    offsets, count = joined_offsets(associations), int(free.sum())
     last = [before.noise.get(one.name, Noise()) for one in associations]
     past = np.array([(one.squares, one.degrees) for one in last]).T
     sums = model.memory * past
@@ -179,7 +179,7 @@ def noise_of(
     return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
 
 
-def _offsets(associations: Sequence[Association]) -> Offsets:
+def joined_offsets(associations: Sequence[Association]) -> Offsets:
     """Offsets of the features of all sensors."""
     return Offsets(
         np.concatenate([one.squared for one in associations]),

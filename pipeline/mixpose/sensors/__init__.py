@@ -6,11 +6,11 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 from __future__ import annotations
 
 from mixpose.sensors.base import OUTSIDE, Sensor
-from mixpose.sensors.batch import SensorBatch, side_by_side
+from mixpose.sensors.batch import SensorBatch
 from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
-from mixpose.sensors.moving import Motion, RollingSensor, in_motion, moments
+from mixpose.sensors.moving import Motion, RollingSensor, in_motion, moments, side_by_side
 from mixpose.sensors.parallel import ParallelBeam
 from mixpose.sensors.pinhole import PinholeCamera
 from mixpose.sensors.rays import Rays

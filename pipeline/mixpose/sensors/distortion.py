@@ -7,6 +7,7 @@ tangential, thin prism, tilted sensor.  Acts on normalised coordinates (x/z, y/z
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,7 +44,7 @@ class LensDistortion:
             return None
         full = np.zeros(_COUNT)
         full[: given.size] = given
-        return cls(full, _monotonic_radius(full))
+        return cls(full, _monotonic_radius(tuple(full.tolist())))
 
     def apply(self, xy: Floats) -> Floats:
         """Distort normalised coordinates (..., 2)."""
@@ -91,7 +92,7 @@ class LensDistortion:
         return np.asarray(inner / h[..., 2, None, None])
 
 
-def _polynomial(r2: Floats, a: Floats, b: Floats, c: Floats) -> Floats:
+def _polynomial(r2: Floats, a: Floats | float, b: Floats | float, c: Floats | float) -> Floats:
     return np.asarray(1 + r2 * (a + r2 * (b + r2 * c)))
 
 
@@ -108,7 +109,8 @@ def _tilt_matrix(tau_x: float, tau_y: float) -> Floats:
     return np.asarray(back @ R)
 
 
-def _monotonic_radius(k: Floats) -> float:
+@lru_cache(maxsize=64)
+def _monotonic_radius(k: tuple[float, ...]) -> float:
     r = np.linspace(0, 10, 4001)
     r2 = r * r
     bottom = _polynomial(r2, k[5], k[6], k[7])

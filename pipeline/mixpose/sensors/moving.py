@@ -6,13 +6,16 @@ moment is a sensor like any other: a map from world points at the common time to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, Self
 
 import numpy as np
 
 from mixpose.rigid import inverse, perturb
-from mixpose.sensors.base import Floats, Mask, Sensor, hide
+from mixpose.sensors import batch
+from mixpose.sensors.base import Floats, Mask, Sensor
 from mixpose.sensors.rays import Rays
 
 
@@ -88,44 +91,21 @@ class RollingSensor:
         """Largest measurable coordinates (m,)."""
         return self.sensor.upper
 
-    def moments(self, y: Floats) -> Floats:
-        """Seconds (...,) after the common time at which pixels (..., 2) are read."""
-        return moments(self.sensor, y, self.delay, self.readout)
-
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         y, _, visible = self.linearise(points_world)
         return y, visible
 
     def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `project`, with the Jacobian (..., 2, 3) in between.
-
-        The moment t solves t = moment of the row that is seen at t.  One Newton step from the
-        middle row leaves the square of the share of the readout in which the image moves a row.
-        """
+        """As `project`, with the Jacobian (..., 2, 3) in between."""
         shape = points_world.shape[:-1]
-        x = points_world.reshape(-1, 3)
-        per_row = self._per_row
-        at, R = self._moved(x, np.full(len(x), self.delay))
-        y, J, visible = self.sensor.linearise(at)
-        seconds = np.full(len(x), self.delay)
-        speed = (J[:, 1] * self._speeds(at, seconds)).sum(axis=1)
-        wanted = self.moments(y) - self.delay
-        lag = np.where(visible, wanted / (1 - per_row * speed), 0.0)
-        seconds = self.delay + lag
-        at, R = self._moved(x, seconds)
-        y, J, visible = self.sensor.linearise(at)
-        by_time = np.einsum("nij,nj->ni", J, self._speeds(at, seconds))
-        J = J @ R
-        # as t moves with the row, so does the image: y(x, t(x))
-        by_point = per_row * J[:, 1] / (1 - per_row * by_time[:, 1])[:, None]
-        J = J + by_time[:, :, None] * by_point[:, None]
-        hide(y, visible, J)
+        y, J, visible = self._batch.linearise(points_world.reshape(-1, 3))
         return y.reshape(*shape, 2), J.reshape(*shape, 2, 3), visible.reshape(shape)
 
     def towards(self, points_world: Floats) -> Floats:
-        """Directions (..., 3) from world points (..., 3) to the sensor."""
-        return self.sensor.moved(self.motion.after(self.delay)).towards(points_world)
+        """Directions (..., 3) from world points (..., 3) to the sensor, as of the middle row."""
+        T = self.motion.after(self.delay)
+        return self.sensor.towards(points_world @ T[:3, :3].T + T[:3, 3]) @ T[:3, :3]
 
     def rays(self, y: Floats) -> Rays | None:
         """Lines of sight of detections (M, 2), as of the middle row."""
@@ -143,22 +123,67 @@ class RollingSensor:
             self, sensor=self.sensor.moved(motion), motion=Motion(T, velocity, acceleration)
         )
 
-    @property
-    def _per_row(self) -> float:
-        return self.readout / rows_apart(self.sensor)
+    @cached_property
+    def _batch(self) -> RollingBatch:
+        return RollingBatch([self])
 
-    def _moved(self, x: Floats, seconds: Floats) -> tuple[Floats, Floats]:
-        """Points (n, 3) after some seconds each, and the turns (n, 3, 3) that they made."""
-        origin, t = self.motion.T_world_object[:3, 3], seconds[:, None]
-        twists = (self.motion.velocity + 0.5 * t * self.motion.acceleration) * t
-        R = _turns(twists[:, 3:])
-        return origin + twists[:, :3] + np.einsum("nij,nj->ni", R, x - origin), R
 
-    def _speeds(self, x: Floats, seconds: Floats) -> Floats:
-        """Velocities (n, 3) of points of the body (n, 3), but for how far its origin moved."""
-        twists = self.motion.velocity + seconds[:, None] * self.motion.acceleration
-        arms = x - self.motion.T_world_object[:3, 3]
-        return np.asarray(twists[:, :3] + np.cross(twists[:, 3:], arms))
+class RollingBatch:
+    """Cameras side by side that read one row after the other, each with its motion."""
+
+    def __init__(self, cameras: Sequence[RollingSensor]) -> None:
+        motions = [camera.motion for camera in cameras]
+        self._still = batch.side_by_side([camera.sensor for camera in cameras])
+        self._origin = np.array([one.T_world_object[:3, 3] for one in motions])[:, None]
+        self._velocity = np.array([one.velocity for one in motions])[:, None]
+        self._acceleration = np.array([one.acceleration for one in motions])[:, None]
+        self._delay = np.array([[camera.delay] for camera in cameras])
+        rows = [(rows_apart(one.sensor), middle_row(one.sensor)) for one in cameras]
+        apart, self._middle = np.array(rows).T[..., None]
+        self._per_row = np.array([[camera.readout] for camera in cameras]) / apart
+
+    def linearise(self, points_world: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `SensorBatch.linearise`.
+
+        The moment t solves t = moment of the row that is seen at t.  One Newton step from the
+        middle row leaves the square of the share of the readout in which the image moves a row.
+        """
+        L, per_row = len(self._delay), self._per_row
+        x = np.broadcast_to(points_world, (L, *points_world.shape[-2:]))
+        at, speeds, _ = self._moved(x, self._delay)
+        y, J, visible = self._still.linearise(at)
+        speed = (J[:, :, 1] * speeds).sum(axis=2)
+        wanted = per_row * (y[..., 1] - self._middle)
+        lag = np.where(visible, wanted / (1 - per_row * speed), 0.0)
+        at, speeds, R = self._moved(x, self._delay + lag)
+        y, J, visible = self._still.linearise(at)
+        by_time = (J @ speeds[..., None])[..., 0]
+        J = J @ R
+        # as t moves with the row, so does the image: y(x, t(x))
+        by_point = J[:, :, 1] * (per_row / (1 - per_row * by_time[..., 1]))[..., None]
+        return y, J + by_time[..., None] * by_point[:, :, None], visible
+
+    def _moved(self, x: Floats, seconds: Floats) -> tuple[Floats, Floats, Floats]:
+        """Points (L, n, 3) after some seconds (L, n) or (L, 1) each, their velocities, and turns.
+
+        Velocities (L, n, 3) are those of points of the body, but for how far its origin moved.
+        """
+        t = seconds[..., None]
+        twists = (self._velocity + 0.5 * t * self._acceleration) * t
+        rates = self._velocity + t * self._acceleration
+        R = _turns(twists[..., 3:])
+        arms = ((x - self._origin)[..., None, :] @ R.swapaxes(2, 3))[..., 0, :]
+        shift = twists[..., :3]
+        turning = _crossed(rates[..., 3:], arms + shift)
+        return self._origin + shift + arms, rates[..., :3] + turning, R
+
+
+def side_by_side(sensors: Sequence[Sensor]) -> batch.SensorBatch:
+    """Put sensors of any kinds side by side."""
+    rolling = [one for one in sensors if isinstance(one, RollingSensor)]
+    if rolling and len(rolling) == len(sensors):
+        return RollingBatch(rolling)
+    return batch.side_by_side(sensors)
 
 
 def rows_apart(sensor: Sensor) -> float:
@@ -166,18 +191,28 @@ def rows_apart(sensor: Sensor) -> float:
     return float(sensor.upper[1] - sensor.lower[1]) - 1.0
 
 
+def middle_row(sensor: Sensor) -> float:
+    """The row in the middle of an image."""
+    return float(sensor.lower[1] + sensor.upper[1]) / 2
+
+
 def moments(sensor: Sensor, y: Floats, delay: float, readout: float) -> Floats:
     """Seconds (...,) after the common time at which pixels (..., m) are read."""
     if not readout:
         return np.full(y.shape[:-1], delay)
-    middle = (sensor.lower[1] + sensor.upper[1]) / 2
-    return np.asarray(delay + readout * (y[..., 1] - middle) / rows_apart(sensor))
+    return np.asarray(delay + readout * (y[..., 1] - middle_row(sensor)) / rows_apart(sensor))
 
 
 def _turns(vectors: Floats) -> Floats:
-    """Rotation matrices (n, 3, 3) of small rotation vectors (n, 3), to the third order."""
-    angle2 = (vectors * vectors).sum(axis=1)[:, None, None]
-    x, y, z = vectors.T
-    o = np.zeros_like(x)
-    K = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
-    return np.asarray(np.eye(3) + (1 - angle2 / 6) * K + (0.5 - angle2 / 24) * K @ K)
+    """Rotation matrices (..., 3, 3) of small rotation vectors (..., 3), to the third order."""
+    angle2 = (vectors * vectors).sum(axis=-1)[..., None, None]
+    K = np.zeros((*vectors.shape, 3))
+    K[..., [2, 0, 1], [1, 2, 0]] = vectors
+    K[..., [1, 2, 0], [2, 0, 1]] = -vectors
+    return np.asarray(np.eye(3) + (1 - angle2 / 6) * K + (0.5 - angle2 / 24) * (K @ K))
+
+
+def _crossed(a: Floats, b: Floats) -> Floats:
+    """A × b (..., 3): for few vectors quicker than NumPy's own."""
+    after, before = [1, 2, 0], [2, 0, 1]
+    return np.asarray(a[..., after] * b[..., before] - a[..., before] * b[..., after])

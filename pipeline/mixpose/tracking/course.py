@@ -108,12 +108,16 @@ class Course:
         covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(_ORDER), (count, 6, 4, 4))
         return cls(T, np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), radius)
 
-    def expected(self, T_world_object: Floats, elapsed: float, rules: CourseRules) -> Expected:
-        """The velocity at a pose some seconds after the last."""
+    def expected(
+        self, T_world_object: Floats | None, elapsed: float, rules: CourseRules
+    ) -> Expected:
+        """The velocity at a pose some seconds after the last; None: where that is foretold."""
         means, covariances = self._foretold(elapsed, rules)
         each = (self.log_likelihoods.argmax(axis=0)[_KINDS], np.arange(6))
         mean, covariance = means[each], covariances[each]
-        moved = twist_between(self.T_world_object, T_world_object)
+        moved = mean[:, 0]
+        if T_world_object is not None:
+            moved = twist_between(self.T_world_object, T_world_object)
         gains = covariance[:, 1:3, 0] / covariance[:, :1, 0]
         rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
         variance = covariance[:, 1, 1] - gains[:, 0] * covariance[:, 1, 0]

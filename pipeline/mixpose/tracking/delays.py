@@ -110,23 +110,22 @@ def seen_in_motion(views: Sequence[View], motion: Motion) -> list[View]:
     ]
 
 
-def offsets_of(
-    found: Sequence[Association], views: Sequence[View], places: Sequence[Floats]
-) -> Offsets:
-    """Rows for least squares.
+def offsets_of(found: Sequence[Association], views: Sequence[View], blurs: Floats) -> Offsets:
+    """Rows for least squares, in which features count as they pull.
 
     Parameters
     ----------
     found : sequence of Association
     views : sequence of View
         As they stand, in the same order.
-    places : sequence of (n, m) array
-        Where the features in view are predicted.
+    blurs : (L,) array
+        In σ_ε, at which features pull: what is far off counts for nothing.
     """
     rows, late, offsets, sensor = [], [], [], []
-    for k, (one, view, y) in enumerate(zip(found, views, places, strict=True)):
-        m = one.J.shape[1]
-        root = np.repeat(np.sqrt(one.shares) / one.sigma, m)
+    for k, (one, view, blur) in enumerate(zip(found, views, blurs.tolist(), strict=True)):
+        m, y = one.J.shape[1], one.places
+        pull = np.sqrt(one.shares * np.exp(-0.25 * one.squared / blur**2))
+        root = np.repeat(pull / one.sigma, m)
         rows.append(one.J.reshape(-1, 6) * root[:, None])
         offsets.append(one.offsets.reshape(-1) * root)
         late.append(np.repeat(moments(view.sensor, y, view.delay, view.readout), m))
@@ -139,6 +138,15 @@ def offsets_of(
         np.concatenate(sensor),
         unsure,
     )
+
+
+def unsure_by(J: Floats, y: Floats, view: View, velocity: Expected) -> float:
+    """How far features at places (n, m) may be off by velocity and delay, in σ_ε; J (n, m, 6)."""
+    late = moments(view.sensor, y, view.delay, view.readout)
+    speed = np.hypot(velocity.velocity, velocity.deviation) * (view.unsure or 0.0)
+    ways = np.hypot(late[:, None] * velocity.deviation, speed)
+    squares = ((J * ways[:, None]) ** 2).sum(axis=(1, 2)).max(initial=0.0)
+    return float(np.sqrt(squares)) / view.observation.sigma
 
 
 def together(

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.fit import Fit
 from mixpose.judgement import Judged, nearest_alike
+from mixpose.rigid import perturb
 from mixpose.sensors import Motion
 from mixpose.tracking.delays import together, widened
 
@@ -20,13 +21,15 @@ if TYPE_CHECKING:
 Floats: TypeAlias = NDArray[np.float64]
 
 ROUNDS = 5
-SETTLED = 1e-3  # of σ_ε: features that a better velocity moves by less stay where they are
+LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, one step of both is all
 
 
 def fit_in_motion(
-    data: FrameData, T_start: Floats, climb: Callable[[FrameData, Floats], Fit]
+    data: FrameData, T_start: Floats, climb: Callable[[FrameData, Floats, Floats], Fit]
 ) -> Fit:
     """Climb to the most likely pose and velocity near a start.
+
+    The pose is climbed to as if the velocity were known; then one step is taken in both.
 
     Parameters
     ----------
@@ -34,20 +37,22 @@ def fit_in_motion(
         Of sensors that see features at moments of their own.
     T_start : (4, 4) array
     climb : callable
-        Takes a frame as of the common time and a pose to the best pose near it.
+        Takes a frame as of the common time, a pose, and how far features of each view may be
+        off, in σ_ε, to the best pose near it.
     """
-    motion = data.motion(T_start)
-    T = T_start
+    motion = data.motion(T_start, is_there=False)
+    T, expected = T_start, data.expected(T_start)
     for _ in range(ROUNDS):
         seen = data.in_motion(motion)
-        fit = climb(seen, T)
+        fit = climb(seen, T, seen.unsure(T, expected))
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
-        offsets = seen.offsets(T)
         expected = data.expected(T)
+        offsets = seen.offsets(T, expected)
         both = together(offsets, motion.velocity, expected, data.free)
         moved = np.abs(offsets.rows @ both.change * offsets.late)
+        T = np.asarray(perturb(T, both.step))
         motion = Motion(T, motion.velocity + both.change, expected.acceleration)
-        if moved.max(initial=0.0) < SETTLED:
+        if moved.max(initial=0.0) < LINEAR:
             break
     return replace(fit, T_world_object=T, motion=motion)
 
@@ -55,7 +60,8 @@ def fit_in_motion(
 def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judged:
     """A judged pose, as sure as its velocity lets it be."""
     T = judged.T_world_object
-    offsets = data.offsets(T, [one for one in judged.associations if judged.sensors[one.name].used])
     expected = data.expected(T)
+    used = [one for one in judged.associations if judged.sensors[one.name].used]
+    offsets = data.offsets(T, expected, used)
     wider = widened(judged.covariance, offsets, motion.velocity, expected, data.free)
     return replace(judged, covariance=wider)

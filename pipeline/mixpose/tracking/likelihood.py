@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Noise
+from mixpose.density import Noise, errors_seen
 from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
     Association,
@@ -23,6 +23,7 @@ from mixpose.judgement import (
     Prior,
     associate,
     flat_prior,
+    joined_offsets,
     judge,
     nearest_alike,
 )
@@ -39,7 +40,7 @@ from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.course import Expected, unknown
-from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion
+from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion, unsure_by
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
@@ -164,8 +165,8 @@ class FrameData:
         still = self.still or self
         return replace(still, views=seen_in_motion(still.views, motion), still=still)
 
-    def expected(self, T_world_object: Floats) -> Expected:
-        """The velocity that the frames before let expect of a pose."""
+    def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
+        """The velocity that the frames before let expect of a pose, or near it."""
         rules, track = self.rules, self.track
         nothing = unknown(self.body.radius, rules.course)
         if not self.elapsed or not track.branches or self.elapsed > rules.course.longest_s:
@@ -174,7 +175,7 @@ class FrameData:
         if course is None:
             return nothing
         T = nearest_alike(T_world_object, self.body, course.T_world_object)
-        expected = course.expected(T, self.elapsed, rules.course)
+        expected = course.expected(T if is_there else None, self.elapsed, rules.course)
         is_far = (np.abs(expected.velocity) > nothing.deviation).any()
         return nothing if is_far else expected
 
@@ -191,27 +192,49 @@ class FrameData:
         velocity = mean + (mean - branch.velocity) / 2
         return Expected(velocity, np.full(6, 1.5 / self.elapsed), nothing.deviation, np.zeros(6))
 
-    def motion(self, T_world_object: Floats) -> Motion:
-        """How the body is expected to move at a pose."""
-        expected = self.expected(T_world_object)
+    def motion(self, T_world_object: Floats, *, is_there: bool = True) -> Motion:
+        """How the body is expected to move at a pose, or near it where it need not be there."""
+        expected = self.expected(T_world_object, is_there=is_there)
         return Motion(T_world_object, expected.velocity, expected.acceleration)
 
+    def unsure(self, T_world_object: Floats, velocity: Expected) -> Floats:
+        """How far features in view may be off by velocity and delay (L,), in σ_ε."""
+        at = self.finest.projection.project(T_world_object[None])
+        dimensions = self.finest.projection.dimensions.tolist()
+        return np.array(
+            [
+                unsure_by(J[0, seen[0], :m], y[0, seen[0], :m], view, velocity)
+                for J, y, seen, m, view in zip(
+                    at.J, at.y, at.seen, dimensions, (self.still or self).views, strict=True
+                )
+            ]
+        )
+
     def offsets(
-        self, T_world_object: Floats, found: Sequence[Association] | None = None
+        self,
+        T_world_object: Floats,
+        velocity: Expected | None = None,
+        found: Sequence[Association] | None = None,
     ) -> Offsets:
-        """How far off features are met at a pose, and when they were seen."""
+        """How far off features are met at a pose, and when they were seen.
+
+        What is farther off than noise and an expected velocity let it be counts for little.
+        """
         if found is None:
             rules = self.rules.judgement.association
             found, _ = associate(self.finest, T_world_object, rules)
         names = {view.name: k for k, view in enumerate(self.views)}
         chosen = [names[one.name] for one in found]
         views = [(self.still or self).views[k] for k in chosen]
-        places = [np.zeros((len(one.features), 1)) for one in found]
-        if any(view.readout for view in views):
-            sensors = tuple(self.views[k].sensor for k in chosen)
-            y = project_body(sensors, self.body).project(T_world_object[None]).y[:, 0]
-            places = [at[one.features] for at, one in zip(y, found, strict=True)]
-        return offsets_of(found, views, places)
+        blurs = np.ones(len(found))
+        if velocity is not None:
+            known = np.array([(self.noise[k].squares, self.noise[k].degrees) for k in chosen]).T
+            errors = self.rules.judgement.noise.errors
+            noise = errors_seen(joined_offsets(found), int(self.free.sum()), known, errors).blurs
+            pairs = zip(found, views, strict=True)
+            unsure = [unsure_by(one.J, one.places, view, velocity) for one, view in pairs]
+            blurs = np.hypot(noise, errors.blur * np.array(unsure))
+        return offsets_of(found, views, np.minimum(blurs, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +254,7 @@ class MatchedLikelihood:
             return Fit(start.T_world_object, 0.0, True, 0)
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
 
-        def climb(seen: FrameData, T_start: Floats) -> Fit:
+        def climb(seen: FrameData, T_start: Floats, least: Floats | None = None) -> Fit:
             return fit_near(
                 seen.views,
                 seen.body,
@@ -241,6 +264,7 @@ class MatchedLikelihood:
                 seen.samples,
                 finest=seen.finest,
                 noise=seen.noise,
+                least=least,
                 errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )

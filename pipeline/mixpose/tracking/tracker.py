@@ -258,9 +258,13 @@ class Tracker:
             motion,
             self.rules.course,
         )
-        if verdict.status != "ok":
-            return replace(followed, believed=track.believed)
-        return replace(followed, believed=track.believed + 1, delays=_delays(data, best, frame))
+        believed = track.believed + (verdict.status == "ok")
+        followed = replace(followed, believed=believed)
+        # sensors whose delays are not known contradict each other until they are
+        late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
+        if verdict.status != "ok" and not late:
+            return followed
+        return replace(followed, delays=_delays(data, best, frame))
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
@@ -305,7 +309,7 @@ def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
     expected = data.expected(T) if timed else data.steady(T)
     if not expected.gain.any():
         return before
-    seen = data.offsets(T, used)
+    seen = data.offsets(T, found=used)
     names = [one.name for one in used]
     views = [view for view in data.views if view.name in names]
     rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
