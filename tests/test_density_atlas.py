@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import Atlas
-from mixpose.density.atlas import MAX_PAGES, REACH
+from mixpose.density.atlas import MAX_PAGES, PAGE, REACH
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -200,6 +200,34 @@ def test_grey_values_drawn_finely_have_their_gradients_to_the_last_digits() -> N
         # single precision and the cut at 6 sigma are left
         np.testing.assert_allclose(value, C, rtol=2e-5)
         np.testing.assert_allclose(gradient, slope, atol=2e-5 * C.max())
+
+
+def test_pages_are_drawn_half_a_page_around_a_place_and_no_farther() -> None:
+    points = far_apart(12, side=3)
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    half = PAGE / 2 * SIGMA / STEPS_PER_SIGMA
+    pending = int(np.count_nonzero(atlas.table < 0))
+    looked_up(atlas, points)
+    drawn = pending - int(np.count_nonzero(atlas.table < 0))
+    assert drawn == 4 * len(points)
+    for turn in np.linspace(0, 2 * np.pi, 9):
+        looked_up(atlas, points + 0.99 * half * np.array([np.cos(turn), np.sin(turn)]))
+    assert pending - int(np.count_nonzero(atlas.table < 0)) == drawn
+
+
+def test_many_detections_looked_up_a_few_at_a_time_are_all_there() -> None:
+    # more pages than one column of the array takes, in pieces of one row and of several
+    points = far_apart(13, side=18)
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    assert atlas.values.shape[1] > atlas.plane.side
+    rng = np.random.default_rng(13)
+    top = peak(len(points))
+    for some in np.split(rng.permutation(len(points)), [1, 3, 10, 40, 41, 100]):
+        y = points[some] + rng.uniform(-0.5, 0.5, (len(some), 2)) * SIGMA
+        value, _ = looked_up(atlas, y)
+        off = 2 * spline_error(STEPS_PER_SIGMA, THIRD) * top
+        np.testing.assert_allclose(value, exact(points, y)[0], atol=off)
+    np.testing.assert_allclose(looked_up(atlas, points)[0], top, rtol=0.02)
 
 
 def test_pages_join_without_a_seam() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.density import ErrorRules, Offsets, errors_seen
+from mixpose.density import ErrorRules, Offsets, errors_seen, log_likelihood
 
 Floats = NDArray[np.float64]
 
@@ -71,9 +71,10 @@ def test_half_of_offsets_far_off_are_no_noise_where_the_rest_is_as_small_as_befo
     seen = errors_seen(offsets_of(away), 6, before, RULES)
     assert seen.variances[0] == pytest.approx(0.02**2, rel=0.3)
     # by chance no nine of sixteen offsets are within 0.05 of a wide noise
-    assert seen.log_likelihood > 20
+    likelihood = log_likelihood(seen.blurs, offsets_of(away), 6, RULES)
+    assert likelihood > 20
     unknown = errors_seen(offsets_of(away), 6, NOTHING, RULES)
-    assert unknown.log_likelihood < seen.log_likelihood
+    assert log_likelihood(unknown.blurs, offsets_of(away), 6, RULES) < likelihood
 
 
 def test_sensors_are_weighed_half_by_what_all_of_them_err_by() -> None:

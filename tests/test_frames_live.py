@@ -374,7 +374,9 @@ def test_poses_of_a_pipe_appear_while_it_is_written_and_its_end_ends_the_run(
         assert process.stdout is not None
         early = [process.stdout.readline() for _ in range(10)]  # the rest is not sent yet
         seen.set()
-        rest, errors = process.communicate(timeout=60)
+        assert process.stderr is not None
+        # not `communicate`, which passes over what `readline` has read ahead
+        rest, errors = process.stdout.read(), process.stderr.read()
     writer.join()
     assert process.returncode == 0, errors
     assert '"frame": 8,' in early[-1]

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.body import Body, Gravity, PointFeature, SegmentFeature
-from mixpose.density import Density, Observation, Window, render, weighted
+from mixpose.density import Density, Observation, Window, render
 from mixpose.objective import (
     OBJECTIVES,
     IndependentObjective,
@@ -301,35 +301,6 @@ def test_a_segment_is_matched_along_its_whole_length() -> None:
 def paper_objective(views: list[View], body: Body, samples: Floats, sigma: float) -> PaperObjective:
     terms = sampled_terms(views, samples, [sigma] * len(views))
     return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
-
-
-def test_weighting_around_zero_is_one_more_blur(
-    paper_body: Body, parallel_cameras: list[ParallelBeam]
-) -> None:
-    # ∫ w(s) f(s) ds for a Gaussian w: f on densities whose variances have grown by that of w
-    views = views_of(parallel_cameras, paper_body, TRUTH, 4.0)
-    samples = paper_body.sample(2)
-    plain = sampled_terms(views, samples, [4.0, 4.0])
-    step = plain[0].density.window.step
-    s = step * np.arange(-20, 21)
-    w = np.exp(-0.5 * (s[:, None] ** 2 + s**2) / 3.0**2).astype(np.float32)
-    averaged = PaperObjective(
-        [replace(term, density=weighted(term.density, w)) for term in plain], samples
-    )
-    blurred = paper_objective(views, paper_body, samples, 5.0)
-    poses = perturb(TRUTH, random_twists(30, 4.0, 0.03))
-    # truncated weights and grids of four points per σ leave a few per cent
-    np.testing.assert_allclose(averaged.value(poses), blurred.value(poses), rtol=0.04)
-
-
-def test_weights_that_are_no_weights_are_refused(
-    paper_body: Body, parallel_cameras: list[ParallelBeam]
-) -> None:
-    views = views_of(parallel_cameras, paper_body, TRUTH, 4.0)
-    density = sampled_terms(views, paper_body.sample(2), [4.0, 4.0])[0].density
-    for w in (np.zeros((3, 3)), -np.ones((3, 3)), np.ones((2, 3))):
-        with pytest.raises(ValueError, match="weights"):
-            weighted(density, w.astype(np.float32))
 
 
 def test_wider_features_keep_the_maximum_of_a_deformed_object_where_exact_ones_split_it(

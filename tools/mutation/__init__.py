@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mutation import (
+    bodies,
     densities,
     edge,
     estimating,
@@ -10,18 +11,25 @@ from mutation import (
     following,
     geometry,
     images,
+    judging,
+    objectives,
     planning,
     recordings,
+    searching,
 )
 from mutation.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
     *geometry.MUTANTS,
+    *bodies.MUTANTS,
     *images.MUTANTS,
     *recordings.MUTANTS,
     *densities.MUTANTS,
+    *objectives.MUTANTS,
     *estimating.MUTANTS,
+    *judging.MUTANTS,
     *following.MUTANTS,
+    *searching.MUTANTS,
     *files.MUTANTS,
     *edge.MUTANTS,
     *planning.MUTANTS,

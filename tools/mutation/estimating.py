@@ -1,4 +1,4 @@
-"""Mutants of `fit` and `judgement`."""
+"""Mutants of `fit`."""
 
 from __future__ import annotations
 
@@ -48,10 +48,34 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "clear = (offsets.squared <= limits) | (offsets.shares == 0)",
-        "clear = offsets.squared < np.inf",
+        "clear = squared <= (errors.outlying**2 * variances)[sensor]",
+        "clear = squared < np.inf",
         "a cut spot bends the pose",
-        ("test_tracking_outliers.py",),
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-narrows-for-nothing",
+        "fit/near.py",
+        "< rules.moved**2",
+        "< 0.0",
+        "fits of large bodies draw every density three times",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-move-without-the-noise",
+        "fit/near.py",
+        "weights, J = shares / variances[sensor], self.J[..., free]",
+        "weights, J = shares, self.J[..., free]",
+        "how far narrower blurs move the pose is told in σ_ε, not in standard deviations",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-offsets-before-the-last-step",
+        "fit/near.py",
+        "away -= J @ ascent.step",
+        "away -= 0.0 * J @ ascent.step",
+        "offsets are those of a pose that was left",
+        ("test_fit_noise.py",),
     ),
 )
 
@@ -173,304 +197,4 @@ _MISFIT = (
     ),
 )
 
-_NOISE = (
-    Mutant(
-        "judgement-few-residuals-are-as-good-as-many",
-        "judgement/noise.py",
-        "return float(directions * tail / chdtri(directions, 1 - self.confidence))",
-        "return 1.0",
-        "covariances of few features are too small",
-    ),
-    Mutant(
-        "judgement-noise-of-earlier-frames-forgotten",
-        "judgement/noise.py",
-        "memory: float = constant(0.95,",
-        "memory: float = constant(0.0,",
-        "covariances change from frame to frame with the residuals of single frames",
-    ),
-    Mutant(
-        "judgement-noise-of-another-kind-joined",
-        "judgement/noise.py",
-        "return ratio / float(fdtri(degrees, known, model.by_chance))",
-        "return 0.0",
-        "a frame of large residuals is as sure as those before it",
-    ),
-    Mutant(
-        "judgement-noise-with-the-coordinates-used-up",
-        "judgement/noise.py",
-        "offsets, count = joined_offsets(associations), int(free.sum())",
-        "offsets, count = joined_offsets(associations), 0",
-        "noise seems smaller than it is",
-    ),
-    Mutant(
-        "judgement-information-in-sigmas",
-        "judgement/noise.py",
-        "one.shares / (variance * one.sigma**2)",
-        "one.shares / (variance * one.sigma)",
-        "covariances depend on the unit of a sensor",
-    ),
-    Mutant(
-        "judgement-unknown-noise-is-sigma",
-        "judgement/noise.py",
-        "typical = 0.0 if degrees >= 1 else model.errors.typical_degrees",
-        "typical = 0.0",
-        "three features in one camera have an exact pose",
-    ),
-)
-
-_FIELDS = (
-    Mutant(
-        "judgement-fields-of-a-sensor-are-noise",
-        "judgement/noise.py",
-        "np.tensordot(shares.variances * factors, parts, 1)",
-        "shares.variances[0] * factors[0] * parts[0]",
-        "a camera that was turned after its calibration leaves the pose as sure as before",
-    ),
-    Mutant(
-        "judgement-fields-that-the-pose-takes-are-seen",
-        "judgement/noise.py",
-        "left = [one - J @ each for one, each in zip(P, drawn, strict=True)]",
-        "left = [one for one, each in zip(P, drawn, strict=True)]",
-        "offsets that a pose takes for its own are thought to be small",
-    ),
-    Mutant(
-        "judgement-outliers-in-the-covariance",
-        "judgement/noise.py",
-        "shares = np.where(inlying, one.shares, 0.0)",
-        "shares = one.shares",
-        "a cut spot makes a frame unsure",
-    ),
-)
-
-_EVIDENCE = (
-    Mutant(
-        "judgement-misses-are-free",
-        "judgement/evidence.py",
-        "return math.log(1 - self.probability)",
-        "return 0.0",
-        "a pose that misses half of the body is as good as one that meets it",
-    ),
-    Mutant(
-        "judgement-out-of-view-is-free",
-        "judgement/evidence.py",
-        "unseen = sum(one.unseen for one in associations) * detection.log_unseen",
-        "unseen = 0.0",
-        "a pose gains by moving features out of the picture",
-    ),
-    Mutant(
-        "judgement-clutter-of-any-density",
-        "judgement/evidence.py",
-        "density = one.crowd *",
-        "density = 1e-6 *",
-        "poses in clutter are as sure as poses without",
-    ),
-    Mutant(
-        "judgement-choices-cost-nothing",
-        "judgement/evidence.py",
-        "return np.asarray(ways + assigned + math.log(2))",
-        "return np.asarray(0 * ways + math.log(2))",
-        "among many detections some pose is sure to be found by chance",
-    ),
-    Mutant(
-        "judgement-offsets-cost-nothing",
-        "judgement/evidence.py",
-        "gain[:, None] - squares / (2 * variance[:, None])",
-        "gain[:, None] - 0 * squares",
-        "a pose that meets features loosely is as good as one that meets them",
-    ),
-    Mutant(
-        "judgement-volume-of-the-other-sign",
-        "judgement/evidence.py",
-        "len(inner) * math.log(2 * math.pi) - _log_det(inner))",
-        "len(inner) * math.log(2 * math.pi) + _log_det(inner))",
-        "poses that are known well count as known badly",
-    ),
-    Mutant(
-        "judgement-prediction-does-not-count",
-        "judgement/evidence.py",
-        " + laplace + prior.log_density",
-        " + laplace",
-        "a pose far from its prediction is as good as one near it",
-    ),
-    Mutant(
-        "judgement-features-that-fix-the-pose-count",
-        "judgement/evidence.py",
-        "odds.gained * np.maximum(spare, 0.0) + odds.missed",
-        "odds.gained + odds.missed",
-        "three features in one camera, which fit whatever they are, are evidence",
-    ),
-    Mutant(
-        "judgement-a-point-in-space-counts-for-each-camera",
-        "judgement/evidence.py",
-        "together = np.nonzero(np.sum(near, axis=0) > 1)",
-        "together = np.nonzero(np.sum(near, axis=0) > 9)",
-        "screws that all cameras see pass for the body",
-    ),
-    Mutant(
-        "judgement-points-in-space-anywhere-are-the-feature",
-        "judgement/evidence.py",
-        "log_rarity + tight - 0.5 * away",
-        "log_rarity + tight",
-        "a false point beside a feature is as good as one at it",
-    ),
-    Mutant(
-        "judgement-points-in-space-are-missed-again",
-        "judgement/evidence.py",
-        "gained[pose, feature], missed[pose, feature] = space[likelier], 0.0",
-        "gained[pose, feature] = space[likelier]",
-        "a covered camera makes what two others see doubtful",
-    ),
-)
-
-_ACCEPTANCE = (
-    Mutant(
-        "judgement-rivals-never-count",
-        "judgement/acceptance.py",
-        "rival: float = constant(0.01,",
-        "rival: float = constant(2.0,",
-        "of two poses that fit alike one is called sure",
-    ),
-    Mutant(
-        "judgement-rivals-count-when-it-is-too-late",
-        "judgement/acceptance.py",
-        "rival: float = constant(0.01,",
-        "rival: float = constant(0.3,",
-        "a frame with a rival of one in ten is called sure",
-    ),
-    Mutant(
-        "judgement-sure-by-chance",
-        "judgement/acceptance.py",
-        "sure: float = constant(\n        7.0,",
-        "sure: float = constant(\n        1.0,",
-        "one pose in four of mere clutter is called sure",
-    ),
-    Mutant(
-        "judgement-open-turns-are-sure",
-        "judgement/acceptance.py",
-        "return bool(turns.max() < _OPEN_TURN**2)",
-        "return True",
-        "the turn about a line of features is called sure",
-    ),
-    Mutant(
-        "judgement-wide-turns-are-sure",
-        "judgement/acceptance.py",
-        "return bool(1.96 * judged.spread[3:].max() < np.radians(rules.widest_turn_deg))",
-        "return True",
-        "ranges that leave the turn open are called sure",
-        ("test_tracking_ranges.py",),
-    ),
-    Mutant(
-        "judgement-doubtful-without-coverage",
-        "judgement/acceptance.py",
-        "ranked[0].coverage < rules.doubtful_coverage",
-        "ranked[0].coverage < 0.0",
-        "poses that meet two features in clutter are told",
-    ),
-    Mutant(
-        "judgement-one-of-many-stands-out",
-        "judgement/acceptance.py",
-        "float(rest) + rules.standing_out",
-        "-np.inf",
-        "clutter without the body is never called lost",
-    ),
-    Mutant(
-        "judgement-three-markers-of-eight-are-the-body",
-        "judgement/acceptance.py",
-        "return len(met) >= min(rules.majority * len(in_view), rules.enough)",
-        "return True",
-        "three markers of another body pass for this one where it was expected",
-    ),
-    Mutant(
-        "judgement-too-few-coordinates-fix-a-pose",
-        "judgement/acceptance.py",
-        "return judged.measurements >= int(free.sum())",
-        "return True",
-        "a pose is told that the data do not fix",
-    ),
-    Mutant(
-        "judgement-symmetric-poses-are-rivals",
-        "judgement/acceptance.py",
-        "T_b = nearest_alike(b.T_world_object, body, T_a)",
-        "T_b = b.T_world_object",
-        "a symmetric body is its own rival",
-    ),
-    Mutant(
-        "judgement-anything-convinces",
-        "judgement/acceptance.py",
-        "return share > rules.convincing and is_sure(judged, free, rules)",
-        "return is_sure(judged, free, rules)",
-        "a body that slipped by a step of its grid is not looked for elsewhere",
-    ),
-    Mutant(
-        "judgement-a-covered-sensor-makes-doubt",
-        "judgement/acceptance.py",
-        "if len(agreeing) > 1 else judged.coverage",
-        "if len(agreeing) > 99 else judged.coverage",
-        "a covered camera makes every frame slow",
-    ),
-    Mutant(
-        "judgement-worse-twin-kept",
-        "judgement/acceptance.py",
-        "if new.log_evidence > old.log_evidence - rules.as_evident:",
-        "if new.log_evidence < old.log_evidence:",
-        "of two fits that are one pose the worse is told",
-    ),
-)
-
-_JUDGE = (
-    Mutant(
-        "judgement-symmetry-ignored",
-        "judgement/judge.py",
-        "if len(body.symmetries) == 1:",
-        "if len(body.symmetries) >= 1:",
-        "a symmetric body jumps between poses that look the same",
-    ),
-    Mutant(
-        "judgement-most-turned-twin",
-        "judgement/judge.py",
-        "alike[int(np.argmax(traces))]",
-        "alike[int(np.argmin(traces))]",
-        "of poses that look the same the farthest is told",
-    ),
-    Mutant(
-        "judgement-all-poses-believed-alike",
-        "judgement/judge.py",
-        "weights = np.exp(logs - logs.max())",
-        "weights = np.ones(len(logs))",
-        "evidence does not tell poses apart",
-    ),
-    Mutant(
-        "judgement-merged-features-move-as-one",
-        "judgement/association.py",
-        "np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)",
-        "np.where(paired[:, None, None], J, J)",
-        "the middle of two features moves as if it were one of them",
-        ("test_tracking_outliers.py",),
-    ),
-    Mutant(
-        "judgement-out-of-view-is-covered",
-        "judgement/association.py",
-        "max(self.expected + self.unseen, 1e-12)",
-        "max(self.expected, 1e-12)",
-        "a body half out of the picture convinces",
-    ),
-    Mutant(
-        "judgement-ranges-have-two-coordinates",
-        "judgement/association.py",
-        "return self.met * int(self.J.shape[1])",
-        "return self.met * 2",
-        "ranges seem to fix poses that they leave open",
-    ),
-)
-
-MUTANTS = (
-    *_NEAR,
-    *_NARROW,
-    *_PROBABLE,
-    *_MISFIT,
-    *_NOISE,
-    *_FIELDS,
-    *_EVIDENCE,
-    *_ACCEPTANCE,
-    *_JUDGE,
-)
+MUTANTS = (*_NEAR, *_NARROW, *_PROBABLE, *_MISFIT)

@@ -9,6 +9,7 @@ import typer
 
 from mixpose.cli.app_calibrate import calibrate
 from mixpose.cli.app_design import design
+from mixpose.cli.app_simulate import simulate
 from mixpose.cli.words import (
     AllowCode,
     ConvertFormat,
@@ -48,57 +49,65 @@ def _common(
     pass
 
 
+Sessions = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="SESSION.toml...",
+        help="One session file or several, patterns such as 'day*/session.toml', or text files "
+        "(.txt) with one to a line.",
+    ),
+]
+RunOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "-o",
+        "--output",
+        help="Write poses here, not to stdout, in the format that the suffix tells. With "
+        "several sessions, a folder in which each gets its own for poses, log and status; what "
+        "is done there already is not done again.",
+    ),
+]
+RunFormat = Annotated[
+    Format | None,
+    typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; or jsonl."),
+]
+Sources = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=PATH",
+        help="Another recording of a sensor, relative to the working folder; repeatable.",
+    ),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on after the last frame in the output.")]
+Workers = Annotated[int, typer.Option(min=1, help="How many sessions are run at a time.")]
+Overlay = Annotated[
+    Path | None,
+    typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
+        "local for one on this machine.",
+    ),
+]
+
+
 @app.command()
 def run(
     context: typer.Context,
-    sessions: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SESSION.toml...",
-            help="One session file or several, patterns such as 'day*/session.toml', or text files "
-            "(.txt) with one to a line.",
-        ),
-    ],
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="Write poses here, not to stdout, in the format that the suffix tells. With "
-            "several sessions, a folder in which each gets its own for poses, log and status; what "
-            "is done there already is not done again.",
-        ),
-    ] = None,
-    format: Annotated[
-        Format | None,
-        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; or jsonl."),
-    ] = None,
-    source: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=PATH",
-            help="Another recording of a sensor, relative to the working folder; repeatable.",
-        ),
-    ] = None,
+    sessions: Sessions,
+    output: RunOutput = None,
+    format: RunFormat = None,
+    source: Sources = None,
     start: Start = None,
     stop: Stop = None,
     step: Step = 1,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on after the last frame in the output.")
-    ] = False,
-    workers: Annotated[int, typer.Option(min=1, help="How many sessions are run at a time.")] = 1,
-    overlay: Annotated[
-        Path | None,
-        typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Run the sessions on a dask.distributed cluster: the address of its scheduler, or "
-            "local for one on this machine.",
-        ),
-    ] = None,
+    resume: Resume = False,
+    workers: Workers = 1,
+    overlay: Overlay = None,
+    scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
@@ -107,17 +116,9 @@ def run(
 
     selection = Selection(start, stop, step)
     sources, debug = tuple(source or ()), bool(context.obj)
-    named = None if format is None else format.value
+    written = format_of(output, None if format is None else format.value)
     request = RunRequest(
-        output,
-        format_of(output, named),
-        sources,
-        selection,
-        resume,
-        overlay,
-        debug,
-        allow_code,
-        scheduler,
+        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler
     )
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
 
@@ -204,114 +205,7 @@ def import_(
     import_files(files, output, unit=unit.value, lengths=None if lengths is None else lengths.value)
 
 
-@app.command()
-def simulate(
-    session: SessionFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="New folder for the recording.")],
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")],
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same recording.")] = 0,
-    fps: Annotated[
-        float | None,
-        typer.Option(help="Frames per second; for poses with times put fps into the session."),
-    ] = None,
-    noise: Annotated[float, typer.Option(help="Camera noise, grey levels.")] = 2.0,
-    clutter: Annotated[float, typer.Option(help="False features per frame and sensor.")] = 0.0,
-    hidden: Annotated[float, typer.Option(help="Chance that a feature is hidden.")] = 0.0,
-    missing: Annotated[float, typer.Option(help="Chance that a sensor has no frame.")] = 0.0,
-    brightness: Annotated[float, typer.Option(help="Peak of a spot, grey levels.")] = 170.0,
-    brightness_spread: Annotated[
-        float, typer.Option(help="Spread of the brightness over the features, as a share.")
-    ] = 0.1,
-    translation: Annotated[
-        float | None, typer.Option(help="Largest displacement along each axis, length units.")
-    ] = None,
-    rotation: Annotated[float, typer.Option(help="Largest turn about each axis, degrees.")] = 20.0,
-    period: Annotated[float, typer.Option(help="Seconds in which the motion comes round.")] = 4.0,
-    pixel_noise: Annotated[
-        float, typer.Option(help="Error of detections in a camera's table, px.")
-    ] = 0.1,
-    range_noise: Annotated[
-        float | None, typer.Option(help="Error of detections in a range table, length units.")
-    ] = None,
-    range_snr: Annotated[
-        float, typer.Option(help="Height of a profile's peak over its noise.")
-    ] = 30.0,
-    deform: Annotated[
-        bool, typer.Option("--deform", help="Displace features by the spread the object states.")
-    ] = False,
-    readout: Annotated[
-        float | None,
-        typer.Option(help="Seconds from a camera's first row to its last; else the session's."),
-    ] = None,
-    exposure: Annotated[
-        float | None, typer.Option(help="Seconds for which a row is lit; else the session's.")
-    ] = None,
-    delay: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=SECONDS", help="A sensor that is late; else the session's."),
-    ] = None,
-    out_of_step: Annotated[
-        float, typer.Option(help="Seconds from the first sensor to the last, in their times.")
-    ] = 0.0,
-    lamps: Annotated[int, typer.Option(min=0, help="Lamps behind the body.")] = 0,
-    mirror: Annotated[
-        float, typer.Option(help="Brightness of mirror images in a table below, as a share.")
-    ] = 0.0,
-    others: Annotated[
-        int, typer.Option(min=0, help="Other bodies with as many markers, beside this one.")
-    ] = 0,
-    occluder: Annotated[int, typer.Option(min=0, help="Dark bars that swing before it.")] = 0,
-    jpeg: Annotated[
-        int | None, typer.Option(min=1, max=100, help="Quality of lossy compression.")
-    ] = None,
-    bayer: Annotated[
-        bool, typer.Option("--bayer", help="Images of a colour sensor, interpolated.")
-    ] = False,
-    turned_camera: Annotated[
-        float, typer.Option(help="Degrees by which the last camera was turned meanwhile.")
-    ] = 0.0,
-    away_from: Annotated[
-        int | None, typer.Option(min=0, help="Frames after which the body is gone.")
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a recording in the folder.")
-    ] = False,
-) -> None:
-    """Render a recording with truth.jsonl that `run` can play."""
-    from mixpose.cli.simulate import delays_of, simulate_session  # noqa: PLC0415
-    from mixpose.simulation import SimulationOptions  # noqa: PLC0415
-
-    options = SimulationOptions(
-        frames=frames,
-        seed=seed,
-        fps=fps,
-        noise=noise,
-        clutter=clutter,
-        hidden=hidden,
-        missing=missing,
-        brightness=brightness,
-        brightness_spread=brightness_spread,
-        amplitude_translation=translation,
-        amplitude_rotation_deg=rotation,
-        period_s=period,
-        pixel_noise=pixel_noise,
-        range_noise=range_noise,
-        range_snr=range_snr,
-        deform=deform,
-        readout=readout,
-        exposure=exposure,
-        delay=delays_of(delay or []),
-        out_of_step=out_of_step,
-        lamps=lamps,
-        mirror=mirror,
-        others=others,
-        occluder=occluder,
-        jpeg=jpeg,
-        bayer=bayer,
-        turned_camera_deg=turned_camera,
-        away_from=away_from,
-    )
-    simulate_session(session, output, options, overwrite=overwrite)
+app.command()(simulate)
 
 
 @app.command()

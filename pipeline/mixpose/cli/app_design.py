@@ -7,55 +7,66 @@ from typing import Annotated
 
 import typer
 
+Sessions = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SESSION.toml", help="One system or several; others are held to the first."
+    ),
+]
+Poses = Annotated[
+    Path | None,
+    typer.Option(metavar="POSES.jsonl", help="Judge at these poses, not over a volume."),
+]
+Count = Annotated[int, typer.Option(min=1, max=2000, help="Number of poses in the volume.")]
+Volume = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Sides of the box around [start] or the middle of the view; else twice the "
+        "body's radius.",
+    ),
+]
+Turn = Annotated[
+    float | None,
+    typer.Option(help="Turn the body by up to so many degrees; else 20 about [start], or 180."),
+]
+Tip = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y,Z", help="Judge a point of the body, in its coordinates."),
+]
+Noise = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="SENSOR=NUMBER",
+        help="What features err by, px or length; SYSTEM:SENSOR=NUMBER for one system, * for "
+        "every sensor; else 0.2 of sigma for cameras, sigma for ranges.",
+    ),
+]
+MonteCarlo = Annotated[
+    int, typer.Option(min=0, help="Simulate and estimate so many frames of each system.")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Same seed, same study.")]
+Tolerance = Annotated[
+    float | None,
+    typer.Option(help="Markers of two bodies lie alike within this; else 10 % of the radius."),
+]
+JsonFile = Annotated[Path | None, typer.Option(help="Write all numbers here.")]
+PlotFile = Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")]
+
 
 def design(
-    sessions: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="SESSION.toml", help="One system or several; others are held to the first."
-        ),
-    ],
-    poses: Annotated[
-        Path | None,
-        typer.Option(metavar="POSES.jsonl", help="Judge at these poses, not over a volume."),
-    ] = None,
-    count: Annotated[
-        int, typer.Option(min=1, max=2000, help="Number of poses in the volume.")
-    ] = 24,
-    volume: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z",
-            help="Sides of the box around [start] or the middle of the view; else twice the "
-            "body's radius.",
-        ),
-    ] = None,
-    turn: Annotated[
-        float | None,
-        typer.Option(help="Turn the body by up to so many degrees; else 20 about [start], or 180."),
-    ] = None,
-    tip: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="Judge a point of the body, in its coordinates."),
-    ] = None,
-    noise: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="SENSOR=NUMBER",
-            help="What features err by, px or length; SYSTEM:SENSOR=NUMBER for one system, * for "
-            "every sensor; else 0.2 of sigma for cameras, sigma for ranges.",
-        ),
-    ] = None,
-    monte_carlo: Annotated[
-        int, typer.Option(min=0, help="Simulate and estimate so many frames of each system.")
-    ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same study.")] = 0,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(help="Markers of two bodies lie alike within this; else 10 % of the radius."),
-    ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write all numbers here.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")] = None,
+    sessions: Sessions,
+    poses: Poses = None,
+    count: Count = 24,
+    volume: Volume = None,
+    turn: Turn = None,
+    tip: Tip = None,
+    noise: Noise = None,
+    monte_carlo: MonteCarlo = 0,
+    seed: Seed = 0,
+    tolerance: Tolerance = None,
+    json: JsonFile = None,
+    plot: PlotFile = None,
 ) -> None:
     """Predict the accuracy of planned systems, side by side, and what would improve them."""
     from mixpose.cli.design import DesignRequest, design_sessions  # noqa: PLC0415

@@ -11,13 +11,13 @@ from mixpose.density.extraction_error import (
     Seen,
     errors_seen,
     known_blurs,
+    log_likelihood,
     pooled,
 )
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
 from mixpose.density.grid import FAR, FLOOR, Density, Window
 from mixpose.density.observation import Observation, matched_atlas
 from mixpose.density.overlap import close_pairs, peak, self_overlap
-from mixpose.density.weighting import weighted
 
 __all__ = [
     "FAR",
@@ -36,11 +36,11 @@ __all__ = [
     "errors_seen",
     "features_met",
     "known_blurs",
+    "log_likelihood",
     "matched_atlas",
     "peak",
     "pooled",
     "render",
     "self_overlap",
     "surplus",
-    "weighted",
 ]

@@ -34,9 +34,15 @@ REACH = 4.25
 """Standard deviations around a detection that are drawn: features farther apart draw each other by
 less than 1e-3 σ_ε."""
 
-MIN_PAGE = 18
-"""Cells along the side of a page, at least.  A page is as wide as what a detection fills, so that
-each lies on two pages along an axis; pages of grey values alone are a standard deviation wide."""
+PAGE = 12
+"""Cells along the side of a page: three standard deviations of detections.  Four such pages around
+a place reach half a page beyond it, as far as a fit moves; larger ones are drawn for little use."""
+
+MIN_GRID_PAGE = 18
+"""The same of grey values alone, at least; as a rule a standard deviation."""
+
+MANY_PAGES = 40_000
+"""Pages of a sensor's plane from which they become larger, up to what a detection fills."""
 
 MAX_PAGES = 400_000
 """Pages of a sensor's plane; detections that are too far from their middle for it are left out,
@@ -44,10 +50,11 @@ and pages of grey values are larger."""
 
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
-_AT_ONCE = 64  # pages that are drawn together: what is made for them stays in the cache
+_AT_ONCE = 100_000  # cells that are drawn together: what is made for them stays in the cache
 _PENDING = -1  # in the table: not drawn yet
 _SIDES = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
 _QUARTERS = np.full(4, 0.25, dtype=np.float32)
+_BESIDE = 2.0  # cells beside a place that are looked up, at most
 
 
 class Atlas:
@@ -78,7 +85,7 @@ class Atlas:
     def __init__(
         self, patterns: Sequence[Pattern], sigmas: Sequence[float], steps_per_sigma: float
     ) -> None:
-        L, sigma, reach = len(patterns), np.array(sigmas), REACH * steps_per_sigma
+        L, sigma, reach = len(patterns), np.array(sigmas), REACH * steps_per_sigma + _BESIDE
         dimensions = np.array([_dimension(pattern) for pattern in patterns])
         self._flat = dimensions == 1
         self.per_unit = np.empty((L, 1, 1, 2))
@@ -99,17 +106,17 @@ class Atlas:
         self._first = (self.plane.squares * np.arange(L))[:, None, None]
         self._limit = np.array(self.plane.shape) * self.plane.page - 1e-3
         self._detections = _detections(patterns, places, self.plane, reach)
-        self.table = np.zeros(L * self.plane.squares, dtype=np.intp)
+        self.table = np.zeros(L * self.plane.squares, dtype=np.int32)
         self.table[self._detections.squares] = _PENDING
         for k in self._grids:
             (u, v), (last_u, last_v) = self.plane.squares_of(places[k] + [[-reach], [reach]])
             plane = self.table.reshape(L, *self.plane.shape[::-1])[k]
             plane[v : last_v + 1, u : last_u + 1] = _PENDING
-        pages = self._detections.squares.size + len(self._grids) * self.plane.squares
-        self._columns = min(math.isqrt(pages) + 1, _LARGEST // self.plane.side)
-        self._rows = min(pages // self._columns + 1, _LARGEST // self.plane.side)
-        self.values = np.zeros((self.plane.side, self._columns * self.plane.side, 3), np.float32)
-        self._drawn = 1  # the page of squares without anything
+        self._most = self._detections.squares.size + len(self._grids) * self.plane.squares
+        self._columns = self._most * self.plane.side // _LARGEST + 1
+        self._drawn = self._columns  # the first row is of squares without anything
+        side = self.plane.side
+        self.values = np.zeros((side, self._columns * side, 3), dtype=np.float32)
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
@@ -121,14 +128,18 @@ class Atlas:
         squares = square[..., 0] + self.plane.shape[0] * square[..., 1] + self._first
         number = self.table[squares]
         if number.min(initial=0) < 0:
-            self._draw(squares[number < 0])
+            if self._grids:
+                squares_to_draw = squares[number < 0]
+            else:
+                squares_to_draw = self._around(index, number < 0)
+            self._draw(np.unique(squares_to_draw))
             number = self.table[squares]
-        row, column = np.divmod(number, self._columns)
-        square *= -self.plane.page
-        square[..., 0] += self.plane.side * column
-        square[..., 1] += self.plane.side * row
-        square += 1
-        index += square
+        corner = np.empty(index.shape)
+        np.divmod(number, self._columns, out=(corner[..., 1], corner[..., 0]), casting="unsafe")
+        corner *= self.plane.side
+        corner += 1.0
+        index -= square * self.plane.page
+        index += corner
         maps = index.reshape(-1, 2).T
         beside = maps - np.rint(maps)
         beside *= beside
@@ -139,50 +150,68 @@ class Atlas:
         sampled = _QUARTERS @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._units)
 
-    def _numbers(self, count: int) -> Indices:
-        """Numbers of more pages, with room for them; memory that is not written to is free."""
-        number = np.arange(self._drawn, self._drawn + count)
-        self._drawn += count
-        rows, side = -(-self._drawn // self._columns), self.plane.side
-        if rows * side > len(self.values):
-            # so large that allocators keep it from frame to frame
-            rows = max(min(4 * rows, self._rows), rows)
-            values = np.empty((rows * side, *self.values.shape[1:]), dtype=np.float32)
-            values[: len(self.values)] = self.values
-            self.values = values
-        return number
+    def _around(self, index: Floats, pending: NDArray[np.bool_]) -> Indices:
+        """The four squares around places (L, H, n, 2) in cells that lie on pending ones.
+
+        Fits go on a little, and drawing once is cheaper than drawing twice.
+        """
+        where = np.nonzero(pending)
+        corner = (index[where] * (1.0 / self.plane.page) - 0.5).astype(np.intp)
+        columns = self.plane.shape[0]
+        first = self.plane.squares * where[0] + corner[:, 0] + columns * corner[:, 1]
+        squares = first[:, None] + np.array([0, 1, columns, columns + 1])
+        return np.asarray(squares[self.table[squares] < 0])
 
     def _draw(self, squares: Indices) -> None:
-        """Draw the pages of squares of the table that are pending; all that are, if few."""
-        few = not self._grids and self._detections.squares.size <= 2 * _AT_ONCE
-        squares = np.flatnonzero(self.table < 0) if few else np.unique(squares)
+        """Draw the pages of pending squares of the table, none of which is twice."""
         side, columns = self.plane.side, self._columns
-        for begin in range(0, len(squares), _AT_ONCE):
-            some = squares[begin : begin + _AT_ONCE]
-            number = self._numbers(len(some))
-            self.table[some] = number
+        at_once = max(_AT_ONCE // side**2, columns)
+        if len(squares) > at_once:  # pages of as many detections are drawn together
+            reached = np.bincount(self._detections.squares.ravel(), minlength=len(self.table))
+            squares = squares[np.argsort(reached[squares], kind="stable")]
+        self._reserve(len(squares))
+        while len(squares):
+            row, column = divmod(self._drawn, columns)
+            whole = 0 if column else min(len(squares), at_once) // columns
+            count = whole * columns or min(len(squares), columns - column)
+            some, squares = squares[:count], squares[count:]
+            room = self.values[row * side : (row + max(whole, 1)) * side]
+            room = room.reshape(-1, side, columns, 3 * side).swapaxes(1, 2)
+            pages = room if whole else room[:, column : column + count]
+            self.table[some] = np.arange(self._drawn, self._drawn + count)
             sensor, square = np.divmod(some, self.plane.squares)
-            corner = np.empty((len(some), 2))
-            np.divmod(
-                square, self.plane.shape[0], out=(corner[:, 1], corner[:, 0]), casting="unsafe"
-            )
+            corner = np.empty((count, 2))
+            rows_columns = corner[:, 1], corner[:, 0]
+            np.divmod(square, self.plane.shape[0], out=rows_columns, casting="unsafe")
             corner *= self.plane.page
             corner -= 1
-            drawn = self._around_detections(corner, int(number[0]))
+            self._draw_detections(corner, pages)
             for k in self._grids:
                 for i in np.flatnonzero(sensor == k).tolist():
-                    drawn[i] = self._of_grid(k, corner[i])
-            pages = self.values.reshape(-1, side, columns, side, 3)
-            pages[number // columns, :, number % columns] = drawn
+                    page = pages[i // pages.shape[1], i % pages.shape[1]]
+                    page[...] = self._of_grid(k, corner[i]).reshape(page.shape)
+            self._drawn += count
 
-    def _around_detections(self, corner: Floats, begin: int) -> Singles:
-        """Pages (P, side, side, 3), numbered from `begin`, with corners (P, 2) in cells.
+    def _reserve(self, pages: int) -> None:
+        """Make room for further pages."""
+        side, columns = self.plane.side, self._columns
+        rows = -(-(self._drawn + pages) // columns)
+        if rows * side > len(self.values):
+            # so large that allocators keep it from frame to frame; memory that is not written to
+            # is free
+            most = max(min(4 * rows, self._most // columns + 2), rows)
+            values = np.empty((most * side, *self.values.shape[1:]), dtype=np.float32)
+            values[: len(self.values)] = self.values
+            self.values = values
+
+    def _draw_detections(self, corner: Floats, pages: Singles) -> None:
+        """Draw pages with corners (P, 2) in cells, the next ones, in place.
 
         They hold exact Gaussians: sums, over the detections that reach a page, of products of one
         along v and one along u, in three channels side by side.
         """
-        side, found = self.plane.side, self._detections
-        number = self.table[found.squares] - begin
+        side, found, count = self.plane.side, self._detections, len(corner)
+        number = self.table[found.squares] - self._drawn
         of, which = np.nonzero(number >= 0)
         number = number[of, which]
         place = np.zeros_like(number)  # among the detections of its page
@@ -199,14 +228,13 @@ class Atlas:
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
         bells[:, 1] *= found.share[of, None]
         slopes = bells * away
-        along_v = np.zeros((len(corner), most, 2, side), dtype=np.float32)
-        along_u = np.zeros((len(corner), most, 2, side, 3), dtype=np.float32)
+        along_v = np.zeros((count, most, 2, side), dtype=np.float32)
+        along_u = np.zeros((count, most, 2, side, 3), dtype=np.float32)
         along_v[number, place, 0], along_v[number, place, 1] = bells[:, 1], slopes[:, 1]
         along_u[number, place, 0, :, 0] = along_u[number, place, 1, :, 2] = bells[:, 0]
         along_u[number, place, 0, :, 1] = slopes[:, 0]
-        rows = along_v.reshape(len(corner), 2 * most, side).swapaxes(1, 2)
-        pages = rows @ along_u.reshape(len(corner), 2 * most, 3 * side)
-        return np.asarray(pages.reshape(len(corner), side, side, 3))
+        rows = along_v.reshape(*pages.shape[:2], 2 * most, side).swapaxes(2, 3)
+        np.matmul(rows, along_u.reshape(*pages.shape[:2], 2 * most, 3 * side), out=pages)
 
     def _of_grid(self, sensor: int, corner: Floats) -> Singles:
         """A page (side, side, 3) of grey values or a profile, which begins at a corner (2,)."""
@@ -254,8 +282,11 @@ class Plane(NamedTuple):
         is seen beside it.  There is a rim of squares with nothing.
         """
         q = np.concatenate([one for k, one in enumerate(places) if k not in grids] or places)
-        page = max(math.ceil(reach / REACH if len(grids) == len(places) else 2 * reach), MIN_PAGE)
+        page = max(math.ceil(reach / REACH), MIN_GRID_PAGE) if grids else PAGE
         lower, upper = q.min(axis=0), q.max(axis=0)
+        if len(grids) < len(places) and _count(lower, upper, page) > MANY_PAGES:
+            several = math.ceil(page * math.sqrt(_count(lower, upper, page) / MANY_PAGES))
+            page = min(several, math.ceil(2 * reach))
         is_cut = len(grids) < len(places) and _count(lower, upper, page) > MAX_PAGES
         if is_cut:
             middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
@@ -287,7 +318,7 @@ class _Detections(NamedTuple):
     share : (D,) float32
         Of the sensor's density.
     sensor : (D,) int
-    squares : (D, 4) int
+    squares : (D, S) int
     """
 
     q: Floats
@@ -309,11 +340,12 @@ def _detections(
         parts = [(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0))]
     sensor, q, share = (np.concatenate(column) for column in zip(*parts, strict=True))
     first = plane.squares_of(q - reach)
+    beside = np.arange(int(2 * reach / plane.page) + 2)
     if plane.is_cut:
-        inside = ((first >= 1) & (first <= np.array(plane.shape) - 3)).all(axis=1)
+        inside = ((first >= 1) & (first < np.array(plane.shape) - len(beside))).all(axis=1)
         sensor, q, share, first = sensor[inside], q[inside], share[inside], first[inside]
     begin = plane.squares * sensor + first[:, 0] + plane.shape[0] * first[:, 1]
-    squares = begin[:, None] + np.array([0, 1, plane.shape[0], plane.shape[0] + 1])
+    squares = begin[:, None] + np.add.outer(plane.shape[0] * beside, beside).ravel()
     return _Detections(q - plane.origin, share.astype(np.float32), sensor, squares)
 
 

@@ -121,14 +121,11 @@ class Seen(NamedTuple):
         Of each sensor's noise, together with what was known.
     blurs : (L,) float64
         In σ_ε.
-    log_likelihood : float
-        Of the offsets, less that of none being noise; the pose was fitted to them.
     """
 
     own: Floats
     variances: Floats
     blurs: Floats
-    log_likelihood: float = 0.0
 
 
 def errors_seen(
@@ -149,18 +146,18 @@ def errors_seen(
     blurs = np.ones(len(offsets.dimensions))
     while True:
         seen = _seen_at(blurs, offsets, free, known, rules)
-        if (seen.blurs > 0.9 * blurs).all():
+        if all((seen.blurs > 0.9 * blurs).tolist()):
             break
         blurs = np.minimum(seen.blurs, blurs)
     blurs = known_blurs(offsets.finest, known, rules)
-    if (seen.blurs <= _ALIKE * blurs).all():
+    if all((seen.blurs <= _ALIKE * blurs).tolist()):
         return seen
     for _ in range(_ROUNDS):
         narrow = _seen_at(blurs, offsets, free, known, rules)
         if (narrow.blurs <= _ALIKE * blurs).all():
             break
         blurs = narrow.blurs
-    return max(seen, narrow, key=lambda one: one.log_likelihood)
+    return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))
 
 
 def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
@@ -172,27 +169,40 @@ def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules())
 def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
     squared, shares, sensor, dimensions, finest = offsets
-    count = len(dimensions)
-    weights = shares * np.exp(-0.25 * squared / blurs[sensor] ** 2)
-    total = dimensions * np.bincount(sensor, weights, count)
-    q = np.bincount(sensor, weights * squared, count) / np.maximum(total, 1e-12)
-    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
-    factor = 1 / (1 - np.minimum(0.5 * q / blurs**2, 0.5))
-    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
-    degrees = factor ** (dimensions / 2) * total
-    most = float(degrees.sum())
+    weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])
+    totals = np.bincount(sensor, weights, len(dimensions)).tolist()
+    sums = np.bincount(sensor, weights * squared, len(dimensions)).tolist()
+    squares, degrees = [], []
+    for total, weighted, m, blur in zip(totals, sums, dimensions.tolist(), blurs.tolist()):
+        q = weighted / max(m * total, _NOTHING)
+        # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+        factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))
+        # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+        degrees.append(factor ** (m / 2) * m * total)
+        squares.append(factor * q * degrees[-1])
+    most = sum(degrees)
     left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
-    own = np.array([(left > 0) * factor * q * degrees, left * degrees])
+    own = np.array([squares, degrees]) * [[left > 0], [left]]
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
-    wide += rules.shared * (np.average(wide, weights=total + _NOTHING) - wide)
-    blurs = np.clip(rules.blur * np.sqrt(wide), finest, 1.0)
-    return Seen(own, variances, blurs, _log_likelihood(blurs, offsets, free, rules))
+    each = dimensions * totals + _NOTHING
+    wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
+    return Seen(own, variances, np.minimum(np.maximum(rules.blur * np.sqrt(wide), finest), 1.0))
 
 
-def _log_likelihood(blurs: Floats, offsets: Offsets, free: int, rules: ErrorRules) -> float:
-    """Of normal offsets and some that are anywhere; what a pose is free to fit is paid for."""
+def log_likelihood(
+    blurs: Floats, offsets: Offsets, free: int, rules: ErrorRules = ErrorRules()
+) -> float:
+    """Of offsets, normal ones and some that are anywhere, less that of none being noise.
+
+    What a pose is free to fit is paid for.
+
+    Parameters
+    ----------
+    blurs : (L,) array
+        That go by the noise; the others as of `errors_seen`.
+    """
     m = offsets.dimensions[offsets.sensor]
     variances = (blurs[offsets.sensor] / rules.blur) ** 2
     peaks = (2 * np.pi * variances) ** (-0.5 * m)
@@ -210,8 +220,9 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
     that of all sensors, in degrees of freedom.
     """
-    squares, degrees = sums
-    most = float(degrees.sum()) + typical
-    common = (float(squares.sum()) + typical * rules.typical**2) / max(most, 1e-12)
+    squares, degrees = sums.tolist()
+    most = sum(degrees) + typical
+    common = (sum(squares) + typical * rules.typical**2) / max(most, _NOTHING)
     pull = min(rules.typical_degrees, most)
-    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, 1e-12))
+    pairs = zip(squares, degrees)
+    return np.array([(one + pull * common) / max(d + pull, _NOTHING) for one, d in pairs])

@@ -16,6 +16,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
@@ -113,8 +114,8 @@ class Observation:
         pattern = self.pattern
         if not isinstance(pattern, PointPattern) or not len(y):
             return self
-        away = pattern.points - y[:, None]
-        near = ((away * away).sum(axis=2) < (reach * self.sigma) ** 2).any(axis=0)
+        distances, _ = cKDTree(y).query(pattern.points, distance_upper_bound=reach * self.sigma)
+        near = np.isfinite(distances)
         if not near.any() or near.all():
             return self
         return replace(self, pattern=PointPattern(pattern.points[near], pattern.weights[near]))

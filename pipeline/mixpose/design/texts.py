@@ -63,8 +63,7 @@ def _system_lines(system: System, study: Study) -> list[str]:
         more = ", ..." if len(summary.undetermined) > _NOTED else ""
         say("open", f"not determined at {len(summary.undetermined)} poses: {listed}{more}")
     rows = zip(plan.names, summary.seen, summary.fewest, strict=True)
-    count = len(plan.body)
-    say("in view", ", ".join(f"{n} {s:.0%} (least {f} of {count})" for n, s, f in rows))
+    say("in view", ", ".join(f"{n} {s:.0%} (least {f} of {len(plan.body)})" for n, s, f in rows))
     crowded = [(n, c) for n, c in zip(plan.names, summary.crowded, strict=True) if c > _CROWDED]
     if crowded:
         told = ", ".join(f"{n} {c:.0%}" for n, c in crowded)

@@ -11,20 +11,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs, log_likelihood
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import Prior, has_likelihood
-from mixpose.objective import MatchedObjective, Objective, View, build_objective, matched_objective
+from mixpose.objective import (
+    MatchedObjective,
+    Objective,
+    Quadratic,
+    View,
+    build_objective,
+    matched_objective,
+)
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb
@@ -48,6 +55,11 @@ class FitRules:
     schedule: ScheduleRules = ScheduleRules()
     misfit: MisfitRules = MisfitRules()
     narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
+    moved: float = constant(
+        0.5,
+        "standard deviations by which narrower blurs have to move the pose: where all offsets are "
+        "normal they do so, too, as they are 5 % less efficient in six directions",
+    )
     near: float = constant(
         0.1,
         "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
@@ -118,9 +130,10 @@ def fit_near(
     rules : FitRules
     """
     free = free_mask(options)
-    matched = options.objective == "matched"
     ascent = None
-    if matched:
+    if options.objective != "matched":
+        finest = None
+    else:
         finest = finest or matched_objective(views, body, [v.observation.sigma for v in views])
     if finest and not has_likelihood(views):
         here = finest.linearise(T_start)
@@ -128,10 +141,10 @@ def fit_near(
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
-    if matched and any(view.observation.cell is None for view in views):
+    if finest and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
         beside = np.zeros(len(views)) if least is None else least
-        ascent = _to_the_noise(views, body, ascent, free, finest, known, beside, errors, rules)
+        ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
@@ -166,66 +179,115 @@ def _through_blurs(
 
 
 def _to_the_noise(
-    views: Sequence[View],
-    body: Body,
     ascent: Ascent[Floats],
+    objective: MatchedObjective,
     free: NDArray[np.bool_],
-    finest: MatchedObjective | None,
     noise: Sequence[Noise],
     beside: Floats,
     errors: ErrorRules,
     rules: FitRules,
 ) -> Ascent[Floats]:
-    """The ascent from σ_ε on, while detections are farther off than their noise lets them be."""
+    """The ascent from σ_ε on, while offsets that are no noise of the detections move the pose."""
     known = np.array([(one.squares, one.degrees) for one in noise]).T
-    sigmas = np.array([view.observation.sigma for view in views])
-    blurs, best = np.ones(len(views)), None
-    objective = finest or matched_objective(views, body, sigmas.tolist())
+    sigmas = np.array([view.observation.sigma for view in objective.views])
+    blurs, count = np.ones(len(sigmas)), int(free.sum())
+    likeliest, best = -np.inf, ascent
     while True:
-        offsets = _offsets(objective, ascent.state, errors)
-        finest_blurs = np.clip(errors.blur * beside, offsets.finest, 1.0)
-        offsets = offsets._replace(finest=finest_blurs)
-        seen = errors_seen(offsets, int(free.sum()), known, errors)
-        if best is None or seen.log_likelihood > best[0]:
-            best = (seen.log_likelihood, ascent)
+        met = _met(objective, ascent, sigmas, beside, errors)
+        seen = errors_seen(met.offsets, count, known, errors)
         # offsets of a bent pose hide how small the noise is
-        least = known_blurs(offsets.finest, known, errors)
-        noise_seen = np.minimum(seen.variances, (least / errors.blur) ** 2)
-        limits = errors.outlying**2 * noise_seen[offsets.sensor]
-        clear = (offsets.squared <= limits) | (offsets.shares == 0)
-        least = np.maximum(least, blurs / rules.schedule.ratio)
-        narrower = np.minimum(np.minimum(seen.blurs, least), blurs)
-        if clear.all() or (narrower > rules.narrower * blurs).all():
-            return best[1]
+        least = known_blurs(met.offsets.finest, known, errors)
+        variances = np.minimum(seen.variances, (least / errors.blur) ** 2)
+        end = np.minimum(np.minimum(seen.blurs, least), blurs)
+        narrower = np.maximum(end, blurs / rules.schedule.ratio)
+        is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
+        if best is ascent and (is_end or met.moved(free, blurs, end, variances) < rules.moved**2):
+            return ascent
+        likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
+        if likelihood > likeliest:
+            likeliest, best = likelihood, ascent
+        if is_end:
+            return best
         blurs = narrower
-        near = _around_the_body(objective, ascent.state, errors.reach)
-        objective = matched_objective(near, body, (blurs * sigmas).tolist())
+        # a fine grid has to hold no more than what was detected around the features
+        near = [
+            replace(view, observation=view.observation.around(places, errors.reach))
+            for view, places in zip(objective.views, met.places, strict=True)
+        ]
+        objective = matched_objective(near, objective.projection.body, (blurs * sigmas).tolist())
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 
-def _offsets(objective: MatchedObjective, T: Floats, errors: ErrorRules) -> Offsets:
-    """How far off features are met, as the density around them shows it: v ∇C / C."""
-    at, sampled, _ = objective.match(T[None])
+class _Met(NamedTuple):
+    """Where K features are met.
+
+    Attributes
+    ----------
+    offsets : Offsets
+    away : (K, 2) float64
+        The offsets themselves, in σ_ε.
+    J : (K, 2, 6) float64
+        Of the features by the pose, in σ_ε.
+    places : list of (n, m) float64
+        Of all features that a sensor sees, in its units.
+    """
+
+    offsets: Offsets
+    away: Floats
+    J: Floats
+    places: list[Floats]
+
+    def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
+        """Whether no offset is larger than noise of variances (L,) lets it be."""
+        squared, shares, sensor, _, _ = self.offsets
+        clear = squared <= (errors.outlying**2 * variances)[sensor]
+        return bool((clear | (shares == 0)).all())
+
+    def moved(
+        self, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
+    ) -> float:
+        """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
+        squared, shares, sensor, _, _ = self.offsets
+        now, then = (np.exp(-0.25 * squared / one[sensor] ** 2) for one in (blurs, narrower))
+        weights, J = shares / variances[sensor], self.J[..., free]
+        pull = ((weights * (then - now))[:, None] * self.away).ravel()
+        rows = ((weights * then)[:, None, None] * J).reshape(len(pull), -1)
+        J = J.reshape(len(pull), -1)
+        gradient = pull @ J
+        return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])
+
+
+def _met(
+    objective: MatchedObjective,
+    ascent: Ascent[Floats],
+    sigmas: Floats,
+    beside: Floats,
+    errors: ErrorRules,
+) -> _Met:
+    """How far off features are met, as the density around them shows it: v ∇C / C.
+
+    What was looked up is where the last step began; the step is taken off.
+    """
+    assert isinstance(ascent.last, Quadratic), "an ascent of the matched objective"
+    assert ascent.last.match is not None
+    at, sampled, _ = ascent.last.match
     sensor, feature = np.nonzero(at.seen[:, 0] & (sampled[:, 0, :, 0] > 0))
-    C, slope = sampled[sensor, 0, feature, 0], sampled[sensor, 0, feature, 1:]
-    sigmas = np.array([view.observation.sigma for view in objective.views])
-    away = slope * (objective.variances[sensor, 0] / C / sigmas[sensor])[:, None]
+    here = sampled[sensor, 0, feature]
+    J = at.J[sensor, 0, feature] / sigmas[sensor, None, None]
+    scale = objective.variances[sensor, 0] / (here[:, 0] * sigmas[sensor])
+    away = here[:, 1:] * scale[:, None]
+    if ascent.step is not None:
+        away -= J @ ascent.step
     squared = (away * away).sum(axis=1)
     shares = np.where(squared < errors.met**2, at.weights[sensor, 0, feature], 0.0)
     dimensions = objective.projection.dimensions
+    places = [
+        y[0, seen[0], :m] for y, seen, m in zip(at.y, at.seen, dimensions.tolist(), strict=True)
+    ]
     finest = [
-        view.observation.narrowest(errors.narrowest, y[0, seen[0], :m])
-        for view, y, seen, m in zip(objective.views, at.y, at.seen, dimensions, strict=True)
+        view.observation.narrowest(errors.narrowest, one)
+        for view, one in zip(objective.views, places, strict=True)
     ]
-    return Offsets(squared, shares, sensor, dimensions, np.array(finest))
-
-
-def _around_the_body(objective: MatchedObjective, T: Floats, reach: float) -> list[View]:
-    """Views with what was detected around the features alone: a fine grid has to hold no more."""
-    at = objective.projection.project(T[None])
-    return [
-        replace(view, observation=view.observation.around(y[0, seen[0], :m], reach))
-        for view, y, seen, m in zip(
-            objective.views, at.y, at.seen, objective.projection.dimensions, strict=True
-        )
-    ]
+    least = np.minimum(np.maximum(errors.blur * beside, finest), 1.0)
+    offsets = Offsets(squared, shares, sensor, dimensions, least)
+    return _Met(offsets, away, J, places)

@@ -28,7 +28,6 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
@@ -244,7 +243,7 @@ def _moments(
         blocks.append(_fields(one.places, shares))
     weighted = np.concatenate(parts)
     J, r = weighted[:, :count], weighted[:, count]
-    P = [block_diag(*kind) for kind in zip(*blocks)]
+    P = [_side_by_side(kind) for kind in zip(*blocks)]
     inverse = _inverse(J.T @ J)
     drawn = [inverse @ (J.T @ one) for one in P]
     left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
@@ -255,6 +254,17 @@ def _moments(
     expected = np.array([[degrees, *once], [once[0], *K[0]], [once[1], *K[1]]])
     own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
     return own, np.array([inverse, *(one @ one.T for one in drawn)])
+
+
+def _side_by_side(fields: Sequence[Floats]) -> Floats:
+    """Fields of each sensor as columns of their own."""
+    P = np.zeros(np.sum([one.shape for one in fields], axis=0))
+    row = column = 0
+    for one in fields:
+        below, beside = row + one.shape[0], column + one.shape[1]
+        P[row:below, column:beside] = one
+        row, column = below, beside
+    return P
 
 
 def _fields(places: Floats, shares: Floats) -> tuple[Floats, Floats]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density import Observation
+from mixpose.objective.kernel import Match
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -59,12 +60,15 @@ class Quadratic(NamedTuple):
         Symmetric, positive semidefinite.
     hessian : (6, 6) float64 or None
         Minus the second derivative itself, where it is known; may be indefinite.
+    match : Match or None
+        What a matched objective made it of.
     """
 
     value: float
     gradient: Floats
     curvature: Floats
     hessian: Floats | None = None
+    match: Match | None = None
 
 
 class Objective(Protocol):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import Literal, TypeAlias
+from collections.abc import Sequence
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,36 +15,7 @@ from mixpose.objective.paper import IndependentObjective, PaperObjective, sample
 
 Floats: TypeAlias = NDArray[np.float64]
 ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
-Builder: TypeAlias = Callable[[Sequence[View], Body, Floats, Sequence[float], Floats], Objective]
-
-
-def _matched(
-    views: Sequence[View],
-    body: Body,
-    samples: Floats,
-    sigmas: Sequence[float],
-    near: Floats,
-) -> Objective:
-    return matched_objective(views, body, sigmas)
-
-
-def _sampled(
-    kind: type[PaperObjective] | type[IndependentObjective],
-    views: Sequence[View],
-    body: Body,
-    samples: Floats,
-    sigmas: Sequence[float],
-    near: Floats,
-) -> Objective:
-    terms = sampled_terms(views, samples, sigmas, near)
-    return kind(terms, samples, body.world_offsets(samples.shape[1]))
-
-
-OBJECTIVES: dict[ObjectiveName, Builder] = {
-    "matched": _matched,
-    "paper": partial(_sampled, PaperObjective),
-    "independent": partial(_sampled, IndependentObjective),
-}
+OBJECTIVES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
 
 
 def build_objective(
@@ -71,4 +41,8 @@ def build_objective(
     near : (4, 4) array
         Pose around whose projection sampled densities are made.
     """
-    return OBJECTIVES[name](views, body, samples, sigmas, near)
+    if name == "matched":
+        return matched_objective(views, body, sigmas)
+    kind = PaperObjective if name == "paper" else IndependentObjective
+    terms = sampled_terms(views, samples, sigmas, near)
+    return kind(terms, samples, body.world_offsets(samples.shape[1]))

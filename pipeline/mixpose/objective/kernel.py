@@ -61,6 +61,14 @@ class Overlaps(NamedTuple):
     away: Floats
 
 
+class Match(NamedTuple):
+    """Features that are predicted at H poses, C and its gradient there (L, H, n, 3), and ⟨h, h⟩."""
+
+    at: Projected
+    sampled: Floats
+    over: Overlaps
+
+
 def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
     """How far the predicted features overlap.
 
@@ -105,11 +113,11 @@ def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     if n <= ALL_PAIRS:
         return close_pairs(y[0, 0], 1.0)
     each = [
-        np.sort(close_pairs(y[k, h], float(v)), axis=1)
+        close_pairs(y[k, h], float(v)) @ [n, 1]
         for k, v in enumerate(variances[:, 0])
         for h in range(y.shape[1])
     ]
-    return each[0] if len(each) == 1 else np.unique(np.concatenate(each), axis=0)
+    return np.stack(np.divmod(np.unique(np.concatenate(each)), n), axis=1)
 
 
 def slopes(

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
 from mixpose.objective.base import Quadratic, View
-from mixpose.objective.kernel import Overlaps, Slopes, overlaps, slopes
-from mixpose.objective.projection import BodyProjection, Projected, project_body
+from mixpose.objective.kernel import Match, Slopes, overlaps, slopes
+from mixpose.objective.projection import BodyProjection, project_body
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -33,6 +33,7 @@ what the best centres of blobs err by."""
 
 FINE_STEPS = 48.0
 """The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
+
 
 _TOGETHER = 200_000  # features times poses that are held in memory at once
 
@@ -99,28 +100,25 @@ class MatchedObjective:
             parts.append(self.weights / self.energies * product**2 / norm)
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
 
-    def match(self, poses: Floats) -> tuple[Projected, Floats, Overlaps]:
-        """The predicted features at poses (H, 4, 4), C with its gradient there, and ⟨h, h⟩."""
+    def match(self, poses: Floats) -> Match:
+        """What is predicted at poses (H, 4, 4), and what is there."""
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
-        return at, sampled, overlaps(at.y, at.weights, self.variances, self.tops)
+        return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
-        if len(poses) == 1:
-            return self._slopes(poses)
-        parts = [self._slopes(some) for some in self._blocks(poses)]
+        parts = [self._slopes(self.match(some)) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _slopes(self, poses: Floats) -> Slopes:
-        at, sampled, over = self.match(poses)
-        scales = self.weights / self.energies
-        return slopes(at, sampled, over, self.variances, self.tops, scales)
+    def _slopes(self, match: Match) -> Slopes:
+        return slopes(*match, self.variances, self.tops, self.weights / self.energies)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and curvature at one pose (4, 4)."""
-        value, gradient, curvature = self.slopes(T_world_object[None])
-        return Quadratic(float(value[0]), gradient[0], curvature[0])
+        match = self.match(T_world_object[None])
+        value, gradient, curvature = self._slopes(match)
+        return Quadratic(float(value[0]), gradient[0], curvature[0], match=match)
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)

@@ -76,12 +76,17 @@ class NewtonOptions:
 
 @dataclass(frozen=True)
 class Ascent(Generic[State]):
-    """Where an ascent ended."""
+    """Where an ascent ended.
+
+    `last` is the model that was evaluated last, and `step` what was taken from there unseen.
+    """
 
     state: State
     value: float
     converged: bool
     iterations: int
+    last: Model | None = None
+    step: Floats | None = None
 
 
 class _Inner(NamedTuple):
@@ -127,7 +132,7 @@ def ascend(
         size = abs(here.value)
         if gain <= options.tolerance * size or gain**2 <= options.remaining * size * before:
             # so near, the model is right: its last step is taken unseen
-            return Ascent(move(state, step), here.value + gain, True, iteration)
+            return Ascent(move(state, step), here.value + gain, True, iteration, here, step)
         candidate = move(state, step)
         there = model(candidate)
         next_damping = max(damping / 10, 1e-9)
@@ -139,9 +144,9 @@ def ascend(
             continue
         damping = max(10 * damping, _HELD_BACK)
         if damping > _STUCK:
-            return Ascent(state, here.value, close, iteration)
+            return Ascent(state, here.value, close, iteration, here)
         step, gain = _step(here, inner, damping)
-    return Ascent(state, here.value, False, options.iterations)
+    return Ascent(state, here.value, False, options.iterations, here)
 
 
 def _step(here: Model, inner: _Inner | None, damping: float) -> tuple[Floats, float]:

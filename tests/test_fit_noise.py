@@ -1,0 +1,137 @@
+"""Fits go on to blurs as narrow as the detections' noise where that moves the pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
+
+from mixpose.body import Body, PointFeature
+from mixpose.density import ErrorRules, Noise, errors_seen
+from mixpose.fit import EstimatorOptions, FitRules, fit_near, near
+from mixpose.judgement.expected_covariance import expected_covariance
+from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.optimise import Ascent, ascend
+from mixpose.records import PointPattern
+from mixpose.rigid import Floats, perturb, twist_between
+from mixpose.sensors import PinholeCamera
+
+NOISE_PX = 0.2
+MANY = Body(
+    "many",
+    tuple(PointFeature(point) for point in np.random.default_rng(3).uniform(-110, 110, (70, 3))),
+)
+NEVER = FitRules(moved=np.inf)
+ALWAYS = FitRules(moved=0.0)
+
+
+def fitted(views: Sequence[View], body: Body, rules: FitRules = FitRules()) -> Floats:
+    start = perturb(TRUTH, np.array([1.0, -0.8, 0.6, 0.004, -0.005, 0.003]))
+    samples, spread = body.means[:, None], np.repeat([2.0, 0.01], 3)
+    return fit_near(
+        views, body, start, spread, EstimatorOptions(), samples, rules=rules
+    ).T_world_object
+
+
+def apart(views: Sequence[View], body: Body, T_a: Floats, T_b: Floats) -> float:
+    """Distance of two poses in standard deviations of the detections' noise."""
+    sensors, count = [view.sensor for view in views], len(views)
+    covariance, _ = expected_covariance(sensors, [NOISE_PX] * count, body, TRUTH, ALL_FREE)
+    twist = twist_between(T_a, T_b)
+    return float(np.sqrt(twist @ np.linalg.solve(covariance, twist)))
+
+
+def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent[Floats]]:
+    objective = matched_objective(views, body, [view.observation.sigma for view in views])
+    return objective, ascend(objective.linearise, perturb, TRUTH, ALL_FREE, near.SHARP)
+
+
+def bent(views: list[View], by_px: float) -> list[View]:
+    """Views of which the first detects one feature beside its place."""
+    pattern = views[0].observation.pattern
+    assert isinstance(pattern, PointPattern)
+    points = pattern.points.copy()
+    points[0] += [by_px, 0.0]
+    return [view_of("0", views[0].sensor, points), *views[1:]]
+
+
+@pytest.mark.parametrize("by_px", [1.5, 2.5])
+def test_a_spot_that_is_cut_hardly_bends_the_pose(
+    by_px: float, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    views = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=1)
+    whole = fitted(views, EIGHT, NEVER)
+    cut = bent(views, by_px)
+    assert apart(views, EIGHT, fitted(cut, EIGHT, NEVER), whole) > 1.5
+    # what least squares lose by one of sixteen detections, √(2 · 6/32 / (1 - 6/32)) = 0.7, and by
+    # Welsch's loss in its place, √(0.05 · 6) = 0.55
+    assert apart(views, EIGHT, fitted(cut, EIGHT), whole) < 1.25
+
+
+def test_an_outlier_among_many_detections_is_left_where_it_moves_nothing(
+    pinhole_cameras: list[PinholeCamera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views = bent(detect(pinhole_cameras[:2], MANY, TRUTH, noise=NOISE_PX, seed=2), 1.0)
+    drawn: list[Sequence[float]] = []
+
+    def recorded(views: Sequence[View], body: Body, sigmas: Sequence[float]) -> MatchedObjective:
+        drawn.append(sigmas)
+        return matched_objective(views, body, sigmas)
+
+    monkeypatch.setattr(near, "matched_objective", recorded)
+    T = fitted(views, MANY)
+    assert drawn == [[1.5, 1.5]]
+    narrow = fitted(views, MANY, ALWAYS)
+    assert len(drawn) > 2
+    # foreseen by one step of several
+    assert 0 < apart(views, MANY, T, narrow) < FitRules().moved * 1.4
+
+
+def test_how_far_narrower_blurs_move_the_pose_is_known_before(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    errors, known = ErrorRules(), np.zeros((2, 2))
+    for seed, body in ((1, EIGHT), (2, EIGHT), (3, MANY)):
+        views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=seed), 1.2)
+        objective, ascent = at_sigma(views, body)
+        sigmas = np.array([view.observation.sigma for view in views])
+        met = near._met(objective, ascent, sigmas, np.zeros(2), errors)
+        seen = errors_seen(met.offsets, 6, known, errors)
+        expected = met.moved(ALL_FREE, np.ones(2), seen.blurs, seen.variances)
+        narrow = matched_objective(views, body, (seen.blurs * sigmas).tolist())
+        end = ascend(narrow.linearise, perturb, ascent.state, ALL_FREE, near.SHARP).state
+        unit = float(np.sqrt(seen.variances.mean())) * 1.5 / NOISE_PX
+        moved = apart(views, body, end, ascent.state) / unit
+        # one step of iterated least squares, of which there are some
+        assert 0.6 * moved < np.sqrt(expected) < 1.2 * moved
+
+
+def test_offsets_are_those_at_the_end_of_an_ascent_whose_last_step_is_not_looked_up(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=4)
+    objective, ascent = at_sigma(views, EIGHT)
+    assert ascent.step is not None
+    sigmas = np.array([view.observation.sigma for view in views])
+    found = near._met(objective, ascent, sigmas, np.zeros(2), ErrorRules()).away
+    at, sampled, _ = objective.match(ascent.state[None])
+    there = 2 * sigmas[:, None, None] * sampled[:, 0, :, 1:] / sampled[:, 0, :, :1]
+    shift = np.abs(at.J[:, 0] @ ascent.step).max() / 1.5
+    assert shift > 1e-4
+    # to second order of the step
+    np.testing.assert_allclose(found, there.reshape(-1, 2), atol=shift / 50)
+
+
+def test_the_noise_of_frames_before_counts(pinhole_cameras: list[PinholeCamera]) -> None:
+    views = bent(detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=0.02, seed=5), 0.4)
+    arguments = views, EIGHT, TRUTH, np.repeat([2.0, 0.01], 3), EstimatorOptions()
+    samples = EIGHT.means[:, None]
+    ends = [
+        fit_near(*arguments, samples, noise=[Noise(200 * s**2, 200.0)] * 2).T_world_object
+        for s in (0.4, 0.02)
+    ]
+    # where detections erred by 0.6 px so far, one that is 0.4 px off is no outlier
+    off = [apart(views, EIGHT, end, TRUTH) for end in ends]
+    assert off[1] < off[0] / 2

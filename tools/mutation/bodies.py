@@ -1,0 +1,167 @@
+"""Mutants of `body` and `optimise`."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_BODY = (
+    Mutant(
+        "body-symmetric-on-average",
+        "body/symmetry.py",
+        "distance.max() <= tolerance",
+        "distance.mean() <= tolerance",
+        "a marker moved on purpose to break a symmetry is overlooked",
+    ),
+    Mutant(
+        "body-normals-not-turned",
+        "body/symmetry.py",
+        "((normals @ T[:3, :3].T) * normals[image])",
+        "(normals * normals[image])",
+        "a board seen from behind counts as the same as from the front",
+    ),
+    Mutant(
+        "body-one-normal-is-enough",
+        "body/symmetry.py",
+        "sum(axis=1).min() > _SAME_NORMAL",
+        "sum(axis=1).max() > _SAME_NORMAL",
+        "a symmetry holds though most normals are turned",
+    ),
+    Mutant(
+        "body-symmetry-without-spread",
+        "body/model.py",
+        "symmetries(points, max(default_tolerance(points), self.spread))",
+        "symmetries(points, default_tolerance(points))",
+        "poses that the spread of the features hides are not known as alike",
+    ),
+    Mutant(
+        "body-samples-not-mirrored",
+        "body/sampling.py",
+        "np.concatenate([points, 1.0 - points])",
+        "np.concatenate([points, points])",
+        "the mean of the samples is off its feature",
+    ),
+    Mutant(
+        "body-box-of-half-the-width",
+        "body/features.py",
+        "np.sqrt(12.0)",
+        "np.sqrt(3.0)",
+        "a uniform spread is half as wide as stated",
+    ),
+    Mutant(
+        "body-variance-for-deviation",
+        "body/features.py",
+        "vectors * np.sqrt(np.maximum(values, 0.0))",
+        "vectors * np.maximum(values, 0.0)",
+        "samples are spread by the variance in place of the deviation",
+    ),
+    Mutant(
+        "body-nodes-at-the-beginnings",
+        "body/features.py",
+        "(np.arange(SEGMENT_NODES) + 0.5)[:, None]",
+        "np.arange(SEGMENT_NODES)[:, None]",
+        "a line is shifted by half a piece",
+    ),
+    Mutant(
+        "body-radius-from-the-origin",
+        "body/model.py",
+        "away = self.nodes.points - self.means.mean(axis=0)",
+        "away = self.nodes.points",
+        "a body measured from afar counts as large, and so do all lengths that follow from it",
+    ),
+    Mutant(
+        "body-least-spread",
+        "body/model.py",
+        "np.linalg.eigvalsh(self.covariances).max()",
+        "np.linalg.eigvalsh(self.covariances).min()",
+        "features that are uncertain in one direction count as exact",
+    ),
+    Mutant(
+        "body-gravity-of-any-length",
+        "body/model.py",
+        "unit = direction / np.linalg.norm(direction)",
+        "unit = direction",
+        "the length of the direction scales the displacement",
+    ),
+    Mutant(
+        "body-gravity-by-the-place-along-a-line",
+        "body/model.py",
+        "seed=seed)[:, 4]",
+        "seed=seed)[:, 3]",
+        "a displacement along gravity goes with the place along a line",
+    ),
+    Mutant(
+        "body-exact-in-spite-of-gravity",
+        "body/model.py",
+        "return sharp and self.gravity is None",
+        "return sharp",
+        "the displacement along gravity is left out",
+    ),
+    Mutant(
+        "body-fresh-offsets-are-common",
+        "body/model.py",
+        "seed=seed + 7919 * i)",
+        "seed=seed)",
+        "samples that should be independent are the same",
+    ),
+)
+
+_OPTIMISE = (
+    Mutant(
+        "optimise-accepts-what-is-worse",
+        "optimise/newton.py",
+        "if there.value > here.value or",
+        "if there.value < here.value or",
+        "the ascent goes down",
+    ),
+    Mutant(
+        "optimise-damps-less-after-failure",
+        "optimise/newton.py",
+        "damping = max(10 * damping, _HELD_BACK)",
+        "damping = max(0.1 * damping, _HELD_BACK)",
+        "a step that led astray is tried again for ever",
+    ),
+    Mutant(
+        "optimise-gain-without-curvature",
+        "optimise/newton.py",
+        "partial @ (g - 0.5 * (C @ partial))",
+        "partial @ g",
+        "the value at the end is more than the function has",
+    ),
+    Mutant(
+        "optimise-any-hessian",
+        "optimise/newton.py",
+        "if hessian is not None and _is_definite(hessian - _LEAST_CURVATURE * C):",
+        "if hessian is not None:",
+        "where the Hessian is not definite the step leads to a saddle or a minimum",
+    ),
+    Mutant(
+        "optimise-no-hessian",
+        "optimise/newton.py",
+        "        C = hessian\n",
+        "        C = 1.0 * C\n",
+        "more evaluations than Newton's method needs",
+    ),
+    Mutant(
+        "optimise-always-converged",
+        "optimise/newton.py",
+        "return Ascent(state, here.value, False, options.iterations, here)",
+        "return Ascent(state, here.value, True, options.iterations, here)",
+        "an ascent that ran out of iterations counts as done",
+    ),
+    Mutant(
+        "optimise-flat-directions-are-singular",
+        "optimise/newton.py",
+        "* 1e-12 * damping + _TINY",
+        "* 0.0",
+        "a direction without curvature ends the run with an error",
+    ),
+    Mutant(
+        "optimise-last-step-not-taken",
+        "optimise/newton.py",
+        "return Ascent(move(state, step), here.value + gain, True, iteration, here, step)",
+        "return Ascent(state, here.value, True, iteration, here)",
+        "the state is a step short of the maximum",
+    ),
+)
+
+MUTANTS = (*_BODY, *_OPTIMISE)

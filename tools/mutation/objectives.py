@@ -1,0 +1,168 @@
+"""Mutants of `objective`."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_PROJECTION = (
+    Mutant(
+        "objective-turn-about-x-of-the-other-sign",
+        "objective/projection.py",
+        "J[..., 3] = y * c - z * b",
+        "J[..., 3] = z * b - y * c",
+        "steps about x turn the wrong way",
+    ),
+    Mutant(
+        "objective-averted-features-expected",
+        "objective/projection.py",
+        "seen &= faced",
+        "seen &= np.ones_like(faced)",
+        "features on the back of a body are missed in every frame",
+    ),
+    Mutant(
+        "objective-hidden-features-weigh",
+        "objective/projection.py",
+        "self._weights * seen)",
+        "self._weights * np.ones_like(seen))",
+        "features out of view make a pose worse",
+    ),
+)
+
+_KERNEL = (
+    Mutant(
+        "objective-overlap-pushes-instead-of-pulling",
+        "objective/kernel.py",
+        "rest - amplitude[..., None] * half",
+        "rest + amplitude[..., None] * half",
+        "the gradient is wrong where features overlap",
+    ),
+    Mutant(
+        "objective-overlap-counted-twice",
+        "objective/kernel.py",
+        "half = -(scaled[:, :, None] @ (along_i - along_j))",
+        "half = -2 * (scaled[:, :, None] @ (along_i - along_j))",
+        "the gradient is wrong where features overlap",
+    ),
+    Mutant(
+        "objective-curvature-of-half-the-pairs",
+        "objective/kernel.py",
+        "return half, gram + cross + cross.swapaxes(2, 3)",
+        "return half, gram + cross",
+        "steps are too long or too short where features overlap",
+    ),
+    Mutant(
+        "objective-curvature-with-the-amplitude",
+        "objective/kernel.py",
+        "(level * (gram - outer))",
+        "(level * gram)",
+        "steps are too short where features overlap",
+    ),
+    Mutant(
+        "objective-overlap-ends-early",
+        "objective/kernel.py",
+        "_NEGLIGIBLE = -16.0",
+        "_NEGLIGIBLE = -1.0",
+        "overlaps of features more than 1.4 standard deviations apart are left out",
+    ),
+    Mutant(
+        "objective-neighbours-taken-for-apart",
+        "objective/kernel.py",
+        "np.count_nonzero(close) <= L * H * n)",
+        "np.count_nonzero(close) <= 2 * L * H * n)",
+        "a body with some features close together is fitted as if they were apart",
+    ),
+    Mutant(
+        "objective-gradient-of-the-other-sign",
+        "objective/kernel.py",
+        "(strength[..., None] * rest).sum(axis=0)",
+        "(-strength[..., None] * rest).sum(axis=0)",
+        "ascents go down",
+    ),
+    Mutant(
+        "objective-curvature-without-variance",
+        "objective/kernel.py",
+        "drawn = (strength / variances)[..., None] * C",
+        "drawn = strength[..., None] * C",
+        "steps depend on the unit of lengths",
+    ),
+)
+
+_MATCHED = (
+    Mutant(
+        "objective-sensors-weigh-alike",
+        "objective/matched.py",
+        "weights = tops / energies / len(body)",
+        "weights = np.ones(len(views))",
+        "clutter in one sensor takes the weight from its true features",
+    ),
+    Mutant(
+        "objective-out-of-the-picture-is-free",
+        "objective/matched.py",
+        "norm = norm + self.tops * (hidden**2).sum(axis=2)",
+        "norm = norm + 0.0 * (hidden**2).sum(axis=2)",
+        "a pose gains by moving features that meet nothing out of the picture",
+    ),
+    Mutant(
+        "objective-norm-as-narrow-as-a-feature",
+        "objective/matched.py",
+        "variances = 2 * np.square(sigmas)",
+        "variances = np.square(sigmas)",
+        "observed and predicted densities are not of one width",
+    ),
+    Mutant(
+        "objective-last-digits-drawn-coarsely",
+        "objective/matched.py",
+        "FINE_STEPS = 48.0",
+        "FINE_STEPS = 2.0",
+        "poses of grey values stop where the look-up is too coarse",
+        ("test_fit*.py",),
+    ),
+    Mutant(
+        "objective-ends-on-coarse-cells",
+        "objective/matched.py",
+        "STEPS_PER_SIGMA = 4.0",
+        "STEPS_PER_SIGMA = 1.0",
+        "estimates end on cells as large as a feature",
+        ("test_fit*.py",),
+    ),
+)
+
+_SAMPLED = (
+    Mutant(
+        "objective-left-of-the-image-is-seen",
+        "objective/index_maps.py",
+        "maps[~((maps >= low) & (maps <= high))] = FAR",
+        "maps[~(maps <= high)] = FAR",
+        "what a sensor cannot measure counts as measured",
+    ),
+    Mutant(
+        "objective-gravity-left-out",
+        "objective/index_maps.py",
+        "in_world[3, 3] = P[:, :3]",
+        "in_world[3, 3] = 0 * P[:, :3]",
+        "a body that sags is expected where it would be without weight",
+    ),
+    Mutant(
+        "objective-filling-samples-count",
+        "objective/paper.py",
+        "by_pose = blocks.reshape(count, -1)[:, :size]",
+        "by_pose = blocks.reshape(count, -1)",
+        "the last sample of a body counts several times",
+    ),
+    Mutant(
+        "objective-sensors-added",
+        "objective/paper.py",
+        "product *= g",
+        "product += g",
+        "formula (4) is another one",
+    ),
+    Mutant(
+        "objective-gradient-without-the-other-sensors",
+        "objective/paper.py",
+        "gradient += rest @ part.by_pose",
+        "gradient += part.by_pose.sum(axis=0)",
+        "steps of formula (4) go by sensors one by one",
+    ),
+)
+
+MUTANTS = (*_PROJECTION, *_KERNEL, *_MATCHED, *_SAMPLED)
