@@ -291,44 +291,6 @@ _TRACKER = (
     ),
 )
 
-<<<<<<< HEAD
-_REFLECTION = (
-    Mutant(
-        "tracking-mirror-images-pass",
-        "tracking/reflection.py",
-        "close)) > judged.log_evidence + ahead:",
-        "close)) > 1e9:",
-        "the body in a window is taken for the body",
-        ("test_tracking_reflection.py",),
-    ),
-    Mutant(
-        "tracking-mirror-images-are-suspected-everywhere",
-        "tracking/reflection.py",
-        "close)) > judged.log_evidence + ahead:",
-        "close)) > -1e9:",
-        "a flat body with a hidden marker is never sure",
-        ("test_tracking_reflection.py",),
-    ),
-    Mutant(
-        "tracking-a-body-given-mirrored-passes",
-        "tracking/reflection.py",
-        "return any(_evidence(mirror, start) > own + ahead for start in starts)",
-        "return False",
-        "few markers of a body given mirrored are met by chance, and the pose is ok",
-        ("test_tracking_reflection.py",),
-    ),
-    Mutant(
-        "tracking-few-markers-are-a-mirror-image",
-        "tracking/reflection.py",
-        "return any(_evidence(mirror, start) > own + ahead for start in starts)",
-        "return any(_evidence(mirror, start) > -1e9 for start in starts)",
-        "a body whose markers are hidden beside false points is never sure",
-        ("test_tracking_reflection.py",),
-    ),
-)
-
-=======
->>>>>>> main
 _STATIC = (
     Mutant(
         "tracking-static-clutter-is-searched-first",
