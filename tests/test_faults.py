@@ -35,9 +35,10 @@ def test_a_fault_makes_no_pose_wrong_and_is_named(name: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("name", "right"), [("bumped by 0.5° from frame 20", 20), ("frozen for 5 frames", 10)]
+    ("name", "right"),
+    [("bumped by 0.5° from frame 20", 20), ("frozen for 5 frames", 10), ("torn for 5 frames", 10)],
 )
-def test_a_camera_that_begins_to_contradict_the_other_makes_no_pose_wrong_and_is_named(
+def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and_is_named(
     name: str, right: int, tmp_path: Path
 ) -> None:
     found = outcome(FAULTS[name], tmp_path / "recording", stop=right + 5)

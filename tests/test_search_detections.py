@@ -11,7 +11,7 @@ from mixpose.rigid import from_rotation_vector, transform
 from mixpose.search.budget import LabelOptions, PeakOptions
 from mixpose.search.detections import peaks, sensor_detections
 from mixpose.search.inlier_counts import count_inliers, label_images
-from mixpose.search.orientations import spread_rotations, spread_turns
+from mixpose.search.spread import spread_rotations, spread_turns
 from mixpose.sensors import PinholeCamera
 
 TRUTH = from_rotation_vector([0.3, -0.2, 0.5], [5.0, -3.0, 8.0])

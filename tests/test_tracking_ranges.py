@@ -25,13 +25,13 @@ from mixpose.rigid import (
 from mixpose.sensors import RangeSensor
 from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.association_likelihood import (
+    RangeRules,
     _summed,
     are_associated,
     sum_associations,
 )
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.range_posterior import noise_ratio
-from mixpose.tracking.range_rules import RangeRules
 
 Floats = NDArray[np.float64]
 

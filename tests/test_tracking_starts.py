@@ -29,11 +29,9 @@ from mixpose.search.result import SearchResult
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
-from mixpose.tracking.proposers.doubt import is_doubtful
 from mixpose.tracking.proposers.multistart import starts_around
-from mixpose.tracking.proposers.predicted import predicted
+from mixpose.tracking.proposers.predicted import is_doubtful, predicted, stepped_aside
 from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import disagreeing
 from mixpose.tracking.track import Branch, SensorTally
 

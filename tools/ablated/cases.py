@@ -20,7 +20,7 @@ from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import FrameData, Start
-from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.predicted import is_doubtful
 from mixpose.tracking.proposers.searched import candidates_of, searched, starts_at
 
 Floats: TypeAlias = NDArray[np.float64]

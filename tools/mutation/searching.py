@@ -58,7 +58,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-slips-never-looked-for",
-        "tracking/proposers/stepped_aside.py",
+        "tracking/proposers/predicted.py",
         "if one.missed > before.missed + least and one.surplus > before.surplus + least:",
         "if one.missed > before.missed + 1e9 and one.surplus > before.surplus + least:",
         "a chessboard is followed a square off",
@@ -66,7 +66,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-slips-along-the-world",
-        "tracking/proposers/stepped_aside.py",
+        "tracking/proposers/predicted.py",
         "yield Start(T @ shifted, close)",
         "yield Start(shifted @ T, close)",
         "a chessboard that is turned is followed a square off",
@@ -146,7 +146,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-never-in-doubt",
-        "tracking/proposers/doubt.py",
+        "tracking/proposers/predicted.py",
         "return not ranked or not convinces(ranked[0], data.free, data.rules.acceptance)",
         "return not ranked",
         "where a prediction fails nothing else is tried",

@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
 from mixpose.rigid import Floats, perturb, rotation_angle_deg, transform
-from mixpose.search.orientations import spread_turns
+from mixpose.search.spread import spread_turns
 from mixpose.sensors import RangeSensor, Sensor
 from mixpose.session import SensorSetup
 

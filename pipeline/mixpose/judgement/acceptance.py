@@ -117,9 +117,7 @@ def stands_out(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: Accepta
 
     Poses that meet detections by chance come in numbers, and about equally good.
     """
-    if not ranked or not _is_fixed(ranked[0], free):
-        return False
-    if ranked[0].coverage < rules.doubtful_coverage:
+    if not ranked or ranked[0].coverage < rules.doubtful_coverage:
         return False
     if ranked[0].measurements < int(free.sum()) + rules.spare:
         return False

@@ -114,7 +114,6 @@ class SearchBudget:
     turn_steps: int = constant(3, "Newton steps of the place for an assumed orientation")
     max_places: int = constant(4, "places of the body's middle that are kept")
     different: float = constant(0.2, "of the body's radius: middles nearer to each other are one")
-    heading_step: float = constant(float(np.radians(4.0)), "between headings, for one free axis")
     orientation_step: float = constant(
         float(np.radians(12.0)), "between spread orientations: 3 ranges 6/0/0 99 of 100"
     )
@@ -152,6 +151,7 @@ LIVE = SearchBudget(
     min_shortlist=6,
     finalists=4,
     max_rays=12,
+    max_pairs=200,
     subsample=6,
     descent_features=16,
 )

@@ -16,23 +16,17 @@ from mixpose.search.detections import SensorDetections
 from mixpose.search.from_point_and_rays import from_point_and_rays
 from mixpose.search.from_point_triples import by_promise, from_point_triples
 from mixpose.search.from_three_rays import from_three_rays
-from mixpose.search.orientations import spread_turns
-from mixpose.search.placement import centres, on_points, on_rays, place
+from mixpose.search.placement import centres, place
 from mixpose.search.refinement import Stage
-from mixpose.search.spread import far_apart
+from mixpose.search.spread import far_apart, spread_turns
 from mixpose.search.triangulation import triangulate
-from mixpose.sensors import Rays
 
 Floats: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Callable[[int], Iterator[Floats]]
 
 
 def kinds_of_guesses(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    constraint: Constraint,
-    budget: SearchBudget,
-    seed: int,
+    detections: Sequence[SensorDetections], body: Body, budget: SearchBudget, seed: int
 ) -> list[Kind]:
     """Kinds of guesses from rays, the quickest first.
 
@@ -45,47 +39,20 @@ def kinds_of_guesses(
         the same.
     """
     seen = [each for each in detections if each.rays is not None and len(each.rays)]
-    rays, gates = _rays_and_gates(seen, budget)
+    rays = [each.rays for each in seen if each.rays is not None]
+    gates = [budget.gate * each.sigma for each in seen]
+    rng = partial(np.random.default_rng, seed)
     kinds: list[Kind] = []
-    if constraint.turns.sum() < 2:
-        kinds.append(partial(_from_restricted_turns, seen, body, constraint, budget))
     most = budget.max_problems
     if len(rays) > 1:
         most = budget.max_shared_problems // len(rays)
         found = triangulate(rays, gates, budget.min_sine)
         found = by_promise(found, seen, budget.gate, budget.max_points)
         few = body.means[far_apart(body.means, budget.subsample)]
-        kinds.append(partial(from_point_triples, found, body, budget, np.random.default_rng(seed)))
+        kinds.append(partial(from_point_triples, found, body, budget, rng()))
         kinds.append(partial(from_point_and_rays, found, rays, gates, few, budget))
-    kinds += [
-        partial(from_three_rays, each, body.means, most, budget, np.random.default_rng(seed))
-        for each in rays
-    ]
+    kinds += [partial(from_three_rays, each, body.means, most, budget, rng()) for each in rays]
     return kinds
-
-
-def _rays_and_gates(
-    detections: Sequence[SensorDetections], budget: SearchBudget
-) -> tuple[list[Rays], list[float]]:
-    rays = [each.rays for each in detections if each.rays is not None]
-    return rays, [budget.gate * each.sigma for each in detections]
-
-
-def _from_restricted_turns(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    constraint: Constraint,
-    budget: SearchBudget,
-    skipped: int,
-) -> Iterator[Floats]:
-    """Guesses for at most one free axis: all headings, one feature on one ray or point."""
-    turns = spread_turns(constraint.turns, budget.heading_step)
-    rotations = turns @ constraint.T_reference[:3, :3]
-    rays, gates = _rays_and_gates(detections, budget)
-    if constraint.shifts.sum() <= 2:
-        yield from on_rays(rays[skipped:], body, rotations, constraint)
-    elif len(rays) >= 2:
-        yield on_points(triangulate(rays, gates, budget.min_sine), body, rotations)
 
 
 def from_spread_orientations(

@@ -1,12 +1,11 @@
 """Where the body is, once its orientation is assumed.
 
-Its centre is where every sensor sees the middle of its detections; or, where few directions are
-free, one feature on one ray says it all.
+Its centre is where every sensor sees the middle of its detections.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -17,8 +16,7 @@ from mixpose.rigid import from_parts, transform
 from mixpose.search.budget import SearchBudget
 from mixpose.search.constraint import Constraint
 from mixpose.search.detections import SensorDetections
-from mixpose.search.triangulation import TriangulatedPoints
-from mixpose.sensors import Rays, Sensor
+from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -130,34 +128,3 @@ def _solve(A: Floats, b: Floats, free: NDArray[np.bool_], limit: float) -> Float
         steps[:, free] = np.linalg.solve(inner, b[:, free][..., None])[..., 0]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     return np.asarray(steps * np.minimum(1.0, limit / np.maximum(length, 1e-30)))
-
-
-def on_rays(
-    rays: Sequence[Rays], body: Body, rotations: Floats, constraint: Constraint
-) -> Iterator[Floats]:
-    """Poses with one feature on one ray, for at most two free shifts.
-
-    Yields
-    ------
-    (K, 4, 4) array
-        For one camera: all rotations (H, 3, 3), features and rays.
-    """
-    shifts = np.eye(3)[:, constraint.shifts]
-    reference = constraint.T_reference[:3, 3]
-    spots = rotations @ body.means.T + reference[:, None]
-    for each in rays:
-        across = np.eye(3) - each.directions[:, :, None] * each.directions[:, None, :]
-        solver = np.linalg.pinv(across @ shifts)
-        gap = each.origins[:, None, None] - spots.transpose(0, 2, 1)[None]
-        shift = np.einsum("mfk,mhnk->mhnf", solver @ across, gap)
-        translations = reference + shift @ shifts.T
-        wide = np.broadcast_to(rotations[None, :, None], (*translations.shape[:3], 3, 3))
-        yield from_parts(wide.reshape(-1, 3, 3), translations.reshape(-1, 3))
-
-
-def on_points(found: TriangulatedPoints, body: Body, rotations: Floats) -> Floats:
-    """Poses with one feature at one point in space, for all rotations (H, 3, 3)."""
-    spots = (rotations @ body.means.T).transpose(0, 2, 1)
-    translations = found.points[:, None, None] - spots[None]
-    wide = np.broadcast_to(rotations[None, :, None], (*translations.shape[:3], 3, 3))
-    return from_parts(wide.reshape(-1, 3, 3), translations.reshape(-1, 3))

@@ -122,9 +122,7 @@ class _Run:
 
     def _sharp(self, state: SearchState) -> SearchState:
         """Guesses from rays, kind after kind; those after the first from where they stopped."""
-        kinds = kinds_of_guesses(
-            self._detections, self._body, self._constraint, self._budget, self._seed
-        )
+        kinds = kinds_of_guesses(self._detections, self._body, self._budget, self._seed)
         most = self._budget.max_guesses
         if len(kinds) > 1:
             self._tried(kinds[0](0), None if most is None else most // 2)

@@ -1,4 +1,4 @@
-"""Which few points stand for many."""
+"""Which few stand for many: features far from one another, orientations spread evenly."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 
 Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
+
+_PHI = np.sqrt(2.0)
+_PSI = 1.533751168756204288118041
 
 
 @lru_cache(maxsize=32)
@@ -33,3 +37,33 @@ def far_apart(points: Floats, count: int) -> Indices:
         chosen.append(int(distance.argmax()))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.array(chosen, dtype=np.intp)
+
+
+def spread_rotations(count: int) -> Floats:
+    """Rotation matrices (count, 3, 3), a super-Fibonacci spiral over all orientations.
+
+    M. Alexa, Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3), CVPR 2022.
+    """
+    s = np.arange(count) + 0.5
+    r, R = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * np.pi * s / _PHI, 2 * np.pi * s / _PSI
+    quaternions = np.stack(
+        [r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)], axis=1
+    )
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix(), dtype=np.float64)
+
+
+def spread_turns(free: NDArray[np.bool_], step: float) -> Floats:
+    """Turns (count, 3, 3) about the free world axes (3,), about `step` radians apart."""
+    around = int(free.sum())
+    if around == 3:
+        return spread_rotations(int(np.ceil(np.pi**2 * 1.5 / step**3)))
+    if around == 0:
+        return np.eye(3)[None]
+    steps = int(np.ceil(2 * np.pi / step))
+    angles = -np.pi + 2 * np.pi * np.arange(steps) / steps
+    grid = np.stack(np.meshgrid(*([angles] * around), indexing="ij"), axis=-1).reshape(-1, around)
+    vectors = np.zeros((len(grid), 3))
+    vectors[:, free] = grid
+    vectors = vectors[np.linalg.norm(vectors, axis=1) <= np.pi + 1e-9]
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix(), dtype=np.float64)

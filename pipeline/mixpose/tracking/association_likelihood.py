@@ -22,14 +22,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.constants import constant
 from mixpose.judgement import DetectionModel
 from mixpose.objective import View, pose_jacobian
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import facing
-from mixpose.tracking.range_rules import RangeRules
 
 Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RangeRules:
+    """What is believed of single ranges."""
+
+    max_features: int = constant(
+        8, "of a body, up to which associations are summed: their subsets double with each"
+    )
+    stated_degrees: float = constant(
+        20.0, "degrees of freedom that σ_ε counts as, where residuals say otherwise"
+    )
+    min_information: float = constant(
+        0.02, "of the information of known labels: what a pose has in any direction"
+    )
 
 
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:

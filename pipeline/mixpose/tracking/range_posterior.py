@@ -22,8 +22,7 @@ from mixpose.judgement import DetectionModel, Judged, NoiseModel, Prior, Residua
 from mixpose.objective import Quadratic, View
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
-from mixpose.tracking.association_likelihood import sum_associations
-from mixpose.tracking.range_rules import RangeRules
+from mixpose.tracking.association_likelihood import RangeRules, sum_associations
 from mixpose.tracking.track import Prediction
 
 Floats: TypeAlias = NDArray[np.float64]

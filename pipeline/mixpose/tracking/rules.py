@@ -4,14 +4,43 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mixpose.constants import constant
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
+from mixpose.tracking.association_likelihood import RangeRules
 from mixpose.tracking.course import CourseRules
 from mixpose.tracking.motion import MotionRules
-from mixpose.tracking.proposal_rules import ProposalRules
-from mixpose.tracking.range_rules import RangeRules
 from mixpose.tracking.static_clutter import StaticRules
+
+
+@dataclass(frozen=True)
+class ProposalRules:
+    """What the proposers of `mixpose.tracking.proposers` go by."""
+
+    slipped: float = constant(
+        0.5, "of a feature, more that are missed and more beside it that belong to none: a step"
+    )
+    drawn: int = constant(
+        512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
+    )
+    kept: int = constant(5, "of these, starts that are fitted")
+    narrowing: float = constant(
+        3.0,
+        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
+        "at which drawn ones are scored; one that was searched for, by its square",
+    )
+    flat: float = constant(
+        0.15, "thickness of a body against its smaller width below which it may be tilted"
+    )
+    by_chance: float = constant(
+        14.0,
+        "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
+        "been met anywhere: five features by two cameras, where three always lie alike",
+    )
+    believed: int = constant(
+        3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
+    )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ everywhere else, and invents nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass, replace
 from typing import TypeAlias
 
@@ -169,30 +169,28 @@ class Tracker:
 
     def refitted(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
         """The same poses, fitted to other views and judged by them, most evident first."""
+        close = data.start_uncertainty / data.rules.proposals.narrowing**2
         found: list[Judged] = []
-        if data.views:
-            likelihood = likelihood_of(data)
-            close = data.start_uncertainty / data.rules.proposals.narrowing**2
-            for one in ranked:
-                left_out = {n: report.why for n, report in one.sensors.items() if report.why}
-                start = Start(one.T_world_object, close, left_out=left_out)
-                judged = likelihood.judge(likelihood.fit(start), start)
-                judged = replace(judged, proposer=one.proposer)
-                insert(found, judged, self.body, self.free, self.rules.acceptance)
+        for judged in self._again(data, ranked, close):
+            insert(found, judged, self.body, self.free, self.rules.acceptance)
         return found
 
     def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
         """The same poses, judged by other views, most evident first."""
+        return sorted(self._again(data, ranked, None), key=lambda one: -one.log_evidence)
+
+    def _again(
+        self, data: FrameData, ranked: Sequence[Judged], uncertainty: Floats | None
+    ) -> Iterator[Judged]:
+        """The same poses by other views, fitted where they are uncertain."""
         if not data.views:
-            return []
+            return
         likelihood = likelihood_of(data)
-        found = []
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
-            start = Start(one.T_world_object, left_out=left_out)
+            start = Start(one.T_world_object, uncertainty, left_out=left_out)
             judged = likelihood.judge(likelihood.fit(start), start)
-            found.append(replace(judged, proposer=one.proposer))
-        return sorted(found, key=lambda one: -one.log_evidence)
+            yield replace(judged, proposer=one.proposer)
 
     def estimate(
         self,

@@ -18,7 +18,7 @@ from mixpose.judgement import Judged
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb
 from mixpose.tracking.likelihood import FrameData, Start
-from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.predicted import is_doubtful
 
 Floats: TypeAlias = NDArray[np.float64]
 

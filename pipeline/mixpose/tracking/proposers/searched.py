@@ -9,7 +9,7 @@ from functools import partial
 from mixpose.judgement import Judged
 from mixpose.search import Candidate, search_frame
 from mixpose.tracking.likelihood import FrameData, Start
-from mixpose.tracking.proposers.doubt import is_doubtful
+from mixpose.tracking.proposers.predicted import is_doubtful
 
 
 def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
