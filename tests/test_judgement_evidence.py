@@ -60,6 +60,17 @@ def test_a_feature_that_is_missed_costs_as_much_as_its_chance() -> None:
     assert lost == pytest.approx(log(4))
 
 
+def test_a_feature_that_no_camera_sees_is_covered_and_counts_as_missed_twice() -> None:
+    six = replace(SIX, features=np.arange(7), shares=np.append(np.ones(6), 0.0), expected=7.0)
+    six = replace(six, places=np.zeros((7, 2)), offsets=np.zeros((7, 2)), J=np.zeros((7, 2, 6)))
+    for cameras, misses in ((1, 1), (2, 2), (4, 2)):
+        seen = [replace(six, name=str(k)) for k in range(cameras)]
+        all_met = [replace(one, shares=np.ones(7)) for one in seen]
+        lost = odds_by_volume(all_met, in_space=False) - odds_by_volume(seen, in_space=False)
+        met = cameras * log(0.75 / (2.0**2 * 1e-5 * 2 * pi * S2))
+        assert lost == pytest.approx(met + misses * log(4))
+
+
 def test_a_feature_out_of_view_costs_as_much_as_its_chance() -> None:
     assert evidence(SIX) - evidence(replace(SIX, unseen=2.0)) == pytest.approx(2.4)
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.optimise import NewtonOptions, ascend
+from mixpose.optimise import NewtonOptions, ascend, ascend_together
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +35,26 @@ def test_a_hill_of_unlike_scales_is_climbed() -> None:
     ascent = ascend(hill, lambda x, step: x + step, start, np.ones(2, dtype=np.bool_))
     assert ascent.converged
     np.testing.assert_allclose(ascent.state, [1.0, -2.0], atol=1e-6)
+
+
+def test_climbs_side_by_side_end_where_each_ends_alone() -> None:
+    free, options, asked = np.ones(2, dtype=np.bool_), NewtonOptions(), []
+
+    def both(states: Sequence[Floats]) -> list[Model]:
+        asked.append(len(states))
+        return [hill(x) for x in states]
+
+    starts = [np.array([2.2, -2.015]), np.array([1.001, -2.0])]
+    found = ascend_together(
+        both, lambda x, step: x + step, starts, free, options, [hill(x) for x in starts]
+    )
+    alone = [ascend(hill, lambda x, step: x + step, start, free, options) for start in starts]
+    for one, other in zip(found, alone, strict=True):
+        np.testing.assert_array_equal(one.state, other.state)
+        assert one.iterations == other.iterations
+    # the one that is near is long done when the other arrives: it asks no further
+    assert len(asked) == max(one.iterations for one in alone) - 1
+    assert alone[1].iterations < alone[0].iterations
 
 
 def test_a_direction_that_is_not_free_is_left_alone() -> None:

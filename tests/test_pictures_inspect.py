@@ -340,3 +340,18 @@ def test_real_frames_have_every_marker_met(
     assert capsys.readouterr().out.count("54 of 54 in view, 54 of them met") == 2
     tracker, _ = begin(mixpose.load_session(session))
     assert len(tracker.body) == 54
+
+
+def test_each_of_several_bodies_is_shown_on_what_the_others_leave(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = SYNTHETIC / "several_bodies" / "session.toml"
+    assert command("inspect", session, "--frame", 12, "-o", tmp_path / "seen") == 0
+    said = capsys.readouterr().out
+    for label in ("tool", "reference", "rod-0", "rod-1"):
+        assert f"frame 12: {label} ok (estimated on its own)" in said
+        assert (tmp_path / "seen" / f"{label}_sheet.png").is_file()
+    assert (tmp_path / "seen" / "bodies.png").is_file()
+    # of about 21 spots in the left image each body's own are left: 6, 5, 5 and 5 are in view
+    assert re.findall(r"left: (\d+) features found", said) == ["6", "5", "5", "5"]
+    assert "belong to no feature" not in said

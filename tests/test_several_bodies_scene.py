@@ -15,7 +15,7 @@ import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
-from mixpose.objective import View
+from mixpose.objective import SharedDensities, Together, View, matched_objective
 from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -231,6 +231,33 @@ def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:
     views = spots([0.0, 0.0], [3.0, 0.0], [100.0, 0.0])
     places = {0: {"left": np.array([[0.5, 0.0]])}, 1: {"left": np.array([[2.0, 0.0]])}}
     assert expected_owners(views, places, 6.0)["left"].tolist() == [0, 1, -1]
+
+
+def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
+    bodies = [body("tool", TOOL), body("other", OTHER[:4])]  # of unlike numbers of markers
+    poses = [at(-80.0), at(90.0, 30.0)]
+    views = views_of(bodies, poses, 3)
+    shared = SharedDensities.drawn(views)
+    each = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
+    near = [T @ at(0.4, -0.3) for T in poses]
+    together = Together.of(each)
+    for found, one, T in zip(together.models(near), each, near, strict=True):
+        alone = one.linearise(T)
+        assert found.value == pytest.approx(alone.value, rel=1e-9)
+        np.testing.assert_allclose(found.gradient, alone.gradient, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(found.curvature, alone.curvature, rtol=1e-6, atol=1e-9)
+    # what they see at other poses is at hand afterwards, as each would see it
+    fresh = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
+    together.match(poses)
+    for one, other, T in zip(each, fresh, poses, strict=True):
+        assert one.at_hand[0][0] is T
+        at_hand, sampled, over = one.match(T[None])
+        seen, looked_up, apart = other.match(T[None])
+        np.testing.assert_allclose(at_hand.y, seen.y)
+        np.testing.assert_array_equal(at_hand.weights, seen.weights)
+        np.testing.assert_allclose(sampled, looked_up, rtol=1e-6, atol=1e-12)
+        np.testing.assert_allclose(over.norm, apart.norm)
+        np.testing.assert_array_equal(over.pairs, apart.pairs)
 
 
 def test_an_estimate_is_the_same_line_by_line() -> None:

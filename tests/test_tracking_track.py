@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
@@ -80,10 +81,26 @@ def test_a_pose_far_from_every_prediction_is_a_surprise_that_grows_with_the_wait
 
 def test_at_a_prediction_directions_that_are_open_are_as_uncertain_as_predicted() -> None:
     log_density, spread = prior_near(TRUTH)
-    # a normal distribution, and next to nothing of anywhere
-    peak = np.log(0.98) - np.log(NARROW * np.sqrt(2 * np.pi)).sum()
+    # Student's distribution with 3 degrees of freedom, and next to nothing of anywhere
+    peak = np.log(0.98) + student.logpdf(np.zeros(6), 3, scale=NARROW).sum()
     assert log_density == pytest.approx(peak, abs=1e-3)
     np.testing.assert_allclose(spread, NARROW)
+
+
+def test_a_sudden_turn_is_unlikely_but_no_surprise() -> None:
+    # by 6 of the degrees that it may be off: normal errors would make that 6²/2 = 18 nats
+    at, _ = prior_near(TRUTH)
+    turned, _ = prior_near(perturb(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, np.radians(6.0), 0.0])))
+    assert at - turned == pytest.approx(2 * np.log(1 + 36 / 3), rel=0.02)
+
+
+def test_how_far_a_prediction_erred_over_several_frames_counts_per_frame() -> None:
+    track = followed(followed(Track(), [moved(0)], 0, 0.0), [moved(1)], 1, 0.1)
+    for _ in range(3):
+        track = track.missed(SearchState(), track.clutter)
+    # in four steps it moved by 40 more than the 4 × 5 that were expected
+    track = followed(track, [moved(5 + 8)], 5, 0.5)
+    assert track.branches[0].uncertainty[:3] == pytest.approx([10.0] * 3)
 
 
 def test_one_detection_where_a_feature_is_predicted_is_no_pose(

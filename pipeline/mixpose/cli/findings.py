@@ -13,6 +13,7 @@ from statistics import median
 import numpy as np
 
 from mixpose.checking import explanation
+from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
@@ -227,13 +228,16 @@ class Findings:
             if each.count < _LONG and each.count <= total / 2:
                 continue  # a frame here and there: clutter does that
             goes_on = each.last_place == self._places and each.found[-1][2] >= _LONG
-            if goes_on and self._agreed_before >= _LONG:
+            if doubt == APART and goes_on and self._agreed_before >= _LONG:
                 lines.append(f"{doubt} from frame {each.found[-1][0]} on: was one of them bumped?")
                 continue
-            lines.append(
-                f"{doubt} in {each.count} of {total} frames, {each.text()}: is one of them out of "
-                "step, or its calibration, T_sensor_world or source that of another?"
-            )
+            line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
+            if doubt == APART:
+                line += (
+                    ": is one of them out of step, or its calibration, T_sensor_world or source "
+                    "that of another?"
+                )
+            lines.append(line)
         return lines
 
     def _change(self) -> str | None:

@@ -7,17 +7,21 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 
+from mixpose.body import Body
 from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
 from mixpose.pictures.advice import describe
-from mixpose.pictures.finding import Finding, find
+from mixpose.pictures.canvas import Picture
+from mixpose.pictures.finding import Finding, find_several
 from mixpose.pictures.plots import require_matplotlib
-from mixpose.pictures.sheet import inspection_pictures, possible_names
+from mixpose.pictures.scene import draw_scene
+from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, prefixes_of
 from mixpose.pictures.signature import refuse_foreign, write_png
+from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet
-from mixpose.runner import begin, observe, open_sources
+from mixpose.runner import observe, open_sources, scene_of
 from mixpose.session import Session, load_session
 
 
@@ -60,20 +64,30 @@ def inspect_frame(
     frame_set = _frame(open_sources(session, named_sources(sources)), number)
     number = frame_set.number
     views = observe(session, frame_set)
-    tracker, track = begin(session)
+    scene = scene_of(session)
     if poses is None:
-        _, estimate = tracker.advance(track, number, frame_set.time_s, views)
+        outcomes = scene.advance(scene.begin(), number, frame_set.time_s, views)
+        estimates = [one.estimate for one in outcomes]
     else:
-        estimate = _from_file(poses, session, number)
-    findings = find(session.sensors, frame_set.frames, views, session.body, estimate)
-    pictures = inspection_pictures(session, tracker, findings, estimate)
+        estimates = _from_file(poses, session, number)
+    trackers = [member.tracker for member in scene.members]
+    bodies = [tracker.body for tracker in trackers]
+    found = find_several(session.sensors, frame_set.frames, views, bodies, estimates)
+    pictures: dict[str, Picture] = {}
+    lines = []
+    if len(bodies) > 1:
+        pictures[BODIES] = draw_scene(session, frame_set, *estimates)
+    each = zip(prefixes_of(session.labels), trackers, found, estimates, strict=True)
+    for prefix, tracker, findings, estimate in each:
+        made = inspection_pictures(session, tracker, findings, estimate)
+        pictures |= {prefix + name: picture for name, picture in made.items()}
+        lines += _summary(session, tracker.body, estimate, findings, poses)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
     for name, picture in pictures.items():
         write_png(folder / name, picture)
-    lines = _summary(session, estimate, findings, poses)
     lines.append(f"pictures in {folder}: {', '.join(pictures)}")
     sys.stdout.write("\n".join(lines) + "\n")
 
@@ -83,7 +97,7 @@ def _check_folder(folder: Path, session: Session) -> None:
         raise SessionError(f"-o {folder}: is a file; name a folder for the pictures")
     if not folder.parent.is_dir():
         raise SessionError(f"-o {folder}: there is no folder {folder.parent}")
-    for name in possible_names(session.sensors):
+    for name in possible_names(session):
         refuse_foreign(folder / name, "-o")
 
 
@@ -100,44 +114,44 @@ def _frame(opened: Mapping[str, Source], number: int | None) -> FrameSet:
     raise SessionError(f"--frame {number}: the recording has no such frame; it has {recordings}")
 
 
-def _from_file(path: Path, session: Session, number: int) -> Estimate:
-    """The pose of a frame as a run wrote it."""
+def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
+    """The poses of a frame as a run wrote them, one per body."""
     file = read_poses(path)
     if file.unit is not None and file.unit != session.unit:
         raise SessionError(
             f"--poses {path}: lengths are in {file.unit}, those of the session in {session.unit}; "
             "give poses of this session"
         )
-    own = [pose for pose in file.poses if pose.object == session.body.name]
-    if not own:
-        others = ", ".join(sorted({pose.object for pose in file.poses})) or "nothing"
-        raise SessionError(
-            f"--poses {path}: found poses of {others}, the session's object is {session.body.name}"
-        )
-    for pose in own:
-        if pose.frame == number:
-            return Estimate(
-                frame=number,
-                time_s=pose.time_s,
-                object=pose.object,
-                status=pose.status,
-                T_world_object=pose.T_world_object,
-                covariance=pose.covariance,
-                score=pose.score or 0.0,
-                sensors=pose.sensors,
-                hypotheses=pose.hypotheses,
+    found = []
+    for label in session.labels:
+        own = [pose for pose in file.poses if pose.label == label]
+        if not own:
+            others = ", ".join(sorted({pose.label for pose in file.poses}))
+            raise SessionError(
+                f"--poses {path}: found poses of {others or 'nothing'}, the session's object is "
+                f"{label}"
             )
-    numbers = [pose.frame for pose in own]
-    raise SessionError(
-        f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to {max(numbers)}"
-    )
+        of_frame = [pose for pose in own if pose.frame == number]
+        if not of_frame:
+            numbers = [pose.frame for pose in own]
+            raise SessionError(
+                f"--frame {number}: {path} has no pose of it, found frames {min(numbers)} to "
+                f"{max(numbers)}"
+            )
+        found.append(estimate_of(of_frame[0]))
+    return found
 
 
 def _summary(
-    session: Session, estimate: Estimate, findings: Sequence[Finding], poses: Path | None
+    session: Session,
+    body: Body,
+    estimate: Estimate,
+    findings: Sequence[Finding],
+    poses: Path | None,
 ) -> list[str]:
     origin = "estimated on its own" if poses is None else f"pose of {poses}"
-    head = f"{session.path}, frame {estimate.frame}: {estimate.status} ({origin})"
+    whose = f"{estimate.label} " if len(session.labels) > 1 else ""
+    head = f"{session.path}, frame {estimate.frame}: {whose}{estimate.status} ({origin})"
     if len(estimate.hypotheses) > 1:
         weights = ", ".join(f"{one.weight:.2g}" for one in estimate.hypotheses)
         head += f"; {len(estimate.hypotheses)} poses with weights {weights}, the first is shown"
@@ -145,7 +159,7 @@ def _summary(
     if estimate.proposer:
         lines.append(f"the pose came from: {estimate.proposer}")
     for finding in findings:
-        lines += describe(finding, session.body, session.unit)
+        lines += describe(finding, body, session.unit)
     if estimate.status == "lost":
         lines.append("lost: once the counts are right, give [start], or check T_sensor_world")
     return lines

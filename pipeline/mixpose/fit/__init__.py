@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
-from mixpose.fit.near import Fit, FitRules, fit_near
+from mixpose.fit.near import Fit, FitRules, fit_near, fit_together
 from mixpose.fit.options import EstimatorOptions, SearchName, free_mask
 
 __all__ = [
@@ -14,5 +14,6 @@ __all__ = [
     "SearchName",
     "blur_schedule",
     "fit_near",
+    "fit_together",
     "free_mask",
 ]

@@ -28,12 +28,13 @@ from mixpose.objective import (
     MatchedObjective,
     Objective,
     Quadratic,
+    Together,
     View,
     build_objective,
     matched_objective,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
-from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.optimise import Ascent, NewtonOptions, ascend, ascend_together
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion
 
@@ -102,6 +103,7 @@ def fit_near(
     samples: Floats,
     *,
     finest: MatchedObjective | None = None,
+    begun: Ascent[Floats] | None = None,
     noise: Sequence[Noise] | None = None,
     least: Floats | None = None,
     errors: ErrorRules = ErrorRules(),
@@ -122,6 +124,8 @@ def fit_near(
         Samples of the body, for the objectives that integrate by sampling.
     finest : MatchedObjective or None
         At σ_ε, where it is at hand.
+    begun : Ascent or None
+        From the start, on that, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
     least : (L,) array or None
@@ -130,12 +134,12 @@ def fit_near(
     rules : FitRules
     """
     free = free_mask(options)
-    ascent = None
+    ascent = begun
     if options.objective != "matched":
         finest = None
     else:
         finest = finest or matched_objective(views, body, [v.observation.sigma for v in views])
-    if finest and not has_likelihood(views):
+    if finest and ascent is None and not has_likelihood(views):
         here = finest.linearise(T_start)
         if here.value >= rules.near * len(views):
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
@@ -149,6 +153,35 @@ def fit_near(
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
+
+
+def fit_together(
+    objectives: Sequence[MatchedObjective],
+    starts: Sequence[Floats],
+    free: NDArray[np.bool_],
+    rules: FitRules = FitRules(),
+) -> list[Ascent[Floats] | None]:
+    """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
+
+    Parameters
+    ----------
+    objectives : sequence of MatchedObjective
+        On the same densities.
+    starts : sequence of (4, 4) array
+    free : (6,) bool
+    rules : FitRules
+
+    Returns
+    -------
+    list of Ascent or None
+        None for a body that has to descend through the blurs.
+    """
+    together = Together.of(objectives)
+    here = together.models(starts)
+    found = ascend_together(together.models, perturb, starts, free, SHARP, here)
+    together.match([one.state for one in found])
+    least = rules.near * len(objectives[0].views)
+    return [one if at.value >= least else None for one, at in zip(found, here, strict=True)]
 
 
 def _through_blurs(

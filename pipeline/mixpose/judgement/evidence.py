@@ -73,6 +73,11 @@ class DetectionModel:
         """Of a feature in view without a detection."""
         return math.log(1 - self.probability)
 
+    @property
+    def log_covered(self) -> float:
+        """Of a feature in view of several sensors without any: as if two had missed it."""
+        return 2 * self.log_missed
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -214,6 +219,10 @@ def odds_of(
         coordinates += m * one.shares
         # a detection that chance puts as near is not the feature's
         near.append((gain > 0) & (m == 2))
+    # a feature that no sensor sees is covered: cameras do not miss it one by one
+    covered = ~np.any([one.shares > 0 for one in matches], axis=0)
+    most = detection.log_covered * np.max([one.weights for one in matches], axis=0)
+    missed[covered] = np.maximum(missed, most)[covered]
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
         space, share = _in_space(matches, near, together, variance, size)

@@ -7,6 +7,7 @@ from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
 from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 from mixpose.objective.projection import BodyProjection, Projected, pose_jacobian, project_body
+from mixpose.objective.together import Together, can_be_together
 
 __all__ = [
     "OBJECTIVES",
@@ -19,8 +20,10 @@ __all__ = [
     "Projected",
     "Quadratic",
     "SharedDensities",
+    "Together",
     "View",
     "build_objective",
+    "can_be_together",
     "matched_objective",
     "pose_jacobian",
     "project_body",

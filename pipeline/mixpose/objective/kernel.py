@@ -16,6 +16,7 @@ is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -28,6 +29,7 @@ from mixpose.objective.projection import Projected
 Floats: TypeAlias = NDArray[np.float64]
 
 _NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
+NEGLIGIBLE_BELL = math.exp(_NEGLIGIBLE)
 _FEW = 24  # features up to which all pairs are looked at first
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 _NO_PAIRS = np.zeros((0, 2), dtype=np.intp)

@@ -43,6 +43,17 @@ class Projected(NamedTuple):
     faced: Mask
     weights: Floats
 
+    def of(self, k: int, n: int) -> Projected:
+        """The same at one of the poses, of the first n features."""
+        one = slice(k, k + 1)
+        return Projected(
+            self.y[:, one, :n],
+            self.J[:, one, :n],
+            self.seen[:, one, :n],
+            self.faced[:, one, :n],
+            self.weights[:, one, :n],
+        )
+
 
 class BodyProjection:
     """Sensors that look at a body; made once for the same ones by `project_body`.
@@ -68,7 +79,7 @@ class BodyProjection:
 
     def project(self, poses: Floats) -> Projected:
         """Where the sensors see the body at poses (H, 4, 4)."""
-        H, n, L = len(poses), len(self._points), len(self.sensors)
+        H, n, L = len(poses), self._points.shape[-2], len(self.sensors)
         arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
         world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
         if self._markers is None:

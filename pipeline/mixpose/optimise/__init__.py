@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from mixpose.optimise.newton import Ascent, NewtonOptions, ascend
+from mixpose.optimise.newton import Ascent, NewtonOptions, ascend, ascend_together
 
-__all__ = ["Ascent", "NewtonOptions", "ascend"]
+__all__ = ["Ascent", "NewtonOptions", "ascend", "ascend_together"]

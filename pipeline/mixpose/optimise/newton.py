@@ -6,7 +6,7 @@ step moves the state.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
@@ -124,8 +124,59 @@ def ascend(
     Ascent
         The best state seen; `converged` is false when the iterations ran out.
     """
+    first = at_start or model(start)
+    return ascend_together(
+        lambda states: [model(states[0])], move, [start], free, options, [first]
+    )[0]
+
+
+def ascend_together(
+    models: Callable[[Sequence[State]], Sequence[Model]],
+    move: Callable[[State, Floats], State],
+    starts: Sequence[State],
+    free: NDArray[np.bool_],
+    options: NewtonOptions,
+    at_starts: Sequence[Model],
+) -> list[Ascent[State]]:
+    """Climb to a maximum near each start, as `ascend` does, all models evaluated at once.
+
+    Parameters
+    ----------
+    models : callable
+        Models at as many states as there are starts, each of its own function.
+    move : callable
+    starts : sequence of state
+    free : (n,) bool
+    options : NewtonOptions
+    at_starts : sequence of Model
+    """
     inner = None if free.all() else _Inner(free, np.ix_(free, free))
-    state, here, damping = start, at_start or model(start), options.damping
+    climbs = [_climb(move, one, here, inner, options) for one, here in zip(starts, at_starts)]
+    states, ends = list(starts), dict[int, Ascent[State]]()
+    there: Sequence[Model | None] = [None] * len(climbs)
+    while True:
+        for k, climb in enumerate(climbs):
+            if k in ends:
+                continue
+            try:
+                states[k] = climb.send(there[k])
+            except StopIteration as end:
+                ends[k] = end.value
+                states[k] = ends[k].state
+        if len(ends) == len(climbs):
+            return [ends[k] for k in range(len(climbs))]
+        there = models(states)
+
+
+def _climb(
+    move: Callable[[State, Floats], State],
+    start: State,
+    here: Model,
+    inner: _Inner | None,
+    options: NewtonOptions,
+) -> Generator[State, Any, Ascent[State]]:
+    """The climb from one start: yields states, and is sent the models there."""
+    state, damping = start, options.damping
     step, gain = _step(here, inner, damping)
     before = 0.0
     for iteration in range(1, options.iterations):
@@ -134,7 +185,7 @@ def ascend(
             # so near, the model is right: its last step is taken unseen
             return Ascent(move(state, step), here.value + gain, True, iteration, here, step)
         candidate = move(state, step)
-        there = model(candidate)
+        there = yield candidate
         next_damping = max(damping / 10, 1e-9)
         next_step, next_gain = _step(there, inner, next_damping)
         close = gain <= options.value_error * size

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import AssociationRules
+from mixpose.density import AssociationRules, Observation
 from mixpose.judgement import Association, associate
 from mixpose.objective import View, matched_objective
 from mixpose.pictures.overlay import projected_features
@@ -102,6 +102,40 @@ def find(
         _finding(setup, frames.get(setup.name), by_name.get(setup.name), body, estimate)
         for setup in setups
     ]
+
+
+def find_several(
+    setups: Sequence[SensorSetup],
+    frames: Mapping[str, RawFrame],
+    views: Sequence[View],
+    bodies: Sequence[Body],
+    estimates: Sequence[Estimate],
+) -> list[list[Finding]]:
+    """The same for each of several bodies, on what the poses of the others leave unexplained."""
+    pairs = list(zip(bodies, estimates, strict=True))
+    alone = [find(setups, frames, views, body, one) for body, one in pairs]
+    if len(pairs) == 1:
+        return alone
+    found = []
+    for k, (body, one) in enumerate(pairs):
+        others = [each for j, each in enumerate(alone) if j != k]
+        left = [_unexplained(view, others) for view in views]
+        found.append(find(setups, frames, left, body, one))
+    return found
+
+
+def _unexplained(view: View, others: Sequence[Sequence[Finding]]) -> View:
+    """What poses of other bodies leave of a view of detections."""
+    pattern = view.observation.pattern
+    if not isinstance(pattern, PointPattern):
+        return view
+    left = np.ones(len(pattern.points), dtype=np.bool_)
+    for finding in (one for each in others for one in each):
+        if finding.name == view.name and finding.expectation is not None:
+            left &= finding.expectation.unexplained
+    rest = PointPattern(pattern.points[left], pattern.weights[left])
+    seen = view.observation
+    return replace(view, observation=Observation(rest, seen.sigma, seen.intrinsic))
 
 
 def _finding(

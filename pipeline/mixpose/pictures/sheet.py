@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.body import Body
 from mixpose.fit import ScheduleRules, blur_schedule
 from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, words
@@ -24,10 +25,13 @@ from mixpose.pictures.stages import (
     threshold_picture,
 )
 from mixpose.records import Estimate
-from mixpose.session import SensorSetup, Session
+from mixpose.session import Session
 from mixpose.tracking import Tracker
 
 Floats: TypeAlias = NDArray[np.float64]
+
+BODIES = "bodies.png"
+"""The frames of all sensors with the poses of several bodies."""
 
 _LARGE = (1400, 1050)  # room of a picture of its own
 _SMALL = (460, 345)  # and on the sheet
@@ -40,13 +44,13 @@ _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 def inspection_pictures(
     session: Session, tracker: Tracker, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
-    """Make all pictures of one frame.
+    """Make all pictures of one body in one frame.
 
     Parameters
     ----------
     session : Session
     tracker : Tracker
-        Of the session: how far from its pose a search begins, and with it the widest blur.
+        Of the body: how far from its pose a search begins, and with it the widest blur.
     findings : sequence of Finding
         One per sensor.
     estimate : Estimate
@@ -56,7 +60,7 @@ def inspection_pictures(
     dict of str to (H, W, 3) uint8
         By file name, ``sheet.png`` first.
     """
-    body, C = session.body, estimate.covariance
+    body = tracker.body
     views = [
         finding.view
         for finding in findings
@@ -64,15 +68,15 @@ def inspection_pictures(
     ]
     blurs = blur_levels(views, tracker, estimate)
     pictures: dict[str, Picture] = {}
-    rows = [_heading(session, estimate)]
-    names = _file_names(session.sensors)
+    rows = [_heading(session, body, estimate)]
+    names = file_names(_names(session))
     for finding, name in zip(findings, names, strict=True):
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        made = _camera_pictures(finding, session, estimate, sigmas)
+        made = _camera_pictures(finding, body, estimate, sigmas)
         pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        rows.append(_camera_row(finding, session, estimate, sigmas))
+        rows.append(_camera_row(finding, body, estimate, sigmas))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
         ends = [_ends(blurs.get(finding.name, [])) for finding in ranged]
@@ -81,29 +85,38 @@ def inspection_pictures(
         pictures["ranges.png"] = picture
         rows.append(picture)
     if estimate.T_world_object is not None and views:
-        pictures["objective.png"] = _objective(session, views, blurs, estimate.T_world_object, C)
+        pictures["objective.png"] = _objective(session, body, views, blurs, estimate)
         rows.append(pictures["objective.png"])
     return {"sheet.png": stacked(rows), **pictures}
 
 
 def _objective(
     session: Session,
+    body: Body,
     views: Sequence[View],
     blurs: Mapping[str, Sequence[float]],
-    T: Floats,
-    covariance: Floats | None,
+    estimate: Estimate,
 ) -> Picture:
+    T, covariance = estimate.T_world_object, estimate.covariance
+    assert T is not None, "without a pose there is nothing to cut the objective around"
     levels = list(zip(*(blurs[view.name] for view in views), strict=True))
-    slices, maps = objective_around(views, session.body, T, covariance, session.estimator, levels)
+    slices, maps = objective_around(views, body, T, covariance, session.estimator, levels)
     factors = [max(a / b for a, b in zip(level, levels[-1])) for level in levels]
     return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
 
 
-def possible_names(setups: Sequence[SensorSetup]) -> list[str]:
-    """Names of all files that `inspection_pictures` may make."""
+def possible_names(session: Session) -> list[str]:
+    """Names of all files that may be made of a session's frame."""
     stages = ("features", "threshold", "density", "pose")
-    names = [f"{name}_{stage}.png" for name in _file_names(setups) for stage in stages]
-    return ["sheet.png", "objective.png", "ranges.png", *names]
+    names = [f"{name}_{stage}.png" for name in file_names(_names(session)) for stage in stages]
+    names = ["sheet.png", "objective.png", "ranges.png", *names]
+    prefixes = prefixes_of(session.labels)
+    return [BODIES, *(prefix + name for prefix in prefixes for name in names)]
+
+
+def prefixes_of(labels: Sequence[str]) -> list[str]:
+    """What the names of a body's pictures begin with; nothing where it is the only one."""
+    return [""] if len(labels) == 1 else [f"{name}_" for name in file_names(labels)]
 
 
 def blur_levels(
@@ -124,23 +137,23 @@ def blur_levels(
 
 
 def _camera_pictures(
-    finding: Finding, session: Session, estimate: Estimate, sigmas: Sequence[float]
+    finding: Finding, body: Body, estimate: Estimate, sigmas: Sequence[float]
 ) -> dict[str, Picture]:
     pictures = {
         "features": features_picture(finding, _LARGE),
         "threshold": threshold_picture(finding, _LARGE),
-        "pose": pose_picture(finding, session.body, estimate, _LARGE),
+        "pose": pose_picture(finding, body, estimate, _LARGE),
     }
     if finding.view is not None and sigmas:
         T = estimate.T_world_object
         pictures["density"] = densities_picture(
-            finding.view, session.body, T, sigmas, (460, 460), min(len(sigmas), 4)
+            finding.view, body, T, sigmas, (460, 460), min(len(sigmas), 4)
         )
     return pictures
 
 
 def _camera_row(
-    finding: Finding, session: Session, estimate: Estimate, sigmas: Sequence[float]
+    finding: Finding, body: Body, estimate: Estimate, sigmas: Sequence[float]
 ) -> Picture:
     """One camera on the sheet: features, threshold, densities, pose."""
     panels = [features_picture(finding, _SMALL), threshold_picture(finding, _SMALL)]
@@ -149,14 +162,15 @@ def _camera_row(
         half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - 2
         few = [sigmas[k] for k in chosen]
         T = estimate.T_world_object
-        panels.append(densities_picture(finding.view, session.body, T, few, half, 2))
-    panels.append(pose_picture(finding, session.body, estimate, _SMALL))
+        panels.append(densities_picture(finding.view, body, T, few, half, 2))
+    panels.append(pose_picture(finding, body, estimate, _SMALL))
     return in_grid(panels, 4, _SMALL)
 
 
-def _heading(session: Session, estimate: Estimate) -> Picture:
+def _heading(session: Session, body: Body, estimate: Estimate) -> Picture:
     picture = np.zeros((40, _WIDTH, 3), np.uint8)
-    text = f"{session.path.name}, frame {estimate.frame}: "
+    whose = f"{estimate.label} " if len(session.labels) > 1 else ""
+    text = f"{session.path.name}, frame {estimate.frame}: {whose}"
     u = words(picture, text, (10, 27), WHITE, size=1.2)
     u = words(
         picture, f"{estimate.status}  ", (u + 8, 27), STATUS_COLOURS[estimate.status], size=1.2
@@ -169,11 +183,15 @@ def _ends(sigmas: Sequence[float]) -> list[float]:
     return list(dict.fromkeys([sigmas[0], sigmas[-1]])) if sigmas else []
 
 
-def _file_names(setups: Sequence[SensorSetup]) -> list[str]:
-    """Names of sensors that any file system takes, no two alike."""
+def _names(session: Session) -> list[str]:
+    return [setup.name for setup in session.sensors]
+
+
+def file_names(wanted: Sequence[str]) -> list[str]:
+    """Names that any file system takes, no two alike."""
     names: list[str] = []
-    for setup in setups:
-        name = re.sub(r"[^\w.-]", "_", setup.name)
+    for one in wanted:
+        name = re.sub(r"[^\w.-]", "_", one)
         taken = {one.casefold() for one in names}
         names.append(name if name.casefold() not in taken else f"{name}_{len(names)}")
     return names

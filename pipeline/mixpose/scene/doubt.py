@@ -54,7 +54,7 @@ def may_be_another(
                 continue
             there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
             own = data[j]
-            seen = replace(own, views=data[k].views, shared=None)
+            seen = replace(own, views=data[k].views, begun=None)
             found = other.tracker.refitted(seen, [there])
             if found and found[0].log_evidence > limit:
                 return True

@@ -38,6 +38,7 @@ from mixpose.scene.ownership import (
 from mixpose.scene.rules import SceneRules
 from mixpose.tracking import Track
 from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.together import begun_together
 
 Floats: TypeAlias = NDArray[np.float64]
 Claims: TypeAlias = Mapping[str, Claim]
@@ -84,7 +85,9 @@ class Joint:
     def solve(self) -> None:
         """Find the poses of all members."""
         self._follow([k for k in range(len(self.members)) if self._is_trusted(k)])
-        self._look_for([k for k in range(len(self.members)) if k not in self._claims])
+        left = [k for k in range(len(self.members)) if k not in self._claims]
+        self._look_for([k for k in left if not self._is_forgotten(k)])
+        self._look_for([k for k in left if self._is_forgotten(k)])
         self._part()
         owners = self._owned()
         for k in range(len(self.members)):
@@ -97,8 +100,8 @@ class Joint:
         owners = expected_owners(self._views, expected, self._rules.gate)
         stale = list(trusted)
         for _ in range(self._rules.rounds):
+            self._look_where_expected(stale, owners, expected)
             for k in stale:
-                self._look(k, owners, expected=expected[k])
                 self._claims.pop(k, None)
                 if self._convinces(k):
                     self._claim(k)
@@ -106,6 +109,24 @@ class Joint:
             stale = [k for k in self._claims if self._is_touched(k, owners)]
             if not stale:
                 break
+
+    def _look_where_expected(
+        self, some: Sequence[int], owners: Owners, places: Mapping[int, Mapping[str, Floats]]
+    ) -> None:
+        """Poses of bodies on what others leave, around their predictions.
+
+        Those that nothing of the others' is near to may look at all that is there, at once.
+        """
+        for k in some:
+            self._left[k], self._owners[k] = left_for(k, self._views, owners), owners
+            tracker, left = self.members[k].tracker, self._left[k]
+            self.data[k] = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
+        alike = [k for k in some if self._may_share(self.data[k], self._left[k], places[k])]
+        if self._shared is not None and alike:
+            begun = begun_together([self.data[k] for k in alike], self._shared)
+            self.data.update(zip(alike, begun, strict=True))
+        for k in some:
+            self.ranked[k] = self.members[k].tracker.ranked(self.data[k], quickly=True)
 
     def _part(self) -> None:
         """Take from bodies what may be their feature and another's in one spot, and fit again."""
@@ -121,7 +142,7 @@ class Joint:
             if are_alike(k, owners, self._owners[k]):
                 continue
             before = self.ranked[k]
-            self._look(k, owners, start=before)
+            self._look(k, owners, before)
             if self.ranked[k]:
                 self._claim(k)
             else:
@@ -164,30 +185,17 @@ class Joint:
             self.ranked[k] = self.ranked[twin]
             self._left[k], self._owners[k] = self._left[twin], owners
 
-    def _look(
-        self,
-        k: int,
-        owners: Owners,
-        *,
-        expected: Mapping[str, Floats] | None = None,
-        start: Sequence[Judged] = (),
-    ) -> None:
-        """Poses of a body on what others leave; near where it is expected, if that is known.
-
-        With `start`, from these poses alone.
-        """
+    def _look(self, k: int, owners: Owners, start: Sequence[Judged] = ()) -> None:
+        """Poses of a body on what others leave; with `start`, from these poses alone."""
         tracker = self.members[k].tracker
         left = left_for(k, self._views, owners)
         track = self.tracks[k]
         if self._is_forgotten(k):
             track = replace(track, branches=())
         data = tracker.data(track, self._frame, self._time_s, left.views)
-        if expected is not None and self._may_share(data, left, expected):
-            data = replace(data, shared=self._shared)
-        if start:
-            self.ranked[k] = tracker.refitted(data, start)
-        else:
-            self.ranked[k] = tracker.ranked(data, quickly=expected is not None)
+        if self._is_away(k):
+            data = replace(data, options=replace(data.options, search="live"))
+        self.ranked[k] = tracker.refitted(data, start) if start else tracker.ranked(data)
         if track is not self.tracks[k]:
             known = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
             data = replace(known, log=data.log)
@@ -242,6 +250,11 @@ class Joint:
         """Whether where the body was says nothing any more."""
         track = self.tracks[k]
         return not track.branches or track.misses > self._rules.forgotten
+
+    def _is_away(self, k: int) -> bool:
+        """Whether a body was looked for everywhere, and a look here and there will do."""
+        rules, misses = self._rules, self.tracks[k].misses
+        return misses > rules.forgotten and misses % rules.thorough != 0
 
     def _is_same(self, a: int, b: int) -> bool:
         """Whether two are identical and nothing tells which is which."""

@@ -49,3 +49,8 @@ class SceneRules:
         "frames without a pose after which identical bodies are searched for as one: velocities "
         "are believed for as many",
     )
+    thorough: int = constant(
+        10,
+        "frames of which one is searched thoroughly for a body that is away: a third of a second "
+        "of video; the others have the budget of live streams, which goes on from frame to frame",
+    )

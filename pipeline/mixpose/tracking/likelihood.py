@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,11 @@ from mixpose.judgement import (
 )
 from mixpose.objective import (
     MatchedObjective,
-    SharedDensities,
     View,
     matched_objective,
     project_body,
 )
+from mixpose.optimise import Ascent
 from mixpose.records import SensorReport
 from mixpose.rigid import twist_between
 from mixpose.search import SearchReport, SearchState
@@ -95,6 +95,13 @@ class SearchLog:
     report: SearchReport | None = None
 
 
+class Begun(NamedTuple):
+    """The matched objective at σ_ε, and the ascent on it; None if it leads nowhere."""
+
+    objective: MatchedObjective
+    ascent: Ascent[Floats] | None
+
+
 @dataclass(frozen=True, eq=False)
 class FrameData:
     """A frame, and what is known before it.
@@ -102,7 +109,7 @@ class FrameData:
     `log` is written by the proposer that searches.  `elapsed` is the time since the last pose,
     seconds, None where it is not known.  Where views see the body in motion as of the common time,
     `still` is the frame with the sensors as they stand.
-    `shared` are the densities of a whole scene, where the views hold what is left for this body.
+    `begun` is the climb from the first prediction, where several bodies were fitted together.
     """
 
     views: Sequence[View]
@@ -114,7 +121,7 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
-    shared: SharedDensities | None = None
+    begun: Begun | None = None
     log: SearchLog = field(default_factory=SearchLog)
     elapsed: float | None = None
     still: FrameData | None = None
@@ -149,8 +156,14 @@ class FrameData:
             views = tuple(self.views)
             projection = project_body(tuple(view.sensor for view in views), self.body)
             return replace(self.still.finest, views=views, projection=projection)
-        sigmas = [view.observation.sigma for view in self.views]
-        return matched_objective(self.views, self.body, sigmas, shared=self.shared)
+        if self.begun is not None:
+            return self.begun.objective
+        return matched_objective(self.views, self.body, self.sigmas)
+
+    @property
+    def sigmas(self) -> list[float]:
+        """σ_ε of each view."""
+        return [view.observation.sigma for view in self.views]
 
     def without(self, names: Mapping[str, str]) -> FrameData:
         """The frame without some sensors."""
@@ -158,7 +171,7 @@ class FrameData:
             return self
         views = [view for view in self.views if view.name not in names]
         still = self.still.without(names) if self.still else None
-        return replace(self, views=views, still=still, shared=None)
+        return replace(self, views=views, still=still, begun=None)
 
     def in_motion(self, motion: Motion) -> FrameData:
         """The frame as of the common time, of a body that moves."""
@@ -253,6 +266,9 @@ class MatchedLikelihood:
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
+        begun = None
+        if data.begun and data.predictions and start.prediction is data.predictions[0]:
+            begun = data.begun.ascent
 
         def climb(seen: FrameData, T_start: Floats, least: Floats | None = None) -> Fit:
             return fit_near(
@@ -263,6 +279,7 @@ class MatchedLikelihood:
                 seen.options,
                 seen.samples,
                 finest=seen.finest,
+                begun=begun,
                 noise=seen.noise,
                 least=least,
                 errors=seen.rules.judgement.noise.errors,

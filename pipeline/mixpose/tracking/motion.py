@@ -24,6 +24,11 @@ class MotionRules:
     )
     steady_distance: float = constant(0.03, "the same, of the body's radius: 1.7° at the rim")
     unsteady: float = constant(5.0, "times as wide where no velocity is known yet")
+    known_from: float = constant(
+        3.0,
+        "degrees of freedom of a prediction's error: its size is that of one change of motion, in "
+        "three directions",
+    )
     widening: float = constant(1.5, "of the uncertainty, per frame without a pose")
     widest: float = constant(4.0, "the most it widens by, but for a tenth per further frame")
     unknown_rotation_deg: float = constant(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeAlias
@@ -102,6 +103,8 @@ class Track:
         Whether two sensors met most of the body in some frame.
     believed : int
         Frames whose pose was ok.
+    known : bool
+        Whether the body was told from things that have three markers alike.
     clutter : StaticClutter
         What stayed where it was while the body was lost.
     """
@@ -118,6 +121,7 @@ class Track:
     doubted: bool = False
     agreed: bool = False
     believed: int = 0
+    known: bool = False
     clutter: StaticClutter = StaticClutter()
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
@@ -183,13 +187,24 @@ def prior_of(
             prediction.T_world_object,
             nearest_alike(T_world_object, body, prediction.T_world_object),
         )
-        scaled = twist[free] / u
-        log_density = -0.5 * scaled @ scaled - np.log(u * np.sqrt(2 * np.pi)).sum()
+        log_density = _log_density(twist[free] / u, rules, prediction) - np.log(u).sum()
         weight = max((1 - surprise) * prediction.weight, 1e-12)
         terms.append(np.log(weight) + log_density)
         spreads.append(prediction.uncertainty)
     # directions that the data leave open are as uncertain as where the pose most likely comes from
     return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
+
+
+def _log_density(scaled: Floats, rules: MotionRules, prediction: Prediction) -> float:
+    """Of a pose so many standard deviations (k,) from a prediction, but for their product.
+
+    How far a prediction errs is known from a step or two: errors have the distribution of Student.
+    """
+    if prediction.is_prior:
+        return float(-0.5 * scaled @ scaled) - 0.5 * len(scaled) * math.log(2 * math.pi)
+    n = rules.known_from
+    peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+    return len(scaled) * peak - 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
 
 
 class Found(NamedTuple):
@@ -250,6 +265,8 @@ def follow(
                 velocity = moved / elapsed
                 change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
                 half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
+                # of one frame, where it was seen over several
+                half = half / (1 + track.misses)
                 uncertainty = np.maximum(_per_kind(half), rules.steady(body))
         course = None
         if deviation is not None:

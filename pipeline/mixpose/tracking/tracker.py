@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
@@ -22,6 +23,7 @@ from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.recognition import TRIANGLE, is_known
 from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
@@ -98,7 +100,7 @@ class Tracker:
         """The track before the first frame."""
         if self.T_start is None:
             return Track()
-        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),))
+        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),), known=True)
 
     def advance(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
@@ -121,6 +123,8 @@ class Tracker:
         data = self.data(track, frame, time_s, views)
         ranked = self.ranked(data)
         verdict = self.verdict(data, ranked)
+        if verdict.status == "ok" and verdict.best and not is_known(data, verdict.best):
+            verdict = replace(verdict, status="ambiguous", doubt=TRIANGLE)
         followed = self.followed(data, frame, time_s, verdict)
         estimate = self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
         if data.log.report:
@@ -237,7 +241,8 @@ class Tracker:
         found = [
             Found(
                 one.T_world_object,
-                weight,
+                # what may be mere clutter counts as little in the next frame
+                weight * float(expit(one.log_evidence)),
                 one.spread if self.options.fuse else None,
                 np.sqrt(np.diagonal(one.covariance)) if is_timed(data.views) else None,
             )
@@ -257,7 +262,7 @@ class Tracker:
             self.rules.course,
         )
         believed = track.believed + (verdict.status == "ok")
-        followed = replace(followed, believed=believed)
+        followed = replace(followed, known=is_known(data, best), believed=believed)
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
         if verdict.status != "ok" and not late:

@@ -1,0 +1,33 @@
+"""Whether a body was told from things that have three markers alike.
+
+Three markers in space are met by every thing that has three in the same places.  A body of more,
+alone in its session, is known once others of it are met, and stays so while it is followed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mixpose.judgement import Judged, flat_prior
+from mixpose.tracking.likelihood import FrameData
+
+TRIANGLE = "three markers are met, which other things may have alike"
+
+_CORNERS = 3
+
+
+def is_known(data: FrameData, judged: Judged) -> bool:
+    """Whether a pose is the body's, by what it meets or by where it was expected."""
+    if any(one.J.shape[1] == 1 for one in judged.associations):
+        return True  # ranges are no markers in space
+    sensors = np.zeros(len(data.body.nodes.points))
+    for one in judged.associations:
+        sensors[one.features[one.shares > 0]] += 1
+    others = np.sort(sensors)[:-_CORNERS]
+    # one sensor of several may meet a marker by chance
+    if not len(others) or others.sum() >= max(len(data.views) / 2, 1):
+        return True
+    if not data.track.known or data.track.misses:
+        return False
+    anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
+    return bool((data.prior(judged.T_world_object).spread < anywhere.spread).all())
