@@ -241,14 +241,11 @@ class Findings:
         return lines
 
     def _change(self) -> str | None:
-        """What the session should have said, where most frames are doubted from the beginning."""
+        """What the session should have said, where few frames are ok and some are doubted."""
         doubted = sum(each.count for each in self._doubts.values())
         frozen = sum(each.count for each in self._same.values())
-        if doubted <= max((self._places + 1) / 2, frozen) or self._agreed_before >= _LONG:
-            return None
-        if all(each.longest < 2 for each in self._doubts.values()):
-            return None
-        if len(self._session.labels) > 1:
+        few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
+        if not few or doubted < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
         return explanation(self._session, self._frames)
 

@@ -37,14 +37,15 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
         close = data.start_uncertainty / data.rules.proposals.narrowing**2
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
-        near = replace(data, body=_reflected(data.body, sharp if sharp.sum() >= 3 else met > 0))
+        flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
+        near = replace(data, body=flat, begun=None)
         if _evidence(near, Start(judged.T_world_object, close)) > judged.log_evidence + ahead:
             return True
     if not _is_by_chance(data, judged):
         return False
     # wherever it is found, and nothing known of either
     track = Track(residuals=data.track.residuals)
-    alone = replace(data, track=track, predictions=(), log=SearchLog(), shared=None)
+    alone = replace(data, track=track, predictions=(), log=SearchLog(), begun=None)
     own = _evidence(alone, Start(judged.T_world_object))
     mirror = replace(alone, body=_reflected(data.body, met >= 0))
     starts = starts_at(mirror, candidates_of(mirror))
