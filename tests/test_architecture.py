@@ -59,6 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }
 MAY_IMPORT["design"] = GROUND | {
+    "executing",
     "sensors",
     "body",
     "objective",

@@ -97,7 +97,7 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=seed), 1.2)
         objective, ascent = at_sigma(views, body)
         sigmas = np.array([view.observation.sigma for view in views])
-        met = near._met(objective, ascent, sigmas, np.zeros(2), errors)
+        met = near._met(objective, ascent, sigmas, 0.0, errors)
         seen = errors_seen(met.offsets, 6, known, errors)
         expected = met.moved(ALL_FREE, np.ones(2), seen.blurs, seen.variances)
         narrow = matched_objective(views, body, (seen.blurs * sigmas).tolist())
@@ -115,7 +115,7 @@ def test_offsets_are_those_at_the_end_of_an_ascent_whose_last_step_is_not_looked
     objective, ascent = at_sigma(views, EIGHT)
     assert ascent.step is not None
     sigmas = np.array([view.observation.sigma for view in views])
-    found = near._met(objective, ascent, sigmas, np.zeros(2), ErrorRules()).away
+    found = near._met(objective, ascent, sigmas, 0.0, ErrorRules()).away
     at, sampled, _ = objective.match(ascent.state[None])
     there = 2 * sigmas[:, None, None] * sampled[:, 0, :, 1:] / sampled[:, 0, :, :1]
     shift = np.abs(at.J[:, 0] @ ascent.step).max() / 1.5

@@ -191,6 +191,28 @@ def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_no
     assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
 
 
+def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -> None:
+    # a body of which three markers lie as three of the tool, and two that do not
+    twin = body("twin", np.concatenate([TOOL[:3], [[15.0, -60.0, 10.0], [-50.0, -20.0, 30.0]]]))
+    tool, scene = body("tool", TOOL), scene_of(twin)
+    tracks = scene.begin()
+    for frame in range(4):
+        # the tool is there, and the twin is not
+        (outcome,) = scene.advance(tracks, frame, None, views_of([tool], [at(2.0 * frame)], frame))
+        tracks = (outcome.track,)
+        assert outcome.estimate.status != "ok"
+    for frame in range(4, 8):
+        views = views_of([twin], [at(2.0 * frame)], frame)
+        (outcome,) = scene.advance(tracks, frame, None, views)
+        tracks = (outcome.track,)
+        assert outcome.estimate.status == "ok"
+    # once it was known it stays so while it is followed, also by three
+    three = body("twin", twin.means[:3])
+    views = views_of([three], [at(16.0)], 8)
+    (outcome,) = scene.advance(tracks, 8, None, views)
+    assert outcome.track.known
+
+
 def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
     isosceles = np.array([[0, 45, 0], [-30, 0, 0], [30, 0, 0.0]])
     whole = np.concatenate([isosceles, [[10, 15, 60.0]], [[-20, -40, 35.0]], [[45, 30, -50.0]]])

@@ -1,6 +1,7 @@
 """Predicted accuracy held against simulated frames: the paper's systems and a two-camera rig.
 
-    python tools/design_study.py [--runs 1000] [--seed 0] [--noise 0.25]
+    python tools/design_study.py [--runs 1000] [--seed 0] [--noise 0.25] [--system 3]
+                                 [--workers 2 | --scheduler ADDRESS]
 
 For each system: errors of simulated frames over predicted ones, with what chance alone makes of
 them; and what the lateration system must err by to be as accurate as the camera system, confirmed.
@@ -29,6 +30,7 @@ from mixpose.design import (
 )
 from mixpose.design.equality import scaled
 from mixpose.design.summary import pooled
+from mixpose.executing import Executor, executor
 from mixpose.rigid import Floats
 from mixpose.session import Session, load_session
 
@@ -42,7 +44,17 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--noise", type=float, default=0.25, help="σ_ε, px and length units")
+    parser.add_argument("--system", type=int, choices=(1, 2, 3, 4), help="only this one")
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--scheduler", help="address of a dask.distributed scheduler, or local")
     asked = parser.parse_args(arguments)
+    with executor(asked.scheduler, asked.workers) as workers:
+        studied(asked, workers)
+    return 0
+
+
+def studied(asked: argparse.Namespace, workers: Executor) -> None:
+    """Print a row for each system, and what equals what."""
     print("| system | markers err by | overall | by chance | x | y | z | rx | ry | rz | ok | s |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     poses = paper_poses(POSES, asked.seed)
@@ -53,14 +65,17 @@ def main(arguments: list[str]) -> int:
         cases.append((f"system {system.name}", session, with_noise(session, asked.noise), poses))
     rig = load_session(TWO_CAMERAS / "session.toml")
     cases.append(("two pinholes", rig, plan_of(rig), spread_poses(rig, POSES, seed=asked.seed)))
-    for name, session, plan, at in cases:
-        began = time.process_time()
-        found = confirm(session, plan, at, asked.runs, tip=ORIGIN, seed=asked.seed)
-        print(row(name, plan, found, time.process_time() - began), flush=True)
-    exact = systems(0.0)[2]
-    session = planned(exact, asked.noise)
-    print(equality(cases[0][2], with_noise(session, asked.noise), session, poses, asked))
-    return 0
+    chosen = cases if asked.system is None else [cases[asked.system - 1]]
+    for name, session, plan, at in chosen:
+        began = time.perf_counter()
+        found = confirm(
+            session, plan, at, asked.runs, tip=ORIGIN, seed=asked.seed, executor=workers
+        )
+        print(row(name, plan, found, time.perf_counter() - began), flush=True)
+    if asked.system is None:
+        session = planned(systems(0.0)[2], asked.noise)
+        ranges = with_noise(session, asked.noise)
+        print(equality(cases[0][2], ranges, session, poses, asked, workers))
 
 
 def with_noise(session: Session, noise: float) -> Plan:
@@ -78,7 +93,12 @@ def row(name: str, plan: Plan, found: Confirmation, seconds: float) -> str:
 
 
 def equality(
-    cameras: Plan, ranges: Plan, session: Session, poses: Floats, asked: argparse.Namespace
+    cameras: Plan,
+    ranges: Plan,
+    session: Session,
+    poses: Floats,
+    asked: argparse.Namespace,
+    workers: Executor,
 ) -> str:
     """What the lateration system must err by, predicted and then simulated."""
 
@@ -90,7 +110,9 @@ def equality(
     factor = noise_to_equal(ranges, wanted, error_of)
     assert factor is not None, "without marker errors any accuracy can be had"
     equal = scaled(ranges, factor)
-    found = confirm(session, equal, poses, asked.runs, tip=ORIGIN, seed=asked.seed)
+    found = confirm(
+        session, equal, poses, asked.runs, tip=ORIGIN, seed=asked.seed, executor=workers
+    )
     return (
         f"\nlateration with sigma = {equal.noises[0]:.4g} ({factor:.4g} times {asked.noise:g}) "
         f"equals the cameras: position {wanted:.4g} predicted, {found.found[0]:.4g} simulated"

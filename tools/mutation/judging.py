@@ -198,6 +198,13 @@ _ACCEPTANCE = (
         "poses that meet two features in clutter are told",
     ),
     Mutant(
+        "judgement-stands-out-by-one-feature",
+        "judgement/acceptance.py",
+        "int(free.sum()) + rules.spare",
+        "int(free.sum()) + 2",
+        "of one feature more than fixes a pose chance makes enough",
+    ),
+    Mutant(
         "judgement-one-of-many-stands-out",
         "judgement/acceptance.py",
         "float(rest) + rules.standing_out",

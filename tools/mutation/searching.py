@@ -274,6 +274,13 @@ _SEARCH = (
         "guesses from three points are turned the wrong way",
     ),
     Mutant(
+        "search-every-pose-a-candidate",
+        "search/search.py",
+        "if self._ranks[k] > least]",
+        "if self._ranks[k] > -np.inf]",
+        "poses that the best leaves no chance are fitted",
+    ),
+    Mutant(
         "search-starts-again-each-frame",
         "search/search.py",
         "return SearchState(k, skipped + batches)",

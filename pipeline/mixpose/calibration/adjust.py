@@ -1,13 +1,16 @@
 """Maximise the matched objective over rig and poses, through narrowing blurs.
 
 At each blur the objective is climbed by Gauss-Newton; the blurs end at twice the noise that the
-residuals show, which is learnt on the way.
+residuals show, which is learnt on the way.  Pairs are known by then, and the last steps weigh them
+as Cauchy errors: where sensors are out of step, a frame that is far off is less wrong than it is
+far, and a Gaussian kernel would drop it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -101,21 +104,43 @@ def adjust(
         for _ in range(rules.steps):
             weighted, _ = _weighted(bundle, rig, poses, blur, blur, rules)
             rig, poses, _ = _climbed(bundle, rig, poses, gauge_of, weighted)
-        learnt = _noise(bundle, rig, poses, blur, sigmas, rules) if noise is None else noise
+        learnt = (
+            noise if noise is not None else _noise(bundle, rig, poses, blur, sigmas, rules, 1.0)
+        )
         last = rules.blur * learnt
         if (blur <= last / rules.narrowing).all():
             break
         blur = np.maximum(blur * rules.narrowing, last)
+    if noise is not None:
+        return _ended(bundle, rig, poses, gauge_of, noise, lambda *_: noise, rules)
+
+    def alike(rig: Rig, poses: Floats, blur: Floats, unlike: float = 1.0) -> Floats:
+        return _noise(bundle, rig, poses, blur, sigmas, rules, unlike)
+
+    found = _ended(bundle, rig, poses, gauge_of, learnt, alike, rules)
+    if found.inflation > 1:
+        return found
+    own = partial(alike, unlike=rules.unlike)
+    return _ended(bundle, found.rig, found.poses, gauge_of, found.noise, own, rules)
+
+
+def _ended(
+    bundle: Bundle,
+    rig: Rig,
+    poses: Floats,
+    gauge_of: GaugeOf,
+    noise: Floats,
+    learnt: Callable[[Rig, Floats, Floats], Floats],
+    rules: CalibrationRules,
+) -> Adjusted:
+    """The last steps, at the noise that is learnt."""
     for _ in range(rules.last_steps):
-        blur = rules.blur * learnt
-        weighted, _ = _weighted(bundle, rig, poses, blur, learnt, rules)
+        weighted, _ = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
         rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
-        before = learnt
-        if noise is None:
-            learnt = _noise(bundle, rig, poses, blur, sigmas, rules)
-        if size < rules.converged and np.allclose(before, learnt, rtol=1e-3):
+        before, noise = noise, learnt(rig, poses, rules.blur * noise)
+        if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
-    return _finished(bundle, rig, poses, gauge_of, learnt, rules)
+    return _finished(bundle, rig, poses, gauge_of, noise, rules)
 
 
 def _weighted(
@@ -125,16 +150,22 @@ def _weighted(
     blur: Floats,
     noise: Floats,
     rules: CalibrationRules,
+    *,
+    last: bool = False,
 ) -> tuple[list[Weighted], list[Floats]]:
     """Pairs of all sensors, weighted by the objective and the noise; and by the objective alone."""
     found: list[Weighted] = []
     alone: list[Floats] = []
+    faintest = rules.faintest_last if last else rules.faintest
     for sensor in range(len(rig.sensors)):
-        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], rules.faintest)
+        pairs = match(rig, poses, bundle.frames, bundle.clock, sensor, blur[sensor], faintest)
         rows = rows_of(bundle, rig, poses, sensor, pairs)
         squared = (rows.residual**2).sum(axis=1)
-        weight = pairs.share * np.exp(-squared / (4 * blur[sensor] ** 2)) * rows.known
+        share = pairs.share * rows.known
+        weight = share * np.exp(-squared / (4 * blur[sensor] ** 2))
         alone.append(weight)
+        if last:
+            weight = share / (1 + squared / (rules.tail * noise[sensor]) ** 2)
         found.append((sensor, pairs, rows, weight / noise[sensor] ** 2))
     return found, alone
 
@@ -164,13 +195,6 @@ def _climbed(
     return rig, poses, size
 
 
-def _unknowns(bundle: Bundle, weights: Sequence[Floats], sensors: Sequence[int]) -> float:
-    """Share of the rows that unknowns use up."""
-    rows = sum(m * float(w.sum()) for w, m in zip(weights, sensors, strict=True))
-    used = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
-    return float(min(used / max(rows, 1.0), 0.9))
-
-
 def _noise(
     bundle: Bundle,
     rig: Rig,
@@ -178,25 +202,35 @@ def _noise(
     blur: Floats,
     sigmas: Floats,
     rules: CalibrationRules,
+    unlike: float,
 ) -> Floats:
-    """Standard deviation of detections (L,) from residuals under a Gaussian weight."""
+    """Standard deviation of detections (L,) from residuals under a Gaussian weight.
+
+    That of a sensor is like that of others of its kind, within the factor `unlike`.  Where frames
+    err as a whole it is 1: poses would be drawn to the sensor that happens to fit best until it had
+    no noise at all.
+    """
     weighted, alone = _weighted(bundle, rig, poses, blur, np.ones(len(blur)), rules)
-    dimensions = [eye.dimension for eye in rig.sensors]
-    used = _unknowns(bundle, alone, dimensions)
+    count = np.array([eye.dimension * float(w.sum()) for eye, w in zip(rig.sensors, alone)])
+    spent = np.array(
+        [float(w @ (one[2].residual ** 2).sum(axis=1)) for one, w in zip(weighted, alone)]
+    )
+    unknowns = bundle.count + bundle.pose_free.sum() * len(bundle.frames)
+    used = unknowns / np.maximum(blur**2 * (count / blur**2).sum(), 1.0)
+    left = count * (1 - np.minimum(used, 0.9))
     found = np.array(sigmas, dtype=np.float64)
-    for unit in sorted({eye.unit for eye in rig.sensors}):
-        # sensors of a kind have one noise, in σ_ε: with one each, poses would be drawn to the
-        # sensor that happens to fit best until it had no noise at all
-        alike = [s for s, eye in enumerate(rig.sensors) if eye.unit == unit]
-        squared = [weighted[s][2].residual / sigmas[s] for s in alike]
-        total = sum(dimensions[s] * float(alone[s].sum()) for s in alike)
-        if total <= 6:
+    units = np.array([eye.unit for eye in rig.sensors])
+    for unit in sorted(set(units)):
+        alike = units == unit
+        if count[alike].sum() <= 6:
             continue
-        spent = sum(float(alone[s] @ (r**2).sum(axis=1)) for s, r in zip(alike, squared))
-        tilted = spent / (total * (1 - used))
+        scaled = spent[alike] / sigmas[alike] ** 2
+        common = scaled.sum() / left[alike].sum()
+        own = (scaled + rules.alike * common) / (left[alike] + rules.alike)
+        tilted = np.clip(own, common / unlike**2, common * unlike**2)
         # a Gaussian of variance s² under the weight exp(-d²/4b²) has 1/(1/s² + 1/2b²)
-        width = float(np.median(blur[alike] / sigmas[alike]))
-        inverse = max(1 / max(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
+        width = blur[alike] / sigmas[alike]
+        inverse = np.maximum(1 / np.maximum(tilted, 1e-300) - 1 / (2 * width**2), 1e-300)
         found[alike] *= np.clip(np.sqrt(1 / inverse), _SHARPEST, _BLUNTEST)
     return found
 
@@ -209,19 +243,32 @@ def _finished(
     noise: Floats,
     rules: CalibrationRules,
 ) -> Adjusted:
-    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules)
+    weighted, alone = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
     normal = normal_equations(bundle, len(poses), weighted, 0.0)
     step = solved(bundle, normal, gauge_of(rig), len(poses))
-    m = float(np.mean([eye.dimension for eye in rig.sensors]))
-    a = 1 / (2 * rules.blur) ** 2
-    # of an M-estimator whose weights are Gaussian, against the inverse of its curvature
-    covariance = step.covariance * (1 + 2 * a) ** (m / 2 + 2) / (1 + 4 * a) ** (m / 2 + 1)
+    dimension = float(np.mean([eye.dimension for eye in rig.sensors]))
+    covariance = step.covariance * _of_cauchy(dimension, rules.tail)
     inflation = _inflation(bundle, weighted, covariance, len(poses))
     parts = tuple(
         (pairs, rows.residual, weight)
         for (_, pairs, rows, _), weight in zip(weighted, alone, strict=True)
     )
     return Adjusted(rig, poses, noise, covariance * inflation, step.unknown, parts, inflation)
+
+
+def _of_cauchy(dimension: float, tail: float) -> float:
+    """Covariance of an M-estimator with Cauchy weights over the inverse of its normal equations.
+
+    Of Gaussian errors with radius r in units of their deviation, whose weight is w = 1/(1 + r²/c²):
+    E[w² r²/m] E[w] / E[w + w' r/m]².
+    """
+    r = np.linspace(0, 10, 2001)
+    density = r ** (dimension - 1) * np.exp(-(r**2) / 2)
+    density /= density.sum()
+    weight = 1 / (1 + (r / tail) ** 2)
+    slope = weight - 2 * (r / tail) ** 2 * weight**2 / dimension
+    spread = density @ (weight * r) ** 2 / dimension
+    return float(spread * (density @ weight) / (density @ slope) ** 2)
 
 
 def _inflation(

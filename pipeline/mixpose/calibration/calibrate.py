@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,23 +53,41 @@ def calibrate(
         known = searched(task, rules, progress, {} if found is None else found)
         starts = iter([start_from_cameras(task, known, rules)])
     else:
-        starts = starts_together(task, rules, progress)
-    best: Calibration | None = None
-    for start in starts:
-        if not len(start.poses):
-            continue
-        one = _Run(task, start, rules, progress).result()
-        off = float((one.noise / task.sigmas).max())
-        if best is None or off < float((best.noise / task.sigmas).max()):
-            best = one
-        if off < rules.failed:
-            break
+        starts = starts_together(task, _probed(task, rules, progress), progress)
+    best = _best(task, starts, rules, progress)
     if best is None:
         raise RecordingError(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
             "check` finds its features"
         )
-    return best
+    return best[1]
+
+
+def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> CalibrationRules:
+    """Rules with the one blur that suits best, by a few of many frames that are searched singly."""
+    few = task.frames[:: -(-len(task.frames) // rules.probes)]
+    if task.known is not None or task.fuse or len(few) == len(task.frames):
+        return rules
+    probe = replace(task, frames=few)
+    best = _best(probe, starts_together(probe, rules, progress), rules, progress)
+    return rules if best is None else replace(rules, widened=(rules.widened[best[0]],))
+
+
+def _best(
+    task: Task, starts: Iterable[Start], rules: CalibrationRules, progress: Progress
+) -> tuple[int, Calibration] | None:
+    """Number and calibration of the first start that is not wrong, else of the least wrong."""
+    best: tuple[float, int, Calibration] | None = None
+    for number, start in enumerate(starts):
+        if not len(start.poses):
+            continue
+        one = _Run(task, start, rules, progress).result()
+        off = float((one.noise / task.sigmas).max())
+        if best is None or off < best[0]:
+            best = (off, number, one)
+        if off < rules.failed:
+            break
+    return None if best is None else best[1:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,8 +248,8 @@ class _Run:
                 told += [none, none]
                 continue
             bundle = self._bundle(part, ())
-            told.append(residuals_of(bundle, task.rig, fit.poses, fit, climb=True))
-            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit, climb=False))
+            told.append(residuals_of(bundle, task.rig, fit.poses, fit))
+            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit))
         return {s: Residual(*(each[s] for each in told)) for s in none}
 
     def _told(

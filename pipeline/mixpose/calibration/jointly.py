@@ -36,9 +36,8 @@ def joint_poses(
         # where hardly any pose is believed, the likeliest are a start, and deviations will tell
         few = len(sure) < rules.believed * len(task.frames)
         found = sorted(sure + doubtful, key=lambda one: one[0].number) if few else sure
-        if found:
-            poses = np.array([T for _, T in found])
-            yield tuple(frame for frame, _ in found), poses
+        poses = np.array([T for _, T in found]).reshape(-1, 4, 4)
+        yield tuple(frame for frame, _ in found), poses
 
 
 def _tracked(task: Task, factor: float) -> Iterator[tuple[tuple[SeenFrame, Floats] | None, bool]]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 
 import numpy as np
 from scipy.signal import find_peaks
 
 from mixpose.body import Body
+from mixpose.calibration.choice import RUN, informative
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.task import Progress
@@ -22,7 +23,6 @@ from mixpose.search.detections import is_pointlike, peaks
 from mixpose.session import Session
 
 _HIGHEST = 0.3  # of a profile's highest peak: a lower one is noise
-_RUN = 8  # frames read together where motion between them counts
 
 
 def require_points(body: Body) -> None:
@@ -46,8 +46,9 @@ def read_frames(
     progress: Progress,
     *,
     runs: bool,
+    known: Collection[int] | None,
 ) -> tuple[SeenFrame, ...]:
-    """Read a recording, or frames spread evenly over it where it is long.
+    """Read a recording, or frames spread evenly over a long one, and take what tells most.
 
     Parameters
     ----------
@@ -58,6 +59,8 @@ def read_frames(
     progress : callable
     runs : bool
         Whether frames next to each other are needed, as motion between them counts.
+    known : collection of int or None
+        Frames whose pose is known, if that is so of any; the others are not needed then.
 
     Raises
     ------
@@ -72,19 +75,20 @@ def read_frames(
         )
     found: list[SeenFrame] = []
     index = {setup.name: k for k, setup in enumerate(session.sensors)}
-    total = min(_length(opened), rules.most_candidates)
+    total = min(_length(opened), rules.most_read)
     for start, stop, step in _stretches(opened, rules, runs=runs):
         with closing(pair(opened, start, stop, step)) as sets:
             for frame_set in sets:
                 progress("reading frames", len(found), total)
                 seen = _seen(session, frame_set, index)
-                if any(len(points) for points in seen.points.values()):
+                wanted = known is None or seen.number in known
+                if wanted and any(len(points) for points in seen.points.values()):
                     found.append(seen)
     if not found:
         raise RecordingError(
             f"{session.path}: found no feature in any frame; see what mixpose check says"
         )
-    return tuple(found)
+    return informative(found, len(index), rules.most_candidates, runs=runs)
 
 
 def _length(opened: Mapping[str, Source]) -> int:
@@ -96,14 +100,14 @@ def _stretches(
 ) -> list[tuple[int | None, int | None, int]]:
     """Which numbers are read: all, every n-th, or runs of neighbours spread evenly."""
     length = _length(opened)
-    if length <= rules.most_candidates:
+    if length <= rules.most_read:
         return [(None, None, 1)]
     if not runs:
-        return [(None, None, -(-length // rules.most_candidates))]
+        return [(None, None, -(-length // rules.most_read))]
     first = min((s.first for s in opened.values() if s.first is not None), default=0)
-    count = rules.most_candidates // _RUN
-    starts = first + np.linspace(0, length - _RUN, count).astype(int)
-    return [(int(start), int(start) + _RUN, 1) for start in np.unique(starts)]
+    count = rules.most_read // RUN
+    starts = first + np.linspace(0, length - RUN, count).astype(int)
+    return [(int(start), int(start) + RUN, 1) for start in np.unique(starts)]
 
 
 def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:

@@ -18,10 +18,10 @@ _MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
 _CLIMBS = 12
 
 
-def residuals_of(
-    bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted, *, climb: bool
-) -> dict[int, float]:
+def residuals_of(bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted) -> dict[int, float]:
     """Root mean square residual of each sensor over the pairs that a calibration met.
+
+    Poses are fitted to the rig by least squares first, so that two rigs are held to the same.
 
     Parameters
     ----------
@@ -31,12 +31,10 @@ def residuals_of(
     poses : (K, 4, 4) array
     adjusted : Adjusted
         Which detection is which feature.
-    climb : bool
-        Whether poses are first fitted to this rig.
     """
     sensors = range(len(rig.sensors))
     weights = [weight * (weight > _MET) for _, _, weight in adjusted.weighted]
-    for _ in range(_CLIMBS if climb and bundle.pose_free.any() else 0):
+    for _ in range(_CLIMBS if bundle.pose_free.any() else 0):
         rows = []
         for s in sensors:
             pairs = adjusted.weighted[s][0]

@@ -13,8 +13,13 @@ class CalibrationRules:
 
     blur: float = constant(
         2.0,
-        "last blur by the noise that residuals show: the maximum of the objective is then 97 % as "
-        "precise as least squares, and a detection 6 standard deviations off has no pull",
+        "last blur by the noise that residuals show: a detection between two features 6 standard "
+        "deviations apart is shared",
+    )
+    tail: float = constant(
+        3.0,
+        "scale of the Cauchy weights of the last steps, by the noise: 97 % as precise as least "
+        "squares where errors are Gaussian",
     )
     narrowing: float = constant(0.5, "of a blur to the next: halving loses no frame of any case")
     first_blur: float = constant(2.0, "of the median distance to the nearest feature at the start")
@@ -22,7 +27,18 @@ class CalibrationRules:
     steps: int = constant(4, "Gauss-Newton steps at each blur but the last")
     last_steps: int = constant(40, "most at the last blur; most cases need 6")
     converged: float = constant(1e-3, "standard deviations moved in a step: then it is the last")
+    alike: float = constant(
+        20.0, "coordinates of a sensor by which its own noise weighs as much as that of its kind"
+    )
+    unlike: float = constant(
+        1.4,
+        "times the noise of its kind that a sensor's may be, or that may be its, where errors of "
+        "detections are independent",
+    )
     faintest: float = constant(0.02, "weight below which a pair of detection and feature is left")
+    faintest_last: float = constant(
+        1e-6, "the same in the last steps: 15 standard deviations, whose Cauchy weight is 0.04"
+    )
     margin: float = constant(12.0, "log-odds behind the best pose of a sensor: less likely is none")
     hypotheses: int = constant(6, "poses kept for a sensor's frame: flat bodies have two or four")
     turn_deg: float = constant(
@@ -33,7 +49,10 @@ class CalibrationRules:
     least_link: int = constant(2, "frames that must agree on where two sensors stand")
     held_back: float = constant(0.2, "of the frames, whose residual is that of unseen data")
     least_frames: int = constant(4, "left to calibrate from, else none is held back")
-    most_candidates: int = constant(240, "frames taken: a longer recording is thinned out evenly")
+    most_read: int = constant(720, "frames read: a longer recording is thinned out evenly")
+    most_candidates: int = constant(
+        240, "of them are searched: those that add most information; a camera's takes 0.1 to 1 s"
+    )
     least_met: float = constant(0.3, "of a sensor's features in view; less and its frame is bad")
     undetermined: float = constant(
         0.25,
@@ -44,6 +63,9 @@ class CalibrationRules:
         (1.0, 2.5, 6.0),
         "σ_ε with which sensors that know no pose alone are tried together, until the rig can be "
         "adjusted: sensors 30 mm off need the second where σ_ε is 5 mm",
+    )
+    probes: int = constant(
+        10, "frames by which that blur is chosen where each is searched by itself: 0.7 s each"
     )
     failed: float = constant(
         1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"

@@ -12,7 +12,6 @@ from mixpose.calibration.rig import Rig, centre_of
 from mixpose.errors import SessionError
 from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.session import Session
 
 
 def with_length(rig: Rig, words: str) -> tuple[Rig, tuple[int, int]]:
@@ -58,7 +57,7 @@ def _scaled(sensor: Any, factor: float) -> Any:
     return replace(sensor, position=sensor.position * factor)
 
 
-def in_world(found: Calibration, words: str, session: Session) -> Calibration:
+def in_world(found: Calibration, words: str) -> Calibration:
     """The calibration in another frame: that of a sensor, or of the body in a frame.
 
     Raises

@@ -52,6 +52,15 @@ Tolerance = Annotated[
 ]
 JsonFile = Annotated[Path | None, typer.Option(help="Write all numbers here.")]
 PlotFile = Annotated[Path | None, typer.Option(help="Draw it: .png, .svg or .pdf.")]
+Workers = Annotated[int, typer.Option(min=1, help="How many poses are simulated at a time.")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ADDRESS",
+        help="Simulate on a dask.distributed cluster: the address of its scheduler, or local for "
+        "one on this machine.",
+    ),
+]
 
 
 def design(
@@ -67,6 +76,8 @@ def design(
     tolerance: Tolerance = None,
     json: JsonFile = None,
     plot: PlotFile = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
 ) -> None:
     """Predict the accuracy of planned systems, side by side, and what would improve them."""
     from mixpose.cli.design import DesignRequest, design_sessions  # noqa: PLC0415
@@ -83,5 +94,7 @@ def design(
         tolerance=tolerance,
         json=json,
         plot=plot,
+        workers=workers,
+        scheduler=scheduler,
     )
     design_sessions(sessions, request)

@@ -118,7 +118,7 @@ def _found(session: Session, request: CalibrateRequest, inputs: Sequence[Path]) 
         finally:
             saved.close(finished=finished)
     if request.world is not None:
-        found = in_world(found, request.world, session)
+        found = in_world(found, request.world)
     return found
 
 
@@ -146,7 +146,9 @@ def task_of(
         rig, pair = with_length(rig, request.length)
     kinds = {kind for each in free.values() for kind in each}
     runs = bool(kinds & {"delay", "drift"})
-    frames = read_frames(session, named_sources(request.sources), rules, progress, runs=runs)
+    frames = read_frames(
+        session, named_sources(request.sources), rules, progress, runs=runs, known=known
+    )
     if runs and any(frame.time_s is None for frame in frames):
         raise SessionError(
             f"{session.path}: --free delay: found frames without times; allowed: fps or times for "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mixpose.cli.notices import say
 from mixpose.design import Request, spread_poses, study
 from mixpose.design.texts import study_json, study_text
 from mixpose.errors import SessionError
+from mixpose.executing import Executor, in_processes, on_cluster
 from mixpose.poses.jsonl import read_poses
 from mixpose.rigid import Floats
 from mixpose.session import Session, load_session
@@ -38,6 +40,8 @@ class DesignRequest:
     tolerance: float | None
     json: Path | None
     plot: Path | None
+    workers: int = 1
+    scheduler: str | None = None
 
 
 def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
@@ -68,7 +72,8 @@ def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
         tolerance=asked.tolerance,
     )
     told = say if sys.stderr.isatty() else _silent
-    found = study(list(zip(names, sessions, strict=True)), request, told)
+    with _simulating(asked) as workers:
+        found = study(list(zip(names, sessions, strict=True)), request, told, workers)
     sys.stdout.write(study_text(found))
     if asked.json is not None:
         with appearing_whole(asked.json) as draft:
@@ -78,6 +83,15 @@ def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
 
         with appearing_whole(asked.plot) as draft:
             draw_study(found, draft)
+
+
+def _simulating(asked: DesignRequest) -> AbstractContextManager[Executor | None]:
+    """What does the simulated frames: this process, others, or a cluster."""
+    if not asked.runs or (asked.workers == 1 and asked.scheduler is None):
+        return nullcontext()
+    if asked.scheduler is None:
+        return in_processes(asked.workers)
+    return on_cluster(asked.scheduler, asked.workers if asked.workers > 1 else None)
 
 
 def _silent(text: str) -> None:

@@ -6,7 +6,7 @@ import csv
 import math
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from mixpose.design.prediction import Plan, Prediction, at_tip, predict
 from mixpose.design.written import plan_text
+from mixpose.executing import Executor, in_threads
 from mixpose.rigid import Floats, inverse, twist_between
 from mixpose.runner import run
 from mixpose.session import Session, load_session
@@ -51,6 +52,17 @@ class Confirmation:
     found: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Frames to simulate at one pose."""
+
+    session: Session
+    plan: Plan
+    T_world_object: Floats
+    frames: int
+    seed: int
+
+
 def confirm(
     session: Session,
     plan: Plan,
@@ -59,7 +71,7 @@ def confirm(
     *,
     tip: Floats,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda done: None,
+    executor: Executor | None = None,
 ) -> Confirmation:
     """Simulate frames of a body that stands still at some of the poses, and estimate them.
 
@@ -74,39 +86,42 @@ def confirm(
         Frames in all.
     tip : (3,) array
     seed : int
-    progress : callable
-        Takes the number of frames so far.
+    executor : Executor, optional
+        Does the poses; one after the other if left out.
     """
     count = min(len(poses), _MOST_POSES, max(1, runs // _FEWEST_FRAMES))
     chosen = poses[np.linspace(0, len(poses) - 1, count).astype(int)]
     prediction = predict(plan, chosen)
-    statuses: Counter[str] = Counter()
-    errors: list[Floats] = []
-    which: list[int] = []
-    for k, T in enumerate(chosen):
-        frames = runs // count + (k < runs % count)
-        if frames == 0:
-            continue
-        # of its own for each pose and each study
-        own = int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
-        found = _errors_at(session, plan, T, frames, own, statuses)
-        errors += found
-        which += [k] * len(found)
-        progress(sum(statuses.values()))
+    places = [
+        # a seed of its own for each pose and each study
+        _Place(
+            session, plan, T, frames, int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+        )
+        for k, T in enumerate(chosen)
+        if (frames := runs // count + (k < runs % count))
+    ]
+    done: dict[int, tuple[list[Floats], Counter[str]]] = {}
+    with nullcontext(executor) if executor is not None else in_threads(1) as workers:
+        for k, result in workers.run(_errors_at, places):
+            if isinstance(result, Exception):
+                raise result
+            done[k] = result
+    errors = [error for k in sorted(done) for error in done[k][0]]
+    which = [k for k in sorted(done) for _ in done[k][0]]
+    statuses = sum((told for _, told in done.values()), Counter[str]())
     return _compared(plan, prediction, np.array(errors).reshape(-1, 6), which, tip, statuses)
 
 
-def _errors_at(
-    session: Session, plan: Plan, T: Floats, frames: int, seed: int, statuses: Counter[str]
-) -> list[Floats]:
-    """Twists (6,) from the truth to the estimate, modulo the body's symmetries."""
+def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
+    """Twists (6,) from the truth to the estimate, modulo the body's symmetries; and statuses."""
+    plan, T = place.plan, place.T_world_object
     least = {
         m: min((n for n, one in zip(plan.noises, plan.sensors) if one.dimension == m), default=0.0)
         for m in (1, 2)
     }
     options = SimulationOptions(
-        frames=frames,
-        seed=seed,
+        frames=place.frames,
+        seed=place.seed,
         amplitude_translation=0.0,
         amplitude_rotation_deg=0.0,
         pixel_noise=least[2],
@@ -114,13 +129,14 @@ def _errors_at(
         deform=bool(plan.body.spread or plan.body.gravity),
     )
     alike = T @ plan.body.symmetries
-    errors = []
+    errors: list[Floats] = []
+    statuses: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "session.toml"
-        path.write_text(plan_text(session, plan, T), encoding="utf-8")
+        path.write_text(plan_text(place.session, plan, T), encoding="utf-8")
         recording = Path(folder) / "recording"
         simulate(load_session(path), recording, options)
-        rng = np.random.default_rng([seed, frames])
+        rng = np.random.default_rng([place.seed, place.frames])
         for name, sensor, noise in zip(plan.names, plan.sensors, plan.noises, strict=True):
             more = math.sqrt(max(noise**2 - least[sensor.dimension] ** 2, 0.0))
             if more > 0:
@@ -134,7 +150,7 @@ def _errors_at(
             # errors of a pose that looks the same, taken back to the pose itself
             same = estimate.T_world_object @ inverse(plan.body.symmetries[nearest])
             errors.append(twist_between(T, same))
-    return errors
+    return errors, statuses
 
 
 def _made_noisier(table: Path, noise: float, rng: np.random.Generator) -> None:

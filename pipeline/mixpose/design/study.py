@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from mixpose.design.congruence import Congruence, congruent_subsets
 from mixpose.design.equality import noise_to_equal, scaled
 from mixpose.design.prediction import Plan, at_tip, plan_of, predict
 from mixpose.design.summary import Summary, pooled, summarise
+from mixpose.executing import Executor
 from mixpose.rigid import Floats
 from mixpose.session import SensorSetup, Session
 
@@ -101,6 +103,7 @@ def study(
     named: Sequence[tuple[str, Session]],
     request: Request,
     say: Callable[[str], None] = lambda text: None,
+    executor: Executor | None = None,
 ) -> Study:
     """Study systems, the first being what the others are compared with.
 
@@ -111,18 +114,23 @@ def study(
     request : Request
     say : callable
         Told what is being done.
+    executor : Executor, optional
+        Does the simulated frames.
     """
     systems: list[System] = []
     for k, (name, session) in enumerate(named):
         say(f"{name}: prediction and advice")
         noises = {s: v for (which, s), v in request.noises.items() if which in (None, k)}
         systems.append(_system(name, session, plan_of(session, noises), request))
+    confirmed = partial(_confirmed, request=request, executor=executor)
     for k, system in enumerate(systems):
         if request.runs:
             say(f"{system.name}: {request.runs} simulated frames")
-            systems[k] = replace(system, confirmation=_confirmed(system, system.plan, request))
+            systems[k] = replace(system, confirmation=confirmed(system, system.plan))
         if k > 0:
-            systems[k] = replace(systems[k], equal=_equal(systems[k], systems[0], request, say))
+            systems[k] = replace(
+                systems[k], equal=_equal(systems[k], systems[0], request, say, confirmed)
+            )
     bodies = [each.body for _, session in named for each in session.objects]
     return Study(
         request=request,
@@ -169,7 +177,9 @@ def _with_noise(setup: SensorSetup, noise: float) -> SensorSetup:
     return replace(setup, extract=replace(setup.extract, sigma=sigma))
 
 
-def _confirmed(system: System, plan: Plan, request: Request) -> Confirmation | None:
+def _confirmed(
+    system: System, plan: Plan, *, request: Request, executor: Executor | None
+) -> Confirmation | None:
     closed = np.setdiff1d(np.arange(len(request.poses)), system.summary.undetermined)
     if not len(closed):
         return None
@@ -180,10 +190,17 @@ def _confirmed(system: System, plan: Plan, request: Request) -> Confirmation | N
         request.runs,
         tip=_tip(request),
         seed=request.seed,
+        executor=executor,
     )
 
 
-def _equal(system: System, first: System, request: Request, say: Callable[[str], None]) -> Equal:
+def _equal(
+    system: System,
+    first: System,
+    request: Request,
+    say: Callable[[str], None],
+    confirmed: Callable[[System, Plan], Confirmation | None],
+) -> Equal:
     factor = noise_to_equal(system.plan, first.error, _error_of(request))
     if factor is None:
         return Equal(None, (), first.error)
@@ -191,7 +208,7 @@ def _equal(system: System, first: System, request: Request, say: Callable[[str],
     found = None
     if request.runs:
         say(f"{system.name}: {request.runs} simulated frames with what equals {first.name}")
-        found = _confirmed(system, plan, request)
+        found = confirmed(system, plan)
     return Equal(factor, plan.noises, first.error, found)
 
 

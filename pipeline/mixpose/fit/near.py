@@ -105,7 +105,7 @@ def fit_near(
     finest: MatchedObjective | None = None,
     begun: Ascent[Floats] | None = None,
     noise: Sequence[Noise] | None = None,
-    least: Floats | None = None,
+    beside: float = 0.0,
     errors: ErrorRules = ErrorRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
@@ -128,8 +128,8 @@ def fit_near(
         From the start, on that, where it is at hand.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
-    least : (L,) array or None
-        Standard deviation of what else features of each view are off by, in σ_ε.
+    beside : float
+        Standard deviation of what else features are off by, in σ_ε.
     errors : ErrorRules
     rules : FitRules
     """
@@ -147,7 +147,6 @@ def fit_near(
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     if finest and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
-        beside = np.zeros(len(views)) if least is None else least
         ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
@@ -216,7 +215,7 @@ def _to_the_noise(
     objective: MatchedObjective,
     free: NDArray[np.bool_],
     noise: Sequence[Noise],
-    beside: Floats,
+    beside: float,
     errors: ErrorRules,
     rules: FitRules,
 ) -> Ascent[Floats]:
@@ -294,7 +293,7 @@ def _met(
     objective: MatchedObjective,
     ascent: Ascent[Floats],
     sigmas: Floats,
-    beside: Floats,
+    beside: float,
     errors: ErrorRules,
 ) -> _Met:
     """How far off features are met, as the density around them shows it: v ∇C / C.

@@ -14,13 +14,14 @@ distance from the feature in standard deviations,
 
 and cameras that miss the feature miss such a point as well.  The density ρ₃ of points in space is
 that of the camera with the fewest detections, over a depth of the body's size.  The explanation
-that makes clutter likelier counts, feature by feature.
+that makes clutter likelier counts, feature by feature.  A feature that no sensor meets is covered,
+and counts as missed twice at most.
 
 A pose is chosen to fit, and pays for that freedom in one of two ways; the cheaper counts.
 
 * By volume: the odds are integrated over the pose by Laplace's method, + ½ ln det(2π Cov)
-  + ln p(pose).  The prior p is flat over everything that can be seen, or Gaussian around what a
-  track predicts.
+  + ln p(pose).  The prior p is flat over everything that can be seen, or Student's distribution
+  around what a track predicts.
 * By count: a pose is fixed by as many features as it has coordinates (three in a camera).  These
   fit whatever they are, so they earn nothing, and the logarithm of the number of ways to choose
   them among what was observed is taken off.

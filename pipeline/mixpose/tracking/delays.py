@@ -64,6 +64,13 @@ class Offsets(NamedTuple):
         speeds = self.rows @ velocity
         return np.where(self.sensor[:, None] == np.array(sensors, int), speeds[:, None], 0.0)
 
+    def followed(self, change: Floats, free: NDArray[np.bool_]) -> Floats:
+        """How the pose (6,) follows a change of the velocity: a Gauss-Newton step."""
+        rows, step = self.rows[:, free], np.zeros(6)
+        left = self.offsets - self.late * (self.rows @ change)
+        step[free] = _inverse(rows.T @ rows) @ (rows.T @ left)
+        return step
+
     def design(self, velocity: Floats, free: NDArray[np.bool_]) -> Floats:
         """Derivatives by pose, velocity and estimated delays (K, 12 + 7 q).
 

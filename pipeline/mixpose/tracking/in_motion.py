@@ -20,16 +20,17 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = NDArray[np.float64]
 
-ROUNDS = 5
-LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, one step of both is all
+ROUNDS = 6
+LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
+SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
 
 
 def fit_in_motion(
-    data: FrameData, T_start: Floats, climb: Callable[[FrameData, Floats, Floats], Fit]
+    data: FrameData, T_start: Floats, climb: Callable[[FrameData, Floats, float], Fit]
 ) -> Fit:
     """Climb to the most likely pose and velocity near a start.
 
-    The pose is climbed to as if the velocity were known; then one step is taken in both.
+    The pose is climbed to as if the velocity were known, then steps of both are taken in turns.
 
     Parameters
     ----------
@@ -37,22 +38,23 @@ def fit_in_motion(
         Of sensors that see features at moments of their own.
     T_start : (4, 4) array
     climb : callable
-        Takes a frame as of the common time, a pose, and how far features of each view may be
-        off, in σ_ε, to the best pose near it.
+        Takes a frame as of the common time, a pose, and how far features may be off, in σ_ε, to
+        the best pose near it.
     """
     motion = data.motion(T_start, is_there=False)
-    T, expected = T_start, data.expected(T_start)
+    T, expected, moved = T_start, data.expected(T_start), np.inf
     for _ in range(ROUNDS):
         seen = data.in_motion(motion)
-        fit = climb(seen, T, seen.unsure(T, expected))
-        T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        if moved > LINEAR:
+            fit = climb(seen, T, seen.unsure(T, expected))
+            T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         expected = data.expected(T)
         offsets = seen.offsets(T, expected)
         both = together(offsets, motion.velocity, expected, data.free)
-        moved = np.abs(offsets.rows @ both.change * offsets.late)
-        T = np.asarray(perturb(T, both.step))
+        moved = float(np.abs(offsets.rows @ both.change * offsets.late).max(initial=0.0))
+        T = np.asarray(perturb(T, offsets.followed(both.change, data.free)))
         motion = Motion(T, motion.velocity + both.change, expected.acceleration)
-        if moved.max(initial=0.0) < LINEAR:
+        if moved < SETTLED:
             break
     return replace(fit, T_world_object=T, motion=motion)
 

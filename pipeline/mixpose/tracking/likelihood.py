@@ -210,17 +210,14 @@ class FrameData:
         expected = self.expected(T_world_object, is_there=is_there)
         return Motion(T_world_object, expected.velocity, expected.acceleration)
 
-    def unsure(self, T_world_object: Floats, velocity: Expected) -> Floats:
-        """How far features in view may be off by velocity and delay (L,), in σ_ε."""
-        at = self.finest.projection.project(T_world_object[None])
+    def unsure(self, T_world_object: Floats, velocity: Expected) -> float:
+        """How far features in view may be off by velocity and delay, in σ_ε of their sensor."""
+        at, views = self.finest.projection.project(T_world_object[None]), (self.still or self).views
         dimensions = self.finest.projection.dimensions.tolist()
-        return np.array(
-            [
-                unsure_by(J[0, seen[0], :m], y[0, seen[0], :m], view, velocity)
-                for J, y, seen, m, view in zip(
-                    at.J, at.y, at.seen, dimensions, (self.still or self).views, strict=True
-                )
-            ]
+        each = zip(at.J, at.y, at.seen, dimensions, views, strict=True)
+        return max(
+            unsure_by(J[0, seen[0], :m], y[0, seen[0], :m], view, velocity)
+            for J, y, seen, m, view in each
         )
 
     def offsets(
@@ -246,7 +243,8 @@ class FrameData:
             noise = errors_seen(joined_offsets(found), int(self.free.sum()), known, errors).blurs
             pairs = zip(found, views, strict=True)
             unsure = [unsure_by(one.J, one.places, view, velocity) for one, view in pairs]
-            blurs = np.hypot(noise, errors.blur * np.array(unsure))
+            # a pose that was climbed to at another velocity is off by as much in all sensors
+            blurs = np.hypot(noise, errors.blur * max(unsure, default=0.0))
         return offsets_of(found, views, np.minimum(blurs, 1.0))
 
 
@@ -270,7 +268,7 @@ class MatchedLikelihood:
         if data.begun and data.predictions and start.prediction is data.predictions[0]:
             begun = data.begun.ascent
 
-        def climb(seen: FrameData, T_start: Floats, least: Floats | None = None) -> Fit:
+        def climb(seen: FrameData, T_start: Floats, beside: float = 0.0) -> Fit:
             return fit_near(
                 seen.views,
                 seen.body,
@@ -281,7 +279,7 @@ class MatchedLikelihood:
                 finest=seen.finest,
                 begun=begun,
                 noise=seen.noise,
-                least=least,
+                beside=beside,
                 errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )

@@ -48,6 +48,8 @@ def candidates_of(data: FrameData) -> list[Candidate]:
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
-    """Where fits of candidates begin."""
+    """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
     close = data.start_uncertainty / data.rules.proposals.narrowing**2
-    return [Start(one.T_world_object, close) for one in candidates]
+    for one in candidates:
+        yield Start(one.T_world_object)
+        yield Start(one.T_world_object, close)

@@ -1,0 +1,157 @@
+"""What else a calibration may find, in rigs whose truth is known: lenses, clocks, scale, world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_rigs import FPS, POINTS, alone, bumped, cameras, motion, recording, task_of
+
+from mixpose.body import Body, PointFeature
+from mixpose.calibration import Rig, SeenFrame, calibrate
+from mixpose.calibration.choice import informative
+from mixpose.calibration.rig import centre_of
+from mixpose.calibration.world import in_world, with_length
+from mixpose.errors import SessionError
+from mixpose.rigid import inverse, rotation_angle_deg, transform
+
+Floats = np.ndarray
+LENS = np.array([-0.08, 0.01, 5e-4, -4e-4])
+
+
+def test_a_focal_length_and_a_principal_point_that_are_off_are_found() -> None:
+    true = cameras(2)
+    matrix = true[1].camera_matrix + np.array([[8.0, 0, 5], [0, 8, -4], [0, 0, 0]])
+    frames = recording(true, 40, 0.02)
+    free = {1: ("pose", "focal", "principal_point")}
+    believed = [true[0], replace(true[1], camera_matrix=matrix)]
+    found = calibrate(task_of(believed, frames, free=free), found=alone(true, frames))
+    off = found.after.sensors[1].camera_matrix - true[1].camera_matrix  # type: ignore[attr-defined]
+    assert [(b.kind, b.names) for b in found.blocks[1:]] == [
+        ("focal", ("f",)),
+        ("principal_point", ("cx", "cy")),
+    ]
+    told = found.deviations[6:]
+    # a small body in the middle of the image: about 0.3 px of the focal length, 1 px of the middle
+    assert (told < 3).all()
+    assert (np.abs([off[0, 0], off[0, 2], off[1, 2]]) < 3 * told).all()
+    assert off[1, 1] == pytest.approx(off[0, 0])
+
+
+def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> None:
+    true = [replace(camera, distortion=LENS) for camera in cameras(2)]
+    frames = recording(true, 40, 0.02)
+    believed = [true[0], replace(true[1], distortion=np.zeros(4))]
+    free = {1: ("pose", "distortion")}
+    found = calibrate(task_of(believed, frames, free=free), found=alone(true, frames))
+    told = found.deviations[6:]
+    known = np.isfinite(told)
+    off = found.after.sensors[1].distortion - LENS  # type: ignore[attr-defined]
+    assert known.sum() >= 3
+    assert (np.abs(off)[known] < 3 * told[known] + 0.02).all()  # beside what stays as it was
+    assert found.residuals[1].held_after < 0.03  # of 0.02 px in two coordinates
+    assert all("s1:distortion" in text for text in found.refused)
+
+
+def test_a_clock_that_is_late_and_runs_slow_is_found() -> None:
+    sensors = cameras(2)
+    middle = 59 / FPS / 2
+    frames = recording(sensors, 60, 0.02, late=lambda time: 0.004 + 0.003 * (time - middle))
+    free = {1: ("pose", "delay", "drift")}
+    found = calibrate(task_of(sensors, frames, free=free), found=alone(sensors, frames))
+    assert found.after.delays[1] == pytest.approx(0.004, abs=0.1e-3)
+    assert found.after.drifts[1] == pytest.approx(0.003, abs=0.2e-3)
+    assert (found.deviations[6:] < [0.05e-3, 0.1e-3]).all()
+
+
+def test_a_known_length_gives_the_size_of_a_body_and_rig_that_are_3_percent_too_small() -> None:
+    true = cameras(2)
+    frames = recording(true, 30, 0.02)
+    length = float(np.linalg.norm(centre_of(true[1]) - centre_of(true[0])))
+    small = Body("six", tuple(PointFeature(p) for p in 0.97 * POINTS))
+    rig = Rig.of(("s0", "s1"), true, small)
+    task = task_of(true, frames, free={1: ("pose",)}, body_free=True)
+    scaled, pair = with_length(rig, f"s0:s1={length}")
+    found = calibrate(replace(task, rig=scaled, body=small, length=pair), found=alone(true, frames))
+    size = np.linalg.norm(found.after.points - found.after.points.mean(axis=0), axis=1)
+    right = np.linalg.norm(POINTS - POINTS.mean(axis=0), axis=1)
+    assert size == pytest.approx(right, rel=1e-3)
+    assert "the known length between two sensors stays" in found.gauge
+    for words in ("s0:s0=3", "s0:s1=-1", "s0:s1=a", "s0=3", "s0:x=3"):
+        with pytest.raises(SessionError, match="allowed: SENSOR:SENSOR=LENGTH"):
+            with_length(rig, words)
+
+
+def test_a_calibration_is_told_in_the_frame_of_a_sensor_or_of_the_body() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 12, 0.05)
+    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    first, second = (one.T_sensor_world for one in found.after.sensors)  # type: ignore[attr-defined]
+    moved = in_world(found, "s1")
+    a, b = (one.T_sensor_world for one in moved.after.sensors)  # type: ignore[attr-defined]
+    assert np.allclose(b, np.eye(4), atol=1e-12)
+    assert np.allclose(a, first @ inverse(second), atol=1e-9)
+    # what a camera sees does not change
+    assert np.allclose(a @ moved.poses[3], first @ found.poses[3], atol=1e-9)
+    assert moved.gauge[-1] == "the world is that of s1"
+    by_body = in_world(found, "body@5")
+    assert np.allclose(by_body.poses[5], np.eye(4), atol=1e-12)
+    for words in ("s7", "body@99", "body"):
+        with pytest.raises(SessionError, match="allowed: s0, s1, or the body in a frame"):
+            in_world(found, words)
+
+
+def test_a_camera_that_shares_no_view_with_the_first_is_linked_through_another() -> None:
+    sensors = cameras(3)
+    frames = []
+    for frame in recording(sensors, 24, 0.02):
+        hidden = 2 if frame.number < 12 else 0
+        points = {k: y for k, y in frame.points.items() if k != hidden}
+        frames.append(replace(frame, points=points))
+    known = alone(sensors, tuple(frames))
+    task = bumped(bumped(task_of(sensors, tuple(frames)), 2, 2.0, 20.0), 1, 1.0, 5.0)
+    found = calibrate(task, found=known)
+    assert {k: other for k, (other, _) in found.through.items()} == {1: 0, 2: 1}
+    T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
+    assert rotation_angle_deg(T, sensors[2].T_sensor_world) < 0.05
+    assert found.unlinked == ()
+
+
+def _standing_still() -> tuple[SeenFrame, ...]:
+    """400 frames of two cameras, of which the body moves in 40 only."""
+    rng = np.random.default_rng(6)
+    frames = []
+    for k in range(400):
+        T = motion(max(k - 360, 0) / FPS)
+        seen = {}
+        for index, camera in enumerate(cameras(2)):
+            y, _ = camera.project(transform(T, POINTS))
+            seen[index] = rng.permutation(y + rng.normal(0, 0.05, y.shape))
+        frames.append(SeenFrame(k, k / FPS, seen, dict.fromkeys(seen, k / FPS)))
+    return tuple(frames)
+
+
+@pytest.mark.parametrize("runs", [False, True])
+def test_of_a_body_that_mostly_lies_still_the_frames_in_which_it_moves_are_taken(
+    runs: bool,
+) -> None:
+    frames = _standing_still()
+    chosen = informative(frames, 2, 40, runs=runs)
+    numbers = [frame.number for frame in chosen]
+    assert numbers == sorted(numbers)
+    # 4 of 40 spread evenly move
+    assert sum(number > 360 for number in numbers) >= 24
+    assert informative(frames[:40], 2, 40, runs=runs) == frames[:40]
+
+
+def test_frames_that_are_chosen_tell_more_than_frames_spread_evenly() -> None:
+    frames = _standing_still()
+    sensors = cameras(2)
+    told = []
+    for chosen in (informative(frames, 2, 12, runs=False), frames[:: 400 // 12][:12]):
+        known = alone(sensors, chosen, lambda k: motion(max(k - 360, 0) / FPS))
+        task = task_of(sensors, tuple(chosen), free={1: ("pose", "focal")})
+        told.append(calibrate(task, found=known).deviations[-1])
+    # a focal length takes several distances and turns: 1.6 px against 2.9 px
+    assert told[0] < 0.7 * told[1]
