@@ -58,6 +58,13 @@ _FIELDS = (
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
+        "judgement-markers-off-are-noise",
+        "judgement/noise.py",
+        "    squares.append(of_markers.squares)",
+        "    squares.append(0.0)",
+        "sensors that see a marker off in the same way count as independent",
+    ),
+    Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
         "judgement/noise.py",
         "left = [one - J @ each for one, each in zip(P, drawn, strict=True)]",
