@@ -34,15 +34,40 @@ def test_a_fault_makes_no_pose_wrong_and_is_named(name: str, tmp_path: Path) -> 
     assert found.right >= 39  # of 40
 
 
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [("bumped by 0.5° from frame 20", 20), ("frozen for 5 frames", 10), ("torn for 5 frames", 10)],
+)
+def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and_is_named(
+    name: str, right: int, tmp_path: Path
+) -> None:
+    found = outcome(FAULTS[name], tmp_path / "recording", stop=right + 5)
+    assert found.wrong == 0
+    assert found.is_named, found.said
+    assert found.right >= right
+
+
 def test_a_recording_without_faults_gives_rise_to_no_remark(tmp_path: Path) -> None:
     found = outcome(FAULTS["nothing"], tmp_path / "recording")
     assert (found.right, found.said) == (40, [])
 
 
-def test_swapped_cameras_are_told_by_what_they_see(tmp_path: Path) -> None:
-    found = outcome(FAULTS["left and right swapped"], tmp_path / "recording")
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("left and right swapped", "'left' and 'right' are swapped"),
+        ("body mirrored", "the body of [object] is mirrored"),
+        ("points in metres", "with points 1000 times as large"),
+        ("translations in metres", "with points a thousandth as large"),
+        ("mirrored image", "images of 'right' are mirrored"),
+    ],
+)
+def test_what_is_given_wrong_all_along_is_told_by_what_is_seen(
+    name: str, said: str, tmp_path: Path
+) -> None:
+    found = outcome(FAULTS[name], tmp_path / "recording", stop=6)  # none convinces: it searches
     assert found.right == found.wrong == 0
-    assert any("'left' and 'right' are swapped" in line for line in found.said), found.said
+    assert any(said in line for line in found.said), found.said
 
 
 def association(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Association:

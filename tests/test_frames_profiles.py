@@ -143,3 +143,14 @@ def test_values_whose_squares_cannot_be_added_up_are_one_line(tmp_path: Path) ->
     path.write_text("0,1,2\n0,1e30,2\n")
     with pytest.raises(RecordingError, match=r"frame 1, bin 1: found 1e\+30, allowed .* 1e\+15"):
         list(profiles(tmp_path, "p.csv").frames())
+
+
+@pytest.mark.parametrize(
+    "shape", ["(-3, 200)", "(3, -200)", "(True, True)", "(3,!J@", "(3, 10**9)"]
+)
+def test_a_header_that_says_nonsense_is_told(tmp_path: Path, shape: str) -> None:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    beginning = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little")
+    (tmp_path / "p.npy").write_bytes(beginning + header.encode() + bytes(2400))
+    with pytest.raises(RecordingError, match=r"p\.npy: (not a|found float32 of|cut short)"):
+        list(profiles(tmp_path, "p.npy").frames())

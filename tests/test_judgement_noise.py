@@ -134,3 +134,25 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
     # degrees of freedom, spread unevenly over frames, the variance is known to a quarter
     assert np.mean(plain[20:]) > 5.0
     assert 0.5 < np.mean(errors[20:]) < 2.0
+
+
+def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
+    rng = np.random.default_rng(6)
+    residuals, errors, plain = Residuals(), [], []
+    for _ in range(100):
+        off = rng.normal(0, 0.3, (12, 3))
+        found = [sensor(name, rng, np.zeros((12, 2))) for name in "01234"]
+        made = [
+            (one.J[..., :3] @ off[..., None])[..., 0] + rng.normal(0, 0.1, (12, 2)) for one in found
+        ]
+        left, error = fitted(found, made)
+        noise = noise_of(left, FREE, residuals, ALONE)
+        residuals = noise.remembered
+        errors.append(error @ np.linalg.solve(noise.covariance, error) / 6)
+        J = np.concatenate([one.J.reshape(-1, 6) for one in left])
+        r = np.concatenate([one.offsets.ravel() for one in left])
+        plain.append(error @ (J.T @ J) @ error / (r @ r / (len(r) - 6)) / 6)
+    # five sensors see the same errors: least squares takes them for independent; that markers are
+    # where they are said to be is believed as surely as one frame of twenty tells
+    assert np.mean(plain[20:]) > 2.5
+    assert 0.8 < np.mean(errors[20:]) < 1.4

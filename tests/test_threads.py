@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -13,6 +14,7 @@ from threadpoolctl import ThreadpoolController
 
 import mixpose
 from mixpose import runner
+from mixpose.executing import in_processes
 from mixpose.threads import one_blas_thread
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
@@ -77,3 +79,14 @@ def test_frames_of_two_threads_that_overlap_leave_the_threads_as_they_were() -> 
     assert threads() == {2}
     with one_blas_thread():
         assert threads() == {1}
+
+
+def test_processes_that_only_compute_have_one_thread_and_leave_the_environment_alone() -> None:
+    before = dict(os.environ)
+    text = "[each['num_threads'] for each in __import__('threadpoolctl').threadpool_info()]"
+    with in_processes(1) as pool:
+        ((_, counts),) = pool.run(eval, [text])
+    assert not isinstance(counts, Exception)
+    assert counts
+    assert {*counts} == {1}
+    assert dict(os.environ) == before

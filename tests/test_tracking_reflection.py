@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from detections import TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.rigid import transform
+from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.rules import ProposalRules
 
 Floats = NDArray[np.float64]
 
@@ -28,9 +28,9 @@ MIRRORED = Body("mirrored", tuple(PointFeature(point) for point in PLATE * [1, 1
 def status(cameras: list[PinholeCamera], shown: Body, *, mirrors: bool = True) -> str:
     views = detect(cameras, shown, TRUTH, noise=0.2)
     tracker = Tracker.create(BODY, EstimatorOptions())
-    if not mirrors:  # no body is so flat
-        rules = replace(tracker.rules, proposals=ProposalRules(in_plane=-1.0))
-        tracker = replace(tracker, rules=rules)
+    if not mirrors:  # no rival is so much better
+        acceptance = replace(tracker.rules.acceptance, standing_out=1e9)
+        tracker = replace(tracker, rules=replace(tracker.rules, acceptance=acceptance))
     return tracker.advance(tracker.begin(), 0, None, views)[1].status
 
 
@@ -58,5 +58,30 @@ def test_a_false_point_beside_a_plane_is_no_mirror_image(
     for k, camera in enumerate(pinhole_cameras):
         y, _ = camera.project(transform(TRUTH, flat))
         views.append(view_of(str(k), camera, y))
+    tracker = Tracker.create(BODY, EstimatorOptions())
+    assert tracker.advance(tracker.begin(), 0, None, views)[1].status == "ok"
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seen_by", [1, 2])
+def test_a_body_given_mirrored_is_never_ok(
+    pinhole_cameras: list[PinholeCamera], seed: int, seen_by: int
+) -> None:
+    points = np.random.default_rng(seed).uniform(-80, 80, (6, 3))
+    given = Body("given", tuple(PointFeature(point) for point in points * [1, 1, -1]))
+    shown = Body("shown", tuple(PointFeature(point) for point in points))
+    tracker = Tracker.create(given, EstimatorOptions())
+    track = tracker.begin()
+    for frame in range(3):
+        T = perturb(TRUTH, np.array([frame, 0, 0, 0, 0.02 * frame, 0]))
+        views = detect(pinhole_cameras[:seen_by], shown, T, noise=0.2, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+        assert estimate.status != "ok"
+
+
+def test_a_body_few_of_whose_markers_are_seen_beside_false_ones_is_not_its_mirror_image(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = detect(pinhole_cameras, BODY, TRUTH, noise=0.2, hidden=1, false=3)
     tracker = Tracker.create(BODY, EstimatorOptions())
     assert tracker.advance(tracker.begin(), 0, None, views)[1].status == "ok"

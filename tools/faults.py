@@ -27,6 +27,7 @@ from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg
 from mixpose.runner import run
+from mixpose.selection import Selection
 from mixpose.session import load_session
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
@@ -282,15 +283,15 @@ class Result:
     is_named: bool
 
 
-def outcome(fault: Fault, folder: Path) -> Result:
-    """Run a copy of the recording with a fault in it."""
+def outcome(fault: Fault, folder: Path, stop: int | None = None) -> Result:
+    """Run a copy of the recording with a fault in it, or its first frames."""
     shutil.copytree(RECORDING, folder)
     fault.change(folder)
     truth = {line.frame: line.T_world_object for line in read_poses(folder / "truth.jsonl").poses}
     session = load_session(folder / "session.toml")
     summary = Summary(session)
     counts = {"right": 0, "wrong": 0, "ambiguous": 0, "lost": 0}
-    for estimate in run(session, watch=summary.watch):
+    for estimate in run(session, selection=Selection(stop=stop), watch=summary.watch):
         summary.add(estimate)
         if estimate.status != "ok":
             counts[estimate.status] += 1

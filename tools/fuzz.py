@@ -4,7 +4,7 @@
 
 Session files, calibrations, tables of markers, detections and times, profiles, images, videos and
 poses are flipped, cut, doubled, nested, filled with absurd numbers and exchanged for each other,
-and given to the command line in a process of their own.  A finding is a traceback, a crash, an exit
+and given to the command line, some inputs to a fork.  A finding is a traceback, a crash, an exit
 status other than 0, 2 and 3, more than one line that is no warning, more than 10 s of processor
 time, or more than 2 GB.  The mutator knows nothing of the code that it runs through; `atheris`
 would, but it cannot see into the decoders of OpenCV and FFmpeg, where most of these bytes go.
@@ -13,7 +13,12 @@ would, but it cannot see into the decoders of OpenCV and FFmpeg, where most of t
 from __future__ import annotations
 
 import argparse
+import gc
+import importlib
+import io
+import json
 import os
+import pkgutil
 import random
 import resource
 import shutil
@@ -21,22 +26,28 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
+import typer
 
+import mixpose
 from mixpose.cli import main as command_line
 from mixpose.frames.quiet import quieten_opencv
 
 LONGEST_S = 10.0
 LARGEST_BYTES = 2 * 10**9
-PATIENCE_S = (
-    600.0  # by the clock; `LONGEST_S` is processor time, which a busy machine does not change
-)
+PATIENCE_S = 1200.0  # by the clock; `LONGEST_S` is processor time, whatever else the machine does
+TOGETHER = 25  # inputs of one fork, which shares what it loads
+TOLD = 500  # after so many the figures so far are printed
+OUTCOME = "outcome"
 SESSION = """unit = "mm"
 [object]
 name = "body"
@@ -48,7 +59,9 @@ translation = [0, 0, 900]
 name = "c"
 {sensor}
 """
-POINTS = "points = [[0, 0, 0], [100, 0, 0], [0, 120, 0], [0, 0, 90], [60, 70, 20]]"
+BODY = [[0, 0, 0], [100, 0, 0], [0, 120, 0], [-80, -60, 90], [60, 70, 20]]
+POINTS = f"points = {BODY}"
+PLACES = ((160.0, 120.0), (193.5, 120.0), (160.0, 160.1), (135.6, 101.7), (179.6, 142.9))
 CAMERA = """model = "pinhole"
 source = "{source}"
 resolution = [320, 240]
@@ -74,8 +87,8 @@ class Kind:
 def spots(seed: int) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
     picture = np.full((240, 320), 12, np.uint8)
     noise = np.random.default_rng(seed).integers(0, 4, picture.shape)
-    for u, v in ((160, 120), (193, 120), (160, 160), (161, 121), (180, 143)):
-        cv2.circle(picture, (u + seed, v), 2, 200, -1)
+    for u, v in PLACES:
+        cv2.circle(picture, (round(u) + seed, round(v)), 2, 200, -1)
     return (picture + noise).astype(np.uint8)
 
 
@@ -85,7 +98,7 @@ def session(folder: Path, sensor: str, body: str = POINTS) -> None:
 
 
 def detections(folder: Path) -> None:
-    rows = [f"{k},{160 + 33 * i + k},{120 + 9 * i},1" for k in range(3) for i in range(5)]
+    rows = [f"{k},{u + k},{v},1" for k in range(3) for u, v in PLACES]
     (folder / "t.csv").write_text("frame,u,v,weight\n" + "\n".join(rows) + "\n", encoding="utf-8")
 
 
@@ -142,14 +155,17 @@ def with_video(name: str, codec: str) -> Callable[[Path], None]:
 
 def with_profiles(name: str) -> Callable[[Path], None]:
     def make(folder: Path) -> None:
-        r = np.arange(200.0)
-        values = np.exp(-((r[None] - 90 - 10 * np.arange(3)[:, None]) ** 2) / 8)
+        bins = np.arange(300.0)[None, :, None]
+        lengths = np.linalg.norm(np.add(BODY, [0, 0, 900]), axis=1) - 800
+        values = np.exp(-((bins - lengths - 2 * np.arange(3)[:, None, None]) ** 2) / 8).sum(axis=2)
         if name.endswith(".npy"):
             np.save(folder / name, values.astype(np.float32))
         else:
             np.savetxt(folder / name, values, delimiter=",", fmt="%.4f")
         sensor = f'model = "lateration"\nsource = "{name}"\nposition = [0, 0, 0]\nrange_min = 800\n'
-        session(folder, sensor + "bin_size = 1.0\n[sensor.extract]\nsigma = 3.0")
+        sensor += "bin_size = 1.0\n[sensor.extract]\nsigma = 3.0"
+        # one range tells one direction; all six would make each input take seconds
+        session(folder, sensor + '\n[estimator]\nfree = ["z"]')
 
     return make
 
@@ -200,7 +216,7 @@ distortion_coefficients:
   data: [0.1, 0.01, 0, 0, 0]
 """
 MARKERS = (
-    "name,x,y,z,sigma\na,0,0,0,0.1\nb,100,0,0,0.1\nc,0,120,0,0.1\nd,0,0,90,0.1\ne,60,70,20,0\n"
+    "name,x,y,z,sigma\na,0,0,0,.1\nb,100,0,0,.1\nc,0,120,0,.1\nd,-80,-60,90,.1\ne,60,70,20,0\n"
 )
 
 KINDS: dict[str, Kind] = {
@@ -268,38 +284,58 @@ def number_changed(data: bytes, rng: random.Random) -> bytes:
     return data[:at] + rng.choice(TOKENS) + data[end:]
 
 
-def said_by(folder: Path, arguments: tuple[str, ...]) -> tuple[str | None, float, int]:
-    """Run the command line in a fork: what is wrong with how it ended, seconds, bytes."""
-    began = time.monotonic()
-    child = os.fork()
-    if child == 0:
-        _run_in_child(folder, arguments)
-    os.set_blocking(0, True)
-    with _alarm(PATIENCE_S, child):
-        _, status, usage = os.wait4(child, 0)
-    seconds = usage.ru_utime + usage.ru_stime
-    size = usage.ru_maxrss * 1024
-    text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-    return _fault(status, text, seconds, size, time.monotonic() - began), seconds, size
+@dataclass(frozen=True)
+class Ended:
+    """How the command line ended on an input."""
+
+    code: int
+    seconds: float
+    size: int
 
 
-def _run_in_child(folder: Path, arguments: tuple[str, ...]) -> None:
-    os.chdir(folder)
-    for stream, name in ((1, "stdout"), (2, "stderr")):
-        os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
-    resource.setrlimit(resource.RLIMIT_CPU, (int(LONGEST_S) + 2, int(LONGEST_S) + 3))
+def ends_of(folders: Sequence[Path], arguments: Sequence[tuple[str, ...]]) -> list[Ended]:
+    """Run the command line on inputs, one after the other in one fork, or more where one dies."""
+    found: list[Ended] = []
+    while len(found) < len(folders):
+        left = slice(len(found), len(folders))
+        child = os.fork()
+        if child == 0:
+            _run_in_child(folders[left], arguments[left])
+        with _alarm(PATIENCE_S, child):
+            _, status, usage = os.wait4(child, 0)
+        for folder in folders[left]:
+            if not (folder / OUTCOME).exists():  # it died of this one
+                code = -os.WTERMSIG(status) if os.WIFSIGNALED(status) else 99
+                found.append(Ended(code, usage.ru_utime + usage.ru_stime, usage.ru_maxrss))
+                break
+            found.append(Ended(*json.loads((folder / OUTCOME).read_text(encoding="utf-8"))))
+    return found
+
+
+def _run_in_child(folders: Sequence[Path], arguments: Sequence[tuple[str, ...]]) -> None:
     cv2.setNumThreads(1)
-    code = 99
-    try:
-        command_line(arguments)
-    except SystemExit as ended:
-        code = int(ended.code or 0)
-    except BaseException:
-        import traceback  # noqa: PLC0415
-
-        traceback.print_exc()
-    sys.stderr.flush()
-    os._exit(code)
+    for folder, each in zip(folders, arguments, strict=True):
+        os.chdir(folder)
+        for stream, name in ((1, "stdout"), (2, "stderr")):
+            descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(descriptor, stream)
+            os.close(descriptor)
+        began = time.process_time()
+        most = int(began + LONGEST_S) + 2
+        resource.setrlimit(resource.RLIMIT_CPU, (most, resource.RLIM_INFINITY))
+        code = 99
+        try:
+            command_line(each)
+        except SystemExit as left:
+            code = int(left.code or 0)
+        except BaseException:
+            traceback.print_exc()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        outcome = json.dumps([code, time.process_time() - began, size])
+        (folder / OUTCOME).write_text(outcome, encoding="utf-8")
+    os._exit(0)
 
 
 class _alarm:  # noqa: N801 - used as a function
@@ -316,28 +352,45 @@ class _alarm:  # noqa: N801 - used as a function
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def _fault(status: int, text: str, seconds: float, size: int, elapsed: float) -> str | None:
-    if os.WIFSIGNALED(status):
-        return f"signal {os.WTERMSIG(status)}"
-    code = os.WEXITSTATUS(status)
+def fault(folder: Path, ended: Ended) -> str | None:
+    """What is wrong with how an input ended."""
+    text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
     lines = [one for one in text.splitlines() if not one.startswith("mixpose: warning: ")]
-    if code not in (0, 2, 3) or "Traceback" in text:
-        return f"exit status {code}"
-    if code and len(lines) != 1:
+    if ended.code < 0:
+        return f"signal {-ended.code} after {ended.seconds:.0f} s"
+    if ended.code not in (0, 2, 3) or "Traceback" in text:
+        return f"exit status {ended.code}"
+    if ended.code and len(lines) != 1:
         return f"{len(lines)} lines"
-    if seconds > LONGEST_S:
-        return f"{seconds:.0f} s of {elapsed:.0f}"
-    return f"{size / 1e9:.1f} GB" if size > LARGEST_BYTES else None
+    if ended.seconds > LONGEST_S:
+        return f"{ended.seconds:.0f} s"
+    return f"{ended.size / 1e6:.1f} GB" if ended.size * 1024 > LARGEST_BYTES else None
+
+
+@dataclass
+class Count:
+    """What came of the inputs so far."""
+
+    done: int = 0
+    slowest: float = 0.0
+    largest: int = 0
+    found: list[str] = field(default_factory=list)
+
+    def text(self) -> str:
+        kinds = dict(Counter(line.split()[0] for line in self.found))
+        return (
+            f"{self.done} mutated inputs: {len(self.found)} findings {kinds}; the slowest took "
+            f"{self.slowest:.1f} s, the largest {self.largest / 1e6:.2f} GB"
+        )
 
 
 def fuzz(
     kinds: list[str], count: int, seed: int, keep: Path | None, until: float | None = None
-) -> tuple[int, list[str], float, int]:
-    """Try mutated inputs: how many, what was found, and the longest time and largest memory."""
+) -> Count:
+    """Try mutated inputs."""
     quieten_opencv()
     rng = random.Random(seed)
-    found: list[str] = []
-    slowest, largest, done = 0.0, 0, 0
+    total = Count()
     with tempfile.TemporaryDirectory() as name:
         whole = {kind: Path(name) / kind for kind in kinds}
         for kind, folder in whole.items():
@@ -345,25 +398,50 @@ def fuzz(
             KINDS[kind].make(folder)
         contents = {kind: (whole[kind] / KINDS[kind].file).read_bytes() for kind in kinds}
         others = [*contents.values(), b"", b"\x89PNG\r\n\x1a\n", b"\n" * 5000]
-        for k in range(count):
-            if until is not None and time.monotonic() > until:
-                break
-            kind = kinds[k % len(kinds)]
-            folder = Path(name) / "one"
-            shutil.rmtree(folder, ignore_errors=True)
-            shutil.copytree(whole[kind], folder)
-            data = mutated(contents[kind], others, rng)
-            (folder / KINDS[kind].file).write_bytes(data)
-            fault, seconds, size = said_by(folder, KINDS[kind].arguments)
-            slowest, largest, done = max(slowest, seconds), max(largest, size), done + 1
-            if fault is None:
-                continue
-            text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
-            found.append(f"{kind} {k}: {fault}: {text.strip()[-300:]}")
-            print(found[-1], flush=True)
-            if keep is not None:
-                shutil.copytree(folder, keep / f"{kind}{k}", dirs_exist_ok=True)
-    return done, found, slowest, largest
+        while total.done < count and (until is None or time.monotonic() < until):
+            numbers = range(total.done, min(total.done + TOGETHER, count))
+            chosen = [kinds[k % len(kinds)] for k in numbers]
+            folders = [Path(name) / f"input{k}" for k in numbers]
+            for kind, folder in zip(chosen, folders, strict=True):
+                shutil.copytree(whole[kind], folder)
+                data = mutated(contents[kind], others, rng)
+                (folder / KINDS[kind].file).write_bytes(data)
+            ends = ends_of(folders, [KINDS[kind].arguments for kind in chosen])
+            for k, kind, folder, ended in zip(numbers, chosen, folders, ends, strict=True):
+                see(total, f"{kind} {k}", folder, ended, keep)
+                shutil.rmtree(folder)
+            if total.done % TOLD < TOGETHER:
+                print(total.text(), flush=True)
+    return total
+
+
+def see(total: Count, name: str, folder: Path, ended: Ended, keep: Path | None) -> None:
+    """Count an input, and tell it where it is a finding."""
+    total.done += 1
+    total.slowest = max(total.slowest, ended.seconds)
+    total.largest = max(total.largest, ended.size)
+    wrong = fault(folder, ended)
+    if wrong is None:
+        return
+    text = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    total.found.append(f"{name}: {wrong}: {text.strip()[-300:]}")
+    print(total.found[-1], flush=True)
+    if keep is not None:
+        shutil.copytree(folder, keep / name.replace(" ", ""), dirs_exist_ok=True)
+
+
+def warm_up() -> None:
+    """Import everything once, before the first fork: a fork then takes some 10 ms."""
+    for module in pkgutil.walk_packages(mixpose.__path__, "mixpose."):
+        if module.name not in ("mixpose.__main__", "mixpose.rerun_file"):
+            importlib.import_module(module.name)
+    with tempfile.TemporaryDirectory() as name:
+        with_table(Path(name))
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()), suppress(SystemExit):
+            command_line(["check", f"{name}/session.toml", "--quick"])
+    typer.main.get_command = cache(typer.main.get_command)  # made anew for each input otherwise
+    gc.collect()
+    gc.freeze()  # a collection in the fork would copy every page
 
 
 def main() -> int:
@@ -379,21 +457,10 @@ def main() -> int:
         parser.error(f"no such kind: {sorted(unknown)[0]}")
     kinds = options.kinds or list(KINDS)
     until = None if options.minutes is None else time.monotonic() + 60 * options.minutes
-    # everything is imported once, before the first fork
-    import mixpose.cli.app  # noqa: PLC0415
-    import mixpose.cli.check  # noqa: PLC0415
-    import mixpose.cli.convert  # noqa: PLC0415
-    import mixpose.cli.evaluate  # noqa: PLC0415
-    import mixpose.cli.run  # noqa: PLC0415
-    import mixpose.cli.simulate  # noqa: F401, PLC0415
-
-    done, found, slowest, largest = fuzz(kinds, options.count, options.seed, options.keep, until)
-    by_kind = Counter(line.split()[0] for line in found)
-    print(
-        f"{done} mutated inputs: {len(found)} findings {dict(by_kind)}; the slowest took "
-        f"{slowest:.1f} s, the largest {largest / 1e9:.2f} GB"
-    )
-    return 1 if found else 0
+    warm_up()
+    total = fuzz(kinds, options.count, options.seed, options.keep, until)
+    print(total.text())
+    return 1 if total.found else 0
 
 
 if __name__ == "__main__":

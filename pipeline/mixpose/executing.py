@@ -16,6 +16,7 @@ from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
 
 from mixpose.errors import SessionError
+from mixpose.threads import keep_one_blas_thread
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -94,9 +95,8 @@ def in_processes(workers: int | None = None) -> Iterator[Executor]:
 
     The linear algebra of each has one thread.
     """
-    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
     context = multiprocessing.get_context("spawn")
-    with futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with futures.ProcessPoolExecutor(workers, context, keep_one_blas_thread) as pool:
         try:
             yield _Pool(pool)
         except BaseException:

@@ -6,15 +6,31 @@ other far longer than they compute, above all where other programs keep the proc
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from threading import Lock
 from typing import Any
 
-from threadpoolctl import ThreadpoolController
-
 _LIMITING = Lock()
+
+
+def ask_for_one_blas_thread() -> None:
+    """Let this process begin with one thread, where nobody said otherwise.
+
+    It holds for libraries that are not loaded yet, and saves the making of threads.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def keep_one_blas_thread() -> None:
+    """Keep this process, which only computes, from ever sharing linear algebra among threads."""
+    import numpy as np  # noqa: F401, PLC0415 - what is loaded later is not limited
+    import scipy.linalg  # noqa: F401, PLC0415
+    from threadpoolctl import threadpool_limits  # noqa: PLC0415
+
+    threadpool_limits(limits=1, user_api="blas")
 
 
 @contextmanager
@@ -38,4 +54,6 @@ def one_blas_thread() -> Iterator[None]:
 @cache
 def _libraries() -> Any:
     """The BLAS libraries that are loaded; looking for them takes milliseconds."""
+    from threadpoolctl import ThreadpoolController  # noqa: PLC0415 - the command line starts here
+
     return ThreadpoolController().select(user_api="blas")

@@ -58,6 +58,13 @@ _FIELDS = (
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
+        "judgement-markers-off-are-noise",
+        "judgement/noise.py",
+        "    squares.append(of_markers.squares)",
+        "    squares.append(0.0)",
+        "sensors that see a marker off in the same way count as independent",
+    ),
+    Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
         "judgement/noise.py",
         "left = [one - J @ each for one, each in zip(P, drawn, strict=True)]",
@@ -74,6 +81,13 @@ _FIELDS = (
 )
 
 _EVIDENCE = (
+    Mutant(
+        "judgement-covered-features-missed-one-by-one",
+        "judgement/evidence.py",
+        "return 2 * self.log_missed",
+        "return 20 * self.log_missed",
+        "of a rig of many cameras a body with a covered marker is lost",
+    ),
     Mutant(
         "judgement-misses-are-free",
         "judgement/evidence.py",

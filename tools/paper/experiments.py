@@ -5,20 +5,18 @@ Each experiment changes one thing in the paper's estimate and shows the cell tha
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from paper.measurements import SNR, Measurement, measure
+from paper.pooled import in_order
 from paper.published import PUBLISHED
 from paper.runs import DEGREES, SAMPLES
 from paper.sampled import sampled_objectives
@@ -141,25 +139,16 @@ def _without_negative(measurement: Measurement, negative: Negative) -> Measureme
 
 def run_experiments(runs: int, seed: int, console: Console) -> None:
     """Run and print all experiments on the first runs of the table."""
-    os.environ.update(OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1")
     shown = Table(title="Experiments: the paper's estimate with one thing changed")
     for heading in ("system", "scenario", "changed", "runs"):
         shown.add_column(heading)
     for heading in NUMBERS:
         shown.add_column(heading, justify="right")
-    bar = Console(stderr=True)
-    counts = [min(runs, experiment.most_runs) for experiment in EXPERIMENTS]
-    with (
-        Progress(console=bar, disable=not bar.is_terminal) as progress,
-        ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool,
-    ):
-        task = progress.add_task("experiments", total=sum(counts))
-        for experiment, count in zip(EXPERIMENTS, counts, strict=True):
-            futures = [pool.submit(error, experiment, seed, k) for k in range(count)]
-            for _ in as_completed(futures):
-                progress.advance(task)
-            errors = np.array([future.result() for future in futures])
-            _add_row(shown, experiment, count, np.sqrt((errors**2).mean(axis=0)))
+    for experiment in EXPERIMENTS:
+        count = min(runs, experiment.most_runs)
+        task, title = partial(error, experiment, seed), f"{experiment.system} {experiment.name}"
+        errors = np.array(in_order(task, range(count), title, None))
+        _add_row(shown, experiment, count, np.sqrt((errors**2).mean(axis=0)))
     console.print(shown)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 
 from mixpose.limits import MOST_PIXELS
+from mixpose.threads import ask_for_one_blas_thread
 
 WRONG_USAGE = 2
 INTERRUPTED = 130
@@ -64,8 +65,7 @@ def _ended_like_interrupted() -> Iterator[None]:
 
 
 def _status(arguments: list[str]) -> int:
-    # the matrices here are small: threads of the linear algebra would wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    ask_for_one_blas_thread()
     # OpenCV looks at it when it is loaded
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))
     # imported here, so that a program that only looks at this package does not wait for them

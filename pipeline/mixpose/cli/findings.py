@@ -5,12 +5,15 @@ Everything is kept as sums and stretches of frames, so that a run of any length 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 
 import numpy as np
 
 from mixpose.checking import explanation
+from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
@@ -21,6 +24,9 @@ _GONE = 0.25  # of the frames in which a marker should be seen, at their end: it
 _FEWEST = 10  # frames in which a marker should have been seen before anything is said of it
 _MEASURED = 4.0  # times what the other markers are off: a marker that is measured wrong
 _SURE = 100.0  # squared offset in its own noise from which that is no chance
+_FAR = 10.0  # times what is usual for a sensor: its features are met far off
+_AT_LEAST = 0.2  # of sigma, for that
+_USUAL = 100  # frames by which it is told what is usual
 _KEPT = 2  # frames that are tried with other sessions
 _SHOWN = 3  # stretches that are named
 _PIXELS = 37  # of an image every so many are compared first
@@ -94,6 +100,9 @@ class Findings:
         self._no_frame = {name: Stretches() for name in names}
         self._no_feature = {name: Stretches() for name in names}
         self._same = {name: Stretches() for name in names}
+        self._far = {name: Stretches() for name in names}
+        self._usual = {name: deque[float](maxlen=_USUAL) for name in names}
+        self._sigmas = {setup.name: setup.extract.sigma for setup in session.sensors}
         self._images: dict[str, Image] = {}
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
@@ -133,7 +142,22 @@ class Findings:
                 self._same[name].add(estimate.frame, self._places)
         elif estimate.status == "ok":
             self._agreed_before += not self._doubts
+            self._add_residuals(estimate)
             self._add_markers(estimate)
+
+    def _add_residuals(self, estimate: Estimate) -> None:
+        if estimate.label != self._session.labels[0]:
+            return
+        for name, one in estimate.sensors.items():
+            usual, off = self._usual[name], one.rms
+            if off is None or not one.used:
+                continue
+            if off < _AT_LEAST * self._sigmas[name] or len(usual) < _FEWEST:
+                usual.append(off)
+            elif off > _FAR * median(usual):
+                self._far[name].add(estimate.frame, self._places)
+            else:
+                usual.append(off)
 
     def _add_markers(self, estimate: Estimate) -> None:
         T = estimate.T_world_object
@@ -183,9 +207,19 @@ class Findings:
                     f"sensor {name!r} shows the image of the frame before in frames {each.text()}, "
                     "which contradicts the others: frozen, or frames doubled?"
                 )
+        for name, each in self._far.items():
+            if each.longest >= _LONG:
+                lines.append(
+                    f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
+                    f"before, in {each.count} of {total} frames: {each.text()}: images torn or "
+                    "blurred, or out of step?"
+                )
         return lines
 
     def _of_doubts(self) -> list[str]:
+        change = self._change()
+        if change is not None:
+            return [f"{change}, frames that are not ok would be"]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
         for doubt, each in self._doubts.items():
@@ -193,22 +227,27 @@ class Findings:
                 continue  # said of the sensor
             if each.count < _LONG and each.count <= total / 2:
                 continue  # a frame here and there: clutter does that
-            if each.count > total / 2 and each.found[0][2] > 1:
-                change = None
-                if len(self._session.labels) == 1 and self._agreed_before < _LONG:
-                    change = explanation(self._session, self._frames)
-                if change is not None:
-                    lines.append(f"{change}, frames that are not ok would be")
-                    continue
             goes_on = each.last_place == self._places and each.found[-1][2] >= _LONG
-            if goes_on and self._agreed_before >= _LONG:
+            if doubt == APART and goes_on and self._agreed_before >= _LONG:
                 lines.append(f"{doubt} from frame {each.found[-1][0]} on: was one of them bumped?")
                 continue
-            lines.append(
-                f"{doubt} in {each.count} of {total} frames, {each.text()}: is one of them out of "
-                "step, or its calibration, T_sensor_world or source that of another?"
-            )
+            line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
+            if doubt == APART:
+                line += (
+                    ": is one of them out of step, or its calibration, T_sensor_world or source "
+                    "that of another?"
+                )
+            lines.append(line)
         return lines
+
+    def _change(self) -> str | None:
+        """What the session should have said, where few frames are ok and some are doubted."""
+        doubted = sum(each.count for each in self._doubts.values())
+        frozen = sum(each.count for each in self._same.values())
+        few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
+        if not few or doubted < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
+            return None
+        return explanation(self._session, self._frames)
 
     def _of_markers(self) -> list[str]:
         lines = []

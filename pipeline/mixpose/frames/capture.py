@@ -31,6 +31,10 @@ class NotOpenedError(RecordingError):
     """Nothing was found that OpenCV can read."""
 
 
+class SilentError(RecordingError):
+    """A source gave no frame for too long, and has not ended."""
+
+
 def is_pipe(address: str) -> bool:
     """Whether a path leads to a named pipe, or to a standard input that is one."""
     return _is(stat.S_ISFIFO, address)
@@ -119,7 +123,7 @@ def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
 
     Raises
     ------
-    RecordingError
+    SilentError
         If a stream falls silent without ending.
     """
     began = time.monotonic()
@@ -127,7 +131,7 @@ def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
     silence = time.monotonic() - began
     # FFmpeg gives up with what it has of a frame, which is damaged then
     if silence > 0.9 * PATIENCE_S and (isinstance(address, int) or is_stream(address)):
-        raise RecordingError(f"{name_of(address)}: no frame came for {PATIENCE_S:g} s")
+        raise SilentError(f"{name_of(address)}: no frame came for {PATIENCE_S:g} s")
     return bool(found)
 
 

@@ -3,6 +3,8 @@
 A pose that comes late is worth little, so a frame that arrives while the one before it is still
 being estimated is passed over when a newer one is there.  Numbers count all frames that arrived,
 so that those passed over leave gaps.
+
+A source that falls silent is opened again for a while; meanwhile the others go on without it.
 """
 
 from __future__ import annotations
@@ -19,7 +21,16 @@ from typing import ClassVar
 from urllib.parse import urlsplit
 
 from mixpose.errors import RecordingError
-from mixpose.frames.capture import grab, is_device, name_of, opened, retrieve
+from mixpose.frames.capture import (
+    NotOpenedError,
+    SilentError,
+    grab,
+    is_device,
+    is_pipe,
+    name_of,
+    opened,
+    retrieve,
+)
 from mixpose.frames.source import SourceKind, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, RawFrame
@@ -29,6 +40,14 @@ _SCHEMES = {"rtsp", "rtsps", "rtp", "rtmp", "udp", "tcp", "srt", "http", "https"
 # what a server sends from a file is sent as fast as it is read
 _FILES = {".avi", ".mp4", ".m4v", ".mkv", ".mov", ".webm", ".mpg", ".mpeg", ".ts"}
 _FAREWELL_S = 1.0
+
+STALLED_S = 3.0
+"""How long the others wait for a source that has given frames before."""
+
+RETURN_S = 60.0
+"""How long a source that has given frames may be away, until the run ends."""
+
+_AGAIN_S = 0.5  # between two attempts to open it
 
 
 def live_address(source: str) -> str | int | None:
@@ -97,7 +116,8 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
     """The newest frames of all sources, once each has one that was not given yet.
 
     The frames of a set are at most one period of the fastest source apart, or what its
-    transmission adds to that.  A source that has ended is left out of further sets.
+    transmission adds to that.  A source that has ended is left out of further sets, and one that
+    is silent until it gives frames again.
 
     Yields
     ------
@@ -116,8 +136,21 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             for sensor, source in sources.items()
         }
         given = dict.fromkeys(readers, -1)
+        stalled: set[str] = set()
         number = -1
-        while going := [sensor for sensor in readers if readers[sensor].wait(given[sensor])]:
+        while True:
+            for sensor, reader in readers.items():
+                waits = sensor not in stalled or len(stalled) == len(readers)
+                patience = None if given[sensor] < 0 else STALLED_S if waits else 0.0
+                reader.wait(given[sensor], patience)
+            going = [each for each in readers if readers[each].is_newer_than(given[each])]
+            left = [each for each in readers if each in going or not readers[each].has_ended]
+            if not left:
+                return
+            readers = {each: readers[each] for each in left}
+            stalled = set(left) - set(going)
+            if not going:
+                continue
             frames = {sensor: readers[sensor].newest() for sensor in going}
             given.update((sensor, frame.number) for sensor, frame in frames.items())
             number = max(number + 1, *given.values())
@@ -135,6 +168,7 @@ class _Reader:
         self._source, self._began = source, began
         self._changed = threading.Condition()
         self._newest: RawFrame | None = None
+        self._count = 0
         self._error: BaseException | None = None
         self._ended = False
         self._stop = threading.Event()
@@ -154,22 +188,25 @@ class _Reader:
         # a thread that still waits for a silent camera is left to end by itself
         self._thread.join(_FAREWELL_S)
 
-    def wait(self, after: int) -> bool:
-        """Wait for a frame with a number above `after`; False if none will come."""
+    def wait(self, after: int, patience_s: float | None) -> None:
+        """Wait for a frame with a number above `after`, until none will come, or so long."""
         with self._changed:
-            self._changed.wait_for(lambda: self._is_newer_than(after) or self._ended)
-            if self._is_newer_than(after):
-                return True
-        if self._error is not None:
+            self._changed.wait_for(lambda: self.is_newer_than(after) or self._ended, patience_s)
+        if self._error is not None and not self.is_newer_than(after):
             raise self._error
-        return False
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether no further frame will come."""
+        return self._ended
 
     def newest(self) -> RawFrame:
-        """The newest frame; `wait` has told that there is one."""
+        """The newest frame; `is_newer_than` has told that there is one."""
         assert self._newest is not None
         return self._newest
 
-    def _is_newer_than(self, number: int) -> bool:
+    def is_newer_than(self, number: int) -> bool:
+        """Whether there is a frame with a number above this one."""
         return self._newest is not None and self._newest.number > number
 
     def _read(self) -> None:
@@ -182,16 +219,32 @@ class _Reader:
             self._changed.notify_all()
 
     def _keep_newest(self) -> None:
+        heard = self._began
+        while True:
+            before = self._count
+            try:
+                self._read_on()
+                return
+            except (SilentError, NotOpenedError):
+                heard = time.monotonic() if self._count > before else heard
+                address = self._source.address
+                lost = isinstance(address, str) and is_pipe(address)  # what it held is gone
+                if lost or not self._count or time.monotonic() - heard > RETURN_S:
+                    raise
+            if self._stop.wait(_AGAIN_S):
+                return
+
+    def _read_on(self) -> None:
+        """Read frames until there are no more."""
         address, clock = self._source.address, self._source.clock
         with opened(address) as capture:
-            number = 0
             while not self._stop.is_set() and grab(capture, address):
-                arrived = time.monotonic() - self._began
+                number, arrived = self._count, time.monotonic() - self._began
                 image = retrieve(capture, address, number, self._source.resolution)
                 time_s = arrived if clock is None else clock(number)
                 with self._changed:
                     self._newest = RawFrame(number, time_s, image)
                     self._changed.notify_all()
-                number += 1
+                self._count += 1
         if isinstance(address, int) and not self._stop.is_set():
             raise RecordingError(f"{name_of(address)}: gives no frames any more")

@@ -12,7 +12,7 @@ from mixpose.judgement.acceptance import (
     is_sure,
 )
 from mixpose.judgement.association import Association, associate
-from mixpose.judgement.contradiction import APART, contradict
+from mixpose.judgement.contradiction import APART, contradict, is_far_off
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,
@@ -46,6 +46,7 @@ __all__ = [
     "flat_prior",
     "insert",
     "invert_information",
+    "is_far_off",
     "is_possible",
     "is_sure",
     "joined_offsets",

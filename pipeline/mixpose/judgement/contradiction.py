@@ -60,19 +60,30 @@ def _is_between(
     used: Sequence[Association], before: Noise, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
     """Offsets far beyond the noise so far, which a pose of its own takes away in each sensor."""
-    degrees = sum(one.measurements for one in used) - 6
-    squares = sum(one.squares for one in used)
+    if not is_far_off(used, before, rules, model):
+        return False
     apart = [_left_alone(one) for one in used]
     own = sum(one.measurements - rank for one, (_, rank) in zip(used, apart, strict=True))
-    if degrees < 1 or own < 1:
+    if own < 1:
         return False
-    known = before.variance if before.degrees >= model.known else model.errors.typical**2
-    times = rules.disagreeing if before.degrees >= model.known else rules.strange
-    if squares / degrees < times * max(known, model.smallest**2):
-        return False
+    degrees = sum(one.measurements for one in used) - 6
     alone = sum(left for left, _ in apart)
-    gained = (squares - alone) / max(degrees - own, 1.0)
+    gained = (sum(one.squares for one in used) - alone) / max(degrees - own, 1.0)
     return bool(gained > fdtri(max(degrees - own, 1.0), own, model.by_chance) * alone / own)
+
+
+def is_far_off(
+    used: Sequence[Association], before: Noise, rules: AcceptanceRules, model: NoiseModel
+) -> bool:
+    """Whether features are met far beyond the noise so far, or what is typical."""
+    degrees = sum(one.measurements for one in used) - 6
+    if degrees < 1:
+        return False
+    is_known = before.degrees >= model.known
+    known = before.variance if is_known else model.errors.typical**2
+    times = rules.disagreeing if is_known else rules.strange
+    squares = sum(one.squares for one in used)
+    return bool(squares / degrees >= times * max(known, model.smallest**2))
 
 
 def _left_alone(one: Association) -> tuple[float, int]:

@@ -3,13 +3,14 @@
 Offsets of the met features from their prediction are of two kinds.  What the extraction errs by is
 independent from feature to feature, with a variance s_0².  What a calibration, a clock or a lens
 errs by is alike in all features of a sensor: a field over its coordinates, an offset (s_1²) and
-what turns, scales and shears the features' image (s_2²).  With weights W, the matrix R = 1 − J
-(JᵀWJ)⁻¹ JᵀW that a pose leaves of errors, and the fields P_1 and P_2 as columns, let
+what turns, scales and shears the features' image (s_2²).  What the body errs by is alike in all
+sensors: three coordinates of each marker (s_3²).  With weights W, the matrix R = 1 − J (JᵀWJ)⁻¹ JᵀW
+that a pose leaves of errors, and the fields P_1, P_2 and P_3 as columns, let
 K_jk = P_jᵀ W R P_k.  The residuals r have the expectations
 
     rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
-(C. R. Henderson's method of moments).  Their sums over the frames so far, fading, give the three
+(C. R. Henderson's method of moments).  Their sums over the frames so far, fading, give the four
 variances, in units of each sensor's noise.  Most of a field a pose takes for its own; the
 covariance has it back:
 
@@ -93,14 +94,14 @@ class Moments(NamedTuple):
 
     Attributes
     ----------
-    seen : (3,) float64
+    seen : (4,) float64
         rᵀWr and |P_kᵀWr|².
-    expected : (3, 3) float64
+    expected : (4, 4) float64
         Of these, by unit variances of each kind.
     """
 
-    seen: Floats = np.zeros(3)
-    expected: Floats = np.zeros((3, 3))
+    seen: Floats = np.zeros(4)
+    expected: Floats = np.zeros((4, 4))
 
     def joined(self, other: Moments, memory: float) -> Moments:
         """Add those of another frame."""
@@ -209,14 +210,16 @@ class _Shares(NamedTuple):
 def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _Shares:
     """What moments say; each sensor meets so many features, of a frame that has its own moments."""
     weights = model.lasting_fields * np.array([met, met**2])
-    believed = np.array([_LEAST, weights[1], weights[1]])
+    # markers are where they are said to be, as surely as one frame tells
+    believed = np.array([_LEAST, weights[1], weights[1], own.expected[3, 3] + _LEAST])
     expected = moments.expected + np.diag(believed)
-    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2])
+    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2, 0.0])
     seen = moments.seen + believed * size
     scale = 1 / np.maximum(expected.diagonal(), _LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
     variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
-    once, squared = own.expected[0, 1:] + weights[0], own.expected.diagonal()[1:] + weights[1]
+    taken = np.array([weights[0], weights[0], _LEAST])
+    once, squared = own.expected[0, 1:] + taken, own.expected.diagonal()[1:] + believed[1:]
     return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
 
 
@@ -234,26 +237,74 @@ def _moments(
     count = int(free.sum())
     clear = offsets.squared <= model.errors.outlying**2 * variances[offsets.sensor]
     ends = np.cumsum(np.bincount(offsets.sensor, minlength=len(associations)))[:-1]
-    parts, blocks = [], []
+    parts, blocks, shifts = [], [], []
     for one, inlying, variance in zip(associations, np.split(clear, ends), variances.tolist()):
         shares = np.where(inlying, one.shares, 0.0)
         scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
         rows = np.concatenate([one.J[..., free], one.offsets[..., None]], axis=2)
         parts.append((scale * rows).reshape(-1, count + 1))
         blocks.append(_fields(one.places, shares))
-    weighted = np.concatenate(parts)
+        shifts.append((scale * one.J[..., :3]).reshape(-1, 3))
+    weighted, shift = np.concatenate(parts), np.concatenate(shifts)
+    shift /= max(float(np.sqrt((shift**2).mean())), _LEAST)
     J, r = weighted[:, :count], weighted[:, count]
     P = [_side_by_side(kind) for kind in zip(*blocks)]
     inverse = _inverse(J.T @ J)
     drawn = [inverse @ (J.T @ one) for one in P]
     left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
-    K = [[float(((a.T @ b) ** 2).sum()) for b in left] for a in P]
-    once = [float((a * b).sum()) for a, b in zip(P, left, strict=True)]
+    K, once = np.zeros((3, 3)), np.zeros(3)
+    K[:2, :2] = [[float(((a.T @ b) ** 2).sum()) for b in left] for a in P]
+    once[:2] = [float((a * b).sum()) for a, b in zip(P, left, strict=True)]
+    of_markers = _of_markers(associations, shift, J, r, left, inverse)
+    K[2], once[2] = of_markers.K, of_markers.once
+    K[:2, 2] = K[2, :2]
     degrees = float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count
     squares = [float(r @ r), *(float(((one.T @ r) ** 2).sum()) for one in P)]
-    expected = np.array([[degrees, *once], [once[0], *K[0]], [once[1], *K[1]]])
+    squares.append(of_markers.squares)
+    expected = np.block([[np.array([[degrees]]), once[None]], [once[:, None], K]])
     own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
-    return own, np.array([inverse, *(one @ one.T for one in drawn)])
+    return own, np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
+
+
+class _OfMarkers(NamedTuple):
+    """K_3k (3,), tr K_33, |P_3ᵀWr|², and the covariance that a unit variance makes."""
+
+    K: Floats
+    once: float
+    squares: float
+    part: Floats
+
+
+def _of_markers(
+    associations: Sequence[Association],
+    shift: Floats,
+    J: Floats,
+    r: Floats,
+    left: Sequence[Floats],
+    inverse: Floats,
+) -> _OfMarkers:
+    """Moments of what markers are off by, of which P_3 has three columns each: one by one.
+
+    `shift` (K, 3) is how features move with the body, in units in which their images move by the
+    noise; a row for each coordinate of each sensor.
+    """
+    marker = np.concatenate([np.repeat(one.features, one.J.shape[1]) for one in associations])
+    order = np.argsort(marker, kind="stable")
+    starts = np.flatnonzero(np.diff(marker[order], prepend=-1))
+    columns = np.hstack([J, r[:, None], shift, *left])[order]
+    own = np.add.reduceat(shift[order][:, :, None] * columns[:, None], starts, axis=0)
+    widths = np.cumsum([J.shape[1], 1, 3, left[0].shape[1]])
+    by_pose, by_rest, by_shift, *by_fields = np.split(own, widths, axis=2)
+    taken, flat = by_pose @ inverse, by_pose.reshape(-1, J.shape[1])
+    spread = inverse @ flat.T @ flat
+    within = by_shift - 2 * taken @ by_pose.swapaxes(1, 2)
+    K = float((within * by_shift).sum()) + float((spread * spread.T).sum())
+    return _OfMarkers(
+        np.array([*(float((one**2).sum()) for one in by_fields), K]),
+        float(np.trace(by_shift.sum(axis=0)) - (taken * by_pose).sum()),
+        float((by_rest**2).sum()),
+        spread @ inverse,
+    )
 
 
 def _side_by_side(fields: Sequence[Floats]) -> Floats:

@@ -1,9 +1,10 @@
-"""The body's mirror image, as a window or a polished floor shows it.
+"""The body's mirror image: in a window or a polished floor, or of a body given mirrored.
 
-Any three markers of a mirror image lie as three of the body do, and markers that are nearly in a
-plane all do.  So where the features met lie in a plane as far as their noise tells, and others are
-missed, the body reflected in that plane is a rival: it puts the same features where they are met,
-and the missed ones on the other side.
+Any three markers of a mirror image lie as three of the body do, a fourth and a fifth may by
+chance, and markers that are nearly in a plane all do.  So where features are missed, and detections
+about the body belong to none, its mirror image is a rival: reflected in the plane nearest to the
+features met, which it leaves where they are.  Where few are met, it is looked for everywhere, in
+the first frames.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import Judged
-from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
+from mixpose.judgement import Judged, is_far_off
+from mixpose.tracking.likelihood import FrameData, SearchLog, Start, likelihood_of
+from mixpose.tracking.proposers.searched import candidates_of, starts_at
+from mixpose.tracking.track import Track
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -26,36 +29,60 @@ MIRRORED = "it shows the body's mirror image"
 
 def is_reflection(data: FrameData, judged: Judged) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
-    if all(one.missed < 0.5 for one in judged.associations) or not data.body.is_exact:
+    if not data.body.is_exact or not judged.associations:
         return False
-    mirror = _reflected(data, judged)
-    if mirror is None:
+    ahead, met = data.rules.acceptance.standing_out, _met(judged, data.body)
+    # of these the mirror image may meet more than the body
+    if sum(min(one.missed, one.surplus) for one in judged.associations) > 0.5:
+        close = data.start_uncertainty / data.rules.proposals.narrowing**2
+        # one camera alone may have met a feature by chance
+        sharp = met >= min(2, met.max())
+        flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
+        near = replace(data, body=flat, begun=None)
+        if _evidence(near, Start(judged.T_world_object, close)) > judged.log_evidence + ahead:
+            return True
+    if not _is_by_chance(data, judged):
         return False
-    data = replace(data, body=mirror)
+    # wherever it is found, and nothing known of either
+    track = Track(residuals=data.track.residuals)
+    alone = replace(data, track=track, predictions=(), log=SearchLog(), begun=None)
+    own = _evidence(alone, Start(judged.T_world_object))
+    mirror = replace(alone, body=_reflected(data.body, met >= 0))
+    starts = starts_at(mirror, candidates_of(mirror))
+    return any(_evidence(mirror, start) > own + ahead for start in starts)
+
+
+def _is_by_chance(data: FrameData, judged: Judged) -> bool:
+    """Whether features may be met by chance: few, others missed or these far off, early on."""
+    rules, seen = data.rules, judged.associations
+    if judged.measurements - 6 > rules.proposals.by_chance:
+        return False
+    if data.track.believed >= rules.proposals.believed or any(one.J.shape[1] != 2 for one in seen):
+        return False
+    before, noise = data.track.residuals.total, rules.judgement.noise
+    return any(one.missed > 0.5 for one in seen) or is_far_off(
+        seen, before, rules.acceptance, noise
+    )
+
+
+def _evidence(data: FrameData, start: Start) -> float:
     likelihood = likelihood_of(data)
-    start = Start(judged.T_world_object, data.start_uncertainty / data.rules.proposals.narrowing**2)
-    rival = likelihood.judge(likelihood.fit(start), start)
-    return rival.log_evidence > judged.log_evidence + data.rules.acceptance.standing_out
+    return likelihood.judge(likelihood.fit(start), start).log_evidence
 
 
-def _reflected(data: FrameData, judged: Judged) -> Body | None:
-    """The body reflected in the plane of the features met; None where they are in no plane."""
-    points = data.body.means
-    views, scale = np.zeros(len(points)), np.zeros(len(points))
-    for one in judged.associations:
-        met = one.features[one.shares > 0]
-        views[met] += 1
-        by_shift = np.linalg.norm(one.J[one.shares > 0][..., :3], axis=(1, 2)) / one.sigma
-        scale[met] = np.maximum(scale[met], by_shift)
-    sharp = views >= min(2, views.max())  # one camera alone may have met them by chance
-    sharp = sharp if sharp.sum() >= 3 else views > 0
-    centre = points[sharp].mean(axis=0)
-    normal = np.linalg.svd(points[sharp] - centre)[2][-1]
-    height = (points - centre) @ normal
-    if np.sqrt(np.mean((height * scale)[sharp] ** 2)) > data.rules.proposals.in_plane:
-        return None
-    mirrored = points - 2 * height[:, None] * normal
-    outward = data.body.normals
+def _met(judged: Judged, body: Body) -> NDArray[np.intp]:
+    """By how many sensors each feature was met (N,)."""
+    found = [one.features[one.shares > 0] for one in judged.associations]
+    return np.bincount(np.concatenate(found), minlength=len(body))
+
+
+def _reflected(body: Body, near: NDArray[np.bool_]) -> Body:
+    """The body reflected in the plane nearest to some of its features."""
+    points = body.means
+    centre = points[near].mean(axis=0)
+    normal = np.linalg.svd(points[near] - centre)[2][-1]
+    mirrored = points - 2 * ((points - centre) @ normal)[:, None] * normal
+    outward = body.normals
     if outward is not None:
         outward = outward - 2 * (outward @ normal)[:, None] * normal
-    return Body(data.body.name, tuple(PointFeature(one) for one in mirrored), outward)
+    return Body(body.name, tuple(PointFeature(one) for one in mirrored), outward)

@@ -33,10 +33,13 @@ class ProposalRules:
     flat: float = constant(
         0.15, "thickness of a body against its smaller width below which it may be tilted"
     )
-    in_plane: float = constant(
-        2.2,
-        "σ_ε by which features may be out of their plane and still meet what their mirror image "
-        "shows: as far as one is met",
+    by_chance: float = constant(
+        14.0,
+        "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
+        "been met anywhere: five features by two cameras, where three always lie alike",
+    )
+    believed: int = constant(
+        3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
     )
 
 

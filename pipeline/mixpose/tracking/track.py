@@ -101,6 +101,8 @@ class Track:
         Whether another body of the scene may have what the last pose meets.
     agreed : bool
         Whether two sensors met most of the body in some frame.
+    believed : int
+        Frames whose pose was ok.
     known : bool
         Whether the body was told from things that have three markers alike.
     clutter : StaticClutter
@@ -118,6 +120,7 @@ class Track:
     delays: DelayEvidence = field(default_factory=DelayEvidence)
     doubted: bool = False
     agreed: bool = False
+    believed: int = 0
     known: bool = False
     clutter: StaticClutter = StaticClutter()
 

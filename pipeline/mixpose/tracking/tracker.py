@@ -261,7 +261,8 @@ class Tracker:
             motion,
             self.rules.course,
         )
-        followed = replace(followed, known=is_known(data, best))
+        believed = track.believed + (verdict.status == "ok")
+        followed = replace(followed, known=is_known(data, best), believed=believed)
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
         if verdict.status != "ok" and not late:
