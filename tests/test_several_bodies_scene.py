@@ -6,7 +6,9 @@ Scenes are drawn here from the cameras' geometry alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
 from mixpose.scene import Member, Scene
 from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, overlap
+from mixpose.search import SearchResult, search_frame
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker
 
@@ -189,6 +192,38 @@ def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_no
     assert "ok" not in [outcome.estimate.status for outcome in alone]
     both = scene.advance(scene.begin(), 0, None, views_of([one, other], [T, elsewhere], 6))
     assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
+
+
+def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int | None] = []
+    frames: list[int] = []
+
+    def search(views: Sequence[View], body: Body, **options: Any) -> SearchResult:
+        if body.name == "other":
+            asked.append(options["budget"].max_guesses)
+            frames.append(frame)
+        return search_frame(views, body, **options)
+
+    # the module: its package has a function of the same name
+    searched = import_module("mixpose.tracking.proposers.searched")
+    monkeypatch.setattr(searched, "search_frame", search)
+    tool, other = body("tool", TOOL), body("other", OTHER)
+    scene = scene_of(tool, other)
+    tracks = scene.begin()
+    for frame in range(12):
+        views = views_of([tool], [at(2.0 * frame)], frame)
+        outcomes = scene.advance(tracks, frame, None, views)
+        tracks = tuple(one.track for one in outcomes)
+        assert outcomes[1].estimate.status == "lost"
+    thorough = [frame for frame, most in zip(frames, asked, strict=True) if most is None]
+    # as long as it may be near, and again after ten frames without it
+    assert sorted(set(thorough)) == [0, 1, 2, 3, 4, 5, 10]
+    assert sorted(set(frames)) == list(range(12))
+    views = views_of([tool, other], [at(24.0), at(150.0, 60.0)], 12)
+    outcomes = scene.advance(tracks, 12, None, views)
+    assert [one.estimate.status for one in outcomes] == ["ok", "ok"]
 
 
 def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -> None:

@@ -12,6 +12,20 @@ _TRACK = "test_tracking_track.py"
 
 _PREDICTION = (
     Mutant(
+        "tracking-errors-over-a-gap-count-for-one-frame",
+        "tracking/track.py",
+        "half = half / (1 + track.misses)",
+        "half = half / 1",
+        "after a gap a body may be anywhere in the next frame",
+    ),
+    Mutant(
+        "tracking-predictions-without-tails",
+        "tracking/track.py",
+        "if prediction.is_prior:",
+        "if True:",
+        "a body that turns suddenly is lost",
+    ),
+    Mutant(
         "tracking-prior-as-wide-as-the-world",
         "tracking/track.py",
         "return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])",

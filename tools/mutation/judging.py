@@ -82,6 +82,13 @@ _FIELDS = (
 
 _EVIDENCE = (
     Mutant(
+        "judgement-covered-features-missed-one-by-one",
+        "judgement/evidence.py",
+        "return 2 * self.log_missed",
+        "return 20 * self.log_missed",
+        "of a rig of many cameras a body with a covered marker is lost",
+    ),
+    Mutant(
         "judgement-misses-are-free",
         "judgement/evidence.py",
         "return math.log(1 - self.probability)",
