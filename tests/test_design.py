@@ -28,6 +28,7 @@ from mixpose.design import (
 from mixpose.design.equality import scaled
 from mixpose.design.prediction import at_tip
 from mixpose.design.study import SHARE_OF_RADIUS
+from mixpose.executing import in_processes
 from mixpose.rigid import Floats, perturb, rotation_angle_deg, rotation_matrix, transform
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.session import load_session
@@ -175,6 +176,17 @@ def test_simulated_frames_of_the_papers_systems_err_as_predicted(number: int) ->
     assert found.chance == pytest.approx(1 / np.sqrt(2 * 150 * 6))
     # 5 %, and what 150 frames leave to chance
     assert abs(found.overall - 1) < 0.05 + found.chance
+
+
+def test_frames_simulated_by_other_processes_are_those_of_this_one() -> None:
+    session = planned(systems(0.0)[0], 0.25)
+    plan = replace(plan_of(session), noises=(0.25,) * 2)
+    here = confirm(session, plan, paper_poses(2), 100, tip=ORIGIN)
+    with in_processes(2) as workers:
+        there = confirm(session, plan, paper_poses(2), 100, tip=ORIGIN, executor=workers)
+    assert np.array_equal(here.found, there.found)
+    assert np.array_equal(here.ratios, there.ratios)
+    assert here.statuses == there.statuses
 
 
 def test_sensors_are_weighed_by_sigma_and_not_by_what_they_err_by() -> None:

@@ -103,6 +103,9 @@ class SearchBudget:
         "evidence in nats from which no other kind of guess is made: a frame is ok from 7; of 900 "
         "frames with clutter no other wrong pose had as much than mirror images and near twins",
     )
+    promising: float = constant(
+        2.0, "the same of a pose that all others found are `outdone` by: chance makes less"
+    )
     outdone: float = constant(
         12.0,
         "nats behind the best from which a pose is no candidate: of 470 frames of the rows and of "

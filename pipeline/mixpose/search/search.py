@@ -180,12 +180,21 @@ class _Run:
         Where the evidence of several cameras is beyond doubt, only a pose that explains most of
         the detections could still be better.
         """
-        if len(self._detections) > 1 and self._ranks.max(initial=0.0) > self._budget.beyond_doubt:
+        if len(self._detections) > 1 and self._is_beyond_doubt():
             best = self._poses[self._ranks.argmax()]
             explainable = sum(min(image.count, len(self._body)) for image in self._images)
             explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
             return max(self._coverage(), explained) >= self._budget.sufficient
         return self._coverage() >= self._budget.convincing
+
+    def _is_beyond_doubt(self) -> bool:
+        """Whether chance would hardly make a pose so evident, by itself or among those found."""
+        budget, best = self._budget, self._ranks.max(initial=0.0)
+        if not self._by_evidence or best < budget.promising:
+            return False
+        two = first_of_each(self._body, self._poses, self._ranks, 2, budget.descent.alike)
+        lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
+        return bool(best > budget.beyond_doubt or lead > budget.outdone)
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
@@ -254,10 +263,9 @@ class _Run:
 
     def _is_found(self, guesses: Floats) -> bool:
         """Whether the best guesses of several cameras leave no need for others."""
-        budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
         if self._judged(guesses)[0].max() < 0:
             return False
         self._keep(self._descended(guesses))
-        return self._ranks.max() > budget.beyond_doubt and self._is_settled()
+        return self._is_beyond_doubt() and self._is_settled()
