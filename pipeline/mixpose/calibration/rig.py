@@ -55,6 +55,8 @@ class Rig:
         Seconds by which a sensor's frames are taken later than their times say.
     drifts : (L,) float64
         Seconds per second by which that grows.
+    labels : tuple of str
+        What the features are called in messages.
     """
 
     names: tuple[str, ...]
@@ -63,12 +65,13 @@ class Rig:
     normals: Floats | None
     delays: Floats
     drifts: Floats
+    labels: tuple[str, ...]
 
     @classmethod
     def of(cls, names: Sequence[str], sensors: Sequence[Sensor], body: Body) -> Rig:
         """The rig as a session has it."""
         none = np.zeros(len(names))
-        return cls(tuple(names), tuple(sensors), body.means, body.normals, none, none)
+        return cls(tuple(names), tuple(sensors), body.means, body.normals, none, none, body.labels)
 
     def placed(self, index: int, T_sensor_world: Floats) -> Rig:
         """The rig with a camera elsewhere."""
@@ -161,7 +164,7 @@ def blocks_of(
                 blocks.append(block)
                 start += len(block.names)
     if body:
-        names = tuple(f"{i}.{axis}" for i in range(len(rig.points)) for axis in "xyz")
+        names = tuple(f"{label}.{axis}" for label in rig.labels for axis in "xyz")
         radius = float(np.linalg.norm(rig.points - rig.points.mean(axis=0), axis=1).max())
         units, scales = ("length",) * len(names), (radius,) * len(names)
         blocks.append(Block("body", None, start, names, units, scales))

@@ -120,10 +120,10 @@ def _body_lines(found: Calibration, unit: str) -> list[str]:
     deviation = found.deviations[block.place].reshape(-1, 3)
     shift = np.linalg.norm(found.after.points - found.before.points, axis=1)
     lines = []
-    for i, (moved, each) in enumerate(zip(shift, deviation, strict=True)):
+    for label, moved, each in zip(found.after.labels, shift, deviation, strict=True):
         total = np.sqrt((each**2).sum())
         said = f"± {total:.2g} {unit}" if np.isfinite(total) else "not determined"
-        lines.append(f"{f'body feature {i}':<28}moved by {moved:.4g} {said}")
+        lines.append(f"{f'body feature {label}':<28}moved by {moved:.4g} {said}")
     return lines
 
 
@@ -157,11 +157,15 @@ def _worst_lines(found: Calibration, unit: str) -> list[str]:
         for number, feature, value in zip(sights.frame, sights.feature, squared, strict=True):
             frames.setdefault(int(number), []).append(float(value))
             features.setdefault(int(feature), []).append(float(value))
+    called = found.after.labels
     for title, groups in (("frames", frames), ("features", features)):
         rms = {key: float(np.sqrt(np.mean(values))) for key, values in groups.items()}
         worst = sorted(rms, key=lambda key: (-rms[key], key))[:_WORST]
         typical = float(np.median(list(rms.values()))) if rms else 1.0
-        parts = ", ".join(f"{key} ({rms[key] / typical:.2g})" for key in worst)
+        names = [called[key] if groups is features else str(key) for key in worst]
+        parts = ", ".join(
+            f"{name} ({rms[key] / typical:.2g})" for name, key in zip(names, worst, strict=True)
+        )
         lines.append(f"{'worst':<10}{title}, by their residual over the median of all: {parts}")
     return lines
 

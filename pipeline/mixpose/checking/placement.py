@@ -207,10 +207,15 @@ def _too_small(setup: SensorSetup, session: Session, seen: Mask) -> list[str]:
 
 
 def expected_count(setup: SensorSetup, session: Session) -> int:
-    """Features that a sensor should see in a frame: those in view at [start], if that is most."""
-    count = len(session.body)
+    """Features that a sensor should see in a frame: those in view at [start], if that is most.
+
+    Without [start], of a body with normals: the median over looks straight at one of its features.
+    """
+    count, normals = len(session.body), session.body.normals
     if session.start is None:
-        return count if session.body.normals is None else max(count // 2, 1)
+        if normals is None:
+            return count
+        return int(np.median(np.count_nonzero(normals @ normals.T > 0, axis=1)))
     T = session.start.T_world_object
     seen = _seen(setup.sensor, session, T) & facing(setup.sensor, session.body, T)
     return int(seen.sum()) if seen.sum() >= count / 2 else count

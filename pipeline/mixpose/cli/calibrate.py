@@ -6,7 +6,7 @@ import hashlib
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,42 +84,50 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
     for written, mark in ((output, MARK), (request.report, REPORT_MARK)):
         if written is not None:
             refuse_to_overwrite_but(written, inputs, mark)
-    found = _found(session, request, inputs)
-    if request.report is not None:
-        page = render_calibration(found, path.name, session.unit, __version__)
-        _write(request.report, page, "--report")
-    if output is None:
-        sys.stdout.write("\n".join(check_lines(found, session.unit)) + "\n")
-        _warn(found)
-        return
-    _write(output, calibrated_text(session, found, output, __version__), "-o")
-    sys.stdout.write("\n".join(lines_of(found, session.unit)) + "\n")
+    with _calibrated(session, request, inputs) as found:
+        if output is not None:
+            _write(output, calibrated_text(session, found, output, __version__), "-o")
+        if request.report is not None:
+            page = render_calibration(found, path.name, session.unit, __version__)
+            _write(request.report, page, "--report")
+    told = (check_lines if output is None else lines_of)(found, session.unit)
+    sys.stdout.write("\n".join(told) + "\n")
     _warn(found)
-    say(f"calibrated from {len(found.used)} frames -> {output}")
+    if output is not None:
+        say(f"calibrated from {len(found.used)} frames -> {output}")
 
 
-def _found(session: Session, request: CalibrateRequest, inputs: Sequence[Path]) -> Calibration:
-    """Calibrate; where a file is written, what was searched is kept beside it until the end."""
+@contextmanager
+def _calibrated(
+    session: Session, request: CalibrateRequest, inputs: Sequence[Path]
+) -> Iterator[Calibration]:
+    """Calibrate, for as long as what comes of it is written."""
     rules = CalibrationRules()
-    with _watched() as progress:
-        task = task_of(session, request, rules, progress)
-        say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
-        if request.output is None:
-            return calibrate(task, rules, progress=progress)
-        partial = request.output.with_name(f"{request.output.name}.partial")
-        refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
-        saved = Saved(partial, _key_of(session, task))
-        if saved.resumed:
-            say(f"going on: {saved.resumed} frames of cameras were searched before")
-        finished = False
-        try:
+    with ExitStack() as kept:
+        with _watched() as progress:
+            task = task_of(session, request, rules, progress)
+            say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
+            saved = None
+            if request.output is not None:
+                partial = request.output.with_name(f"{request.output.name}.partial")
+                refuse_to_overwrite_but(partial, inputs, SAVED_MARK)
+                saved = kept.enter_context(_kept(partial, _key_of(session, task)))
             found = calibrate(task, rules, progress=progress, found=saved)
-            finished = True
-        finally:
-            saved.close(finished=finished)
-    if request.world is not None:
-        found = in_world(found, request.world)
-    return found
+        yield found if request.world is None else in_world(found, request.world)
+
+
+@contextmanager
+def _kept(path: Path, key: str) -> Iterator[Saved]:
+    """What was searched, in a file that goes when all is written."""
+    saved = Saved(path, key)
+    if saved.resumed:
+        say(f"going on: {saved.resumed} frames of cameras were searched before")
+    finished = False
+    try:
+        yield saved
+        finished = True
+    finally:
+        saved.close(finished=finished)
 
 
 def _write(path: Path, text: str, option: str) -> None:

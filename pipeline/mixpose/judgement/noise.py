@@ -41,6 +41,7 @@ Floats: TypeAlias = NDArray[np.float64]
 _LEAST = 1e-6  # degrees of freedom: less is as good as none
 _LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
+_LEAST_EIGENVALUE = 1e-14  # of an information matrix of diagonal 1: float64 tells no less from none
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,7 @@ def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:
 
 
 class _Shares(NamedTuple):
-    """Variances (3,) of independent errors and of fields; degrees of freedom (2,) of the latter."""
+    """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter."""
 
     variances: Floats
     degrees: Floats
@@ -210,15 +211,16 @@ class _Shares(NamedTuple):
 def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _Shares:
     """What moments say; each sensor meets so many features, of a frame that has its own moments."""
     weights = model.lasting_fields * np.array([met, met**2])
-    # markers are where they are said to be, as surely as one frame tells
-    believed = np.array([_LEAST, weights[1], weights[1], own.expected[3, 3] + _LEAST])
+    # markers are where they are said to be, as surely as so many frames tell
+    of_markers = model.lasting_fields * own.expected[3, 3] + _LEAST
+    believed = np.array([_LEAST, weights[1], weights[1], of_markers])
     expected = moments.expected + np.diag(believed)
     size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2, 0.0])
     seen = moments.seen + believed * size
     scale = 1 / np.maximum(expected.diagonal(), _LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
     variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
-    taken = np.array([weights[0], weights[0], _LEAST])
+    taken = np.array([weights[0], weights[0], model.lasting_fields * own.expected[0, 3] + _LEAST])
     once, squared = own.expected[0, 1:] + taken, own.expected.diagonal()[1:] + believed[1:]
     return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
 
@@ -230,7 +232,7 @@ def _moments(
     free: NDArray[np.bool_],
     model: NoiseModel,
 ) -> tuple[Moments, Floats]:
-    """Of one frame, and the covariances (3, k, k) that unit variances of each kind make.
+    """Of one frame, and the covariances (4, k, k) that unit variances of each kind make.
 
     Detections that are farther off than the extraction errs are left out.
     """
@@ -296,14 +298,15 @@ def _of_markers(
     widths = np.cumsum([J.shape[1], 1, 3, left[0].shape[1]])
     by_pose, by_rest, by_shift, *by_fields = np.split(own, widths, axis=2)
     taken, flat = by_pose @ inverse, by_pose.reshape(-1, J.shape[1])
-    spread = inverse @ flat.T @ flat
+    drawn = inverse @ flat.T
+    spread = drawn @ flat
     within = by_shift - 2 * taken @ by_pose.swapaxes(1, 2)
     K = float((within * by_shift).sum()) + float((spread * spread.T).sum())
     return _OfMarkers(
         np.array([*(float((one**2).sum()) for one in by_fields), K]),
         float(np.trace(by_shift.sum(axis=0)) - (taken * by_pose).sum()),
         float((by_rest**2).sum()),
-        spread @ inverse,
+        drawn @ drawn.T,  # not less than nothing where a direction is hardly determined
     )
 
 
@@ -340,7 +343,7 @@ def _inverse(information: Floats) -> Floats:
     """
     scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), _MIN_INFORMATION))
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
-    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T * scale * scale[:, None]
+    inverse = (vectors / np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T * scale * scale[:, None]
     return np.asarray((inverse + inverse.T) / 2)
 
 

@@ -213,8 +213,8 @@ def _about_extra(
         level = (peak[extra].max() + peak[own].min()) / 2
         word = "fainter" if options.polarity == "bright" else "less dark"
         return [
-            f"{text}, all {word} than those that do: set threshold = "
-            f"{_in_image(level, image, options):.0f}"
+            f"{text}, all {word} than those that do; they do no harm, and in this frame "
+            f"threshold = {_in_image(level, image, options):.0f} would leave them out"
         ]
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 

@@ -9,12 +9,13 @@ import numpy as np
 from mixpose.calibration import Calibration
 from mixpose.calibration.rig import centre_of
 from mixpose.calibration.telling import lines_of
-from mixpose.report.drawing import BARS, POSE, TRUTH, blank, count_axes, drawn
+from mixpose.report.drawing import BARS, POSE, TRUTH, blank, drawn
 from mixpose.report.figures import Chart
 from mixpose.report.page import page_templates
 
 MARK = '<meta name="generator" content="mixpose calibration'
 _TEMPLATE = "calibration.html.j2"
+_MOST_NAMED = 20  # features whose names have room below a chart
 _LONG = 0.05  # of an image's width: the arrow of a residual of three standard deviations
 
 
@@ -125,10 +126,12 @@ def _by_frame(found: Calibration) -> Chart:
 
 
 def _by_feature(found: Calibration) -> Chart:
-    numbers, values = _grouped(found, "feature")
+    indices, values = _grouped(found, "feature")
+    numbers = indices + 1
     figure, axes = blank()
     axes.bar(numbers, values, **BARS)
-    count_axes(axes)
+    if len(numbers) <= _MOST_NAMED:
+        axes.set_xticks(numbers, [found.after.labels[k] for k in indices])
     axes.set_xlabel("feature of the body")
     axes.set_ylabel("residual, standard deviations")
     return Chart("Residual of each feature", _spoken("feature", numbers, values), drawn(figure))
