@@ -133,12 +133,15 @@ def test_cameras_in_a_ring_about_the_worlds_origin_are_not_suspicious(session: S
     assert not [warning for warning in warnings if "at one place" in warning]
 
 
-def test_a_body_with_a_back_shows_half_of_its_features_where_nothing_says_how_it_stands(
+def test_a_body_shows_the_features_that_face_whoever_looks_at_one_of_them(
     session: Session,
 ) -> None:
     count = len(session.body)
     unknown = replace(session, start=None)
     assert expected_count(session.sensors[0], unknown) == count
     normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    board = replace(unknown, body=replace(session.body, normals=normals))
+    assert expected_count(session.sensors[0], board) == count  # its back shows nothing at all
+    normals[: count // 2] *= -1
     two_sided = replace(unknown, body=replace(session.body, normals=normals))
-    assert expected_count(session.sensors[0], two_sided) == count // 2
+    assert expected_count(session.sensors[0], two_sided) == count - count // 2

@@ -200,8 +200,8 @@ _CHECKING = (
     Mutant(
         "checking-both-sides-are-seen",
         "checking/placement.py",
-        "return count if session.body.normals is None else max(count // 2, 1)",
-        "return count",
+        "np.count_nonzero(normals @ normals.T > 0, axis=1)",
+        "np.full(count, count)",
         "a body with normals seems to lack the features of its back",
     ),
 )
