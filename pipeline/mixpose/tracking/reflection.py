@@ -45,10 +45,14 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
         return False
     # wherever it is found, and nothing known of either
     track = Track(residuals=data.track.residuals)
-    alone = replace(data, track=track, predictions=(), log=SearchLog(), begun=None)
+    # what explains more than this pose is met by the first guesses already
+    options = replace(data.options, search="live")
+    alone = replace(data, track=track, predictions=(), log=SearchLog(), begun=None, options=options)
     own = _evidence(alone, Start(judged.T_world_object))
     mirror = replace(alone, body=_reflected(data.body, met >= 0))
-    starts = starts_at(mirror, candidates_of(mirror))
+    least = own - data.rules.search.outdone
+    found = [one for one in candidates_of(mirror) if one.evidence > least]
+    starts = starts_at(mirror, found)
     return any(_evidence(mirror, start) > own + ahead for start in starts)
 
 
