@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from session_lines import message_of, with_lines
 
+from mixpose.body import Body, PointFeature
 from mixpose.errors import RecordingError
 from mixpose.frames import ALL_NUMBERS, SourceSpec, open_source, read_image
 from mixpose.limits import MOST_DETECTIONS, MOST_FEATURES, MOST_PIXELS
@@ -165,3 +166,17 @@ def test_an_image_of_the_largest_size_is_read(tmp_path: Path) -> None:
     path = tmp_path / "long.png"
     cv2.imwrite(str(path), np.zeros((2, 100_000), np.uint8))
     assert read_image(path).shape == (2, 100_000)
+
+
+def test_a_body_that_repeats_its_features_takes_neither_all_time_nor_all_memory() -> None:
+    repeated = np.concatenate([np.eye(3)] * 200 + [[[0.0, 0.0, 0.0], [1.0, 1.0, 0.2]]])
+    body = Body("repeated", tuple(PointFeature(point) for point in 100 * repeated))
+    began = time.process_time()
+    # the pairs of its steps would be gigabytes, its triples are 200**3
+    assert (len(body.symmetries), len(body.grid_steps)) == (1, 0)
+    assert time.process_time() - began < 5
+
+
+def test_a_point_that_is_given_twice_is_refused(tmp_path: Path) -> None:
+    twice = "points = [[0, 0, 0], [100, 0, 0], [0, 100, 0], [100, 0, 0]]"
+    assert "point 4 is where point 2 is" in message_of(tmp_path, with_lines(points=twice))

@@ -41,6 +41,8 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
         only the identity and the half-turn, if any.
     """
     points = np.asarray(points, dtype=np.float64)
+    distinct = np.unique(points, axis=0)
+    points = points if len(distinct) == len(points) else distinct  # seen as one
     centre = points.mean(axis=0)
     centred = points - centre
     if np.linalg.svd(centred, compute_uv=False)[1] <= tolerance:
@@ -77,11 +79,14 @@ def grid_steps(points: Floats, tolerance: float, share: float) -> Floats:
         return np.zeros((0, 3))
     _, near = cKDTree(points).query(points, k=min(len(points), 1 + _NEIGHBOURS))
     steps = (points[near[:, 1:]] - points[:, None]).reshape(-1, 3)
-    alike = cKDTree(steps).query_ball_point(steps, tolerance)
+    steps = steps[np.linalg.norm(steps, axis=1) > tolerance]  # of points at one place
+    if not len(steps):
+        return np.zeros((0, 3))
+    # their numbers only: where points repeat, each step is alike to most others
+    alike = cKDTree(steps).query_ball_point(steps, tolerance, return_length=True)
     found: list[Floats] = []
-    for step, others in zip(steps, alike, strict=True):
-        known = any(np.linalg.norm(step - other) <= 2 * tolerance for other in found)
-        if len(others) >= share * len(points) and not known:
+    for step in steps[alike >= share * len(points)]:
+        if all(np.linalg.norm(step - other) > 2 * tolerance for other in found):
             found.append(step)
     return np.array(found).reshape(-1, 3)
 

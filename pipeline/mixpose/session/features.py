@@ -38,7 +38,8 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     Raises
     ------
     BadKeyError
-        If there are fewer than three features, or spread or normals do not fit them.
+        If there are fewer than three features, some are repeated, or spread or normals do not fit
+        them.
     """
     markers = _markers(table, folder, unit)
     points = np.zeros((0, 3)) if markers is None else markers.points
@@ -78,9 +79,26 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     for (a, b), C in zip(segments, spreads[len(points) :]):
         features.append(SegmentFeature(a, b, C, kind))
     normals = _normals(_stated_normals(table, markers, count), count)
+    _refuse_repeated(points, spreads, normals, "file" if table.file is not None else "points")
     radii = _radii(table, normals, len(points), count)
     gravity, names = _gravity(table), _names(markers)
     return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names)
+
+
+def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, key: str) -> None:
+    """Refuse a point that is there twice: nothing can tell the two from each other."""
+    parts = [points, spreads[: len(points)].reshape(-1, 9)]
+    parts += [] if normals is None else [normals[: len(points)]]
+    rows = np.concatenate(parts, axis=1)
+    _, first, back = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[back.ravel()] != np.arange(len(rows)))
+    if len(again):
+        k = int(again[0])
+        before = int(first[back.ravel()][k])
+        raise BadKeyError(
+            f"point {k + 1} is where point {before + 1} is, alike in all; allowed: each point once",
+            key,
+        )
 
 
 def _names(markers: Markers | None) -> tuple[str, ...]:
