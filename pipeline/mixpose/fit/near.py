@@ -233,10 +233,11 @@ def _to_the_noise(
         end = np.minimum(np.minimum(seen.blurs, least), blurs)
         narrower = np.maximum(end, blurs / rules.schedule.ratio)
         is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
+        if best is ascent and is_end:
+            return ascent
         # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
         alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-        stays = alike and met.moved(free, blurs, end, variances) < rules.moved**2
-        if best is ascent and (is_end or stays):
+        if best is ascent and alike and met.moved(free, blurs, end, variances) < rules.moved**2:
             return ascent
         likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
         if likelihood > likeliest:
