@@ -112,9 +112,8 @@ def run(
 ) -> None:
     """Estimate a pose per frame."""
     from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
-    from mixpose.selection import Selection  # noqa: PLC0415
-
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
+    from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
     sources, debug = tuple(source or ()), bool(context.obj)

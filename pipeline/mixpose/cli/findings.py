@@ -13,6 +13,7 @@ from statistics import median
 import numpy as np
 
 from mixpose.checking import explanation
+from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
@@ -107,6 +108,11 @@ class Findings:
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
         self._markers: dict[str, dict[int, _Marker]] = {}
+        self._sizes = {
+            label: BodySize(session, one.body.means)
+            for one in session.objects
+            for label in one.labels
+        }
         self._frames: list[tuple[int, list[View]]] = []
         self._agreed_before = 0
 
@@ -144,6 +150,8 @@ class Findings:
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
             self._add_markers(estimate)
+            if estimate.label in self._sizes:
+                self._sizes[estimate.label].add(estimate)
 
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
@@ -189,7 +197,10 @@ class Findings:
 
     def warnings(self) -> list[str]:
         """What is most likely at fault, a line each."""
-        return [*self._of_sensors(), *self._of_doubts(), *self._of_markers()]
+        sizes = size_warnings(self._sizes)
+        # a body of another size is met off at all of its markers
+        of_bodies = sizes or self._of_markers()
+        return [*self._of_sensors(), *self._of_doubts(), *of_bodies]
 
     def _of_sensors(self) -> list[str]:
         total, lines = self._places + 1, []
@@ -235,7 +246,8 @@ class Findings:
             if doubt == APART:
                 line += (
                     ": is one of them out of step, or its calibration, T_sensor_world or source "
-                    "that of another?"
+                    "that of another? Or are points of [object] and translations in another unit, "
+                    "or of another size?"
                 )
             lines.append(line)
         return lines
