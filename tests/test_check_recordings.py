@@ -274,3 +274,15 @@ def test_the_typical_frame_has_the_median_number_of_features() -> None:
     # in order the counts are 0, 3, 7, 9, 40
     assert seen.typical_frame == 8
     assert replace(seen, counts=None).typical_frame is None
+
+
+def test_files_that_are_given_to_two_sensors_are_told(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8").replace('"right*.png"', '"./left*.png"')
+    session.write_text(text, encoding="utf-8")
+    check_session(session, quick=True)
+    out = capsys.readouterr().out
+    assert "sensors 'left' and 'right' read the same recording, " in out
+    assert "files (left0000.png, ...): give each its own source" in out

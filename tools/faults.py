@@ -22,6 +22,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from mixpose.checking import shared_source_warnings
 from mixpose.cli.notices import Summary
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
@@ -325,7 +326,7 @@ def outcome(fault: Fault, folder: Path, stop: int | None = None) -> Result:
             counts[estimate.status] += 1
         else:
             counts["right" if fault.has_truth and is_right(estimate, truth) else "wrong"] += 1
-    said = summary.warnings()
+    said = [*shared_source_warnings(session, {}), *summary.warnings()]
     is_named = any(re.search(fault.named, line) for line in said) if fault.named else not said
     return Result(**counts, said=said, is_named=is_named)
 
