@@ -12,7 +12,7 @@ from statistics import median
 
 import numpy as np
 
-from mixpose.checking import explanation
+from mixpose.checking import CAUSES, explanation
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
@@ -244,11 +244,7 @@ class Findings:
                 continue
             line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
             if doubt == APART:
-                line += (
-                    ": is one of them out of step, or its calibration, T_sensor_world or source "
-                    "that of another? Or are points of [object] and translations in another unit, "
-                    "or of another size?"
-                )
+                line += f": {CAUSES}"
             lines.append(line)
         return lines
 
