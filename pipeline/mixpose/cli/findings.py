@@ -17,6 +17,7 @@ from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
+from mixpose.tracking import ASIDE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -237,6 +238,8 @@ class Findings:
                     ": is one of them out of step, or its calibration, T_sensor_world or source "
                     "that of another?"
                 )
+            if doubt == ASIDE:
+                line += ": is a part of it hidden, or does the session say more rows than it has?"
             lines.append(line)
         return lines
 

@@ -62,12 +62,15 @@ class Start:
         That it comes from.
     left_out : mapping of str to str
         Sensors that are not to take part, and why.
+    T_moved : (4, 4) float64 or None
+        A pose that has moved as this one must have, and was as likely before the frame.
     """
 
     T_world_object: Floats
     uncertainty: Floats | None = None
     prediction: Prediction | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    T_moved: Floats | None = None
 
 
 class Likelihood(Protocol):
@@ -305,7 +308,7 @@ class MatchedLikelihood:
             T,
             data.free,
             before=data.track.residuals,
-            prior=data.prior(T),
+            prior=data.prior(T if start.T_moved is None else start.T_moved),
             unmet=others,
             rules=rules,
         )
