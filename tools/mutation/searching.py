@@ -59,8 +59,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers/stepped_aside.py",
-        "yield Start(poses[1 + k], close, T_moved=T_moved)",
-        "yield Start(poses[0], close, T_moved=T_moved)",
+        "yield Start(poses[1 + k], close, T_moved=data.moves_alike(T))",
+        "yield Start(poses[0], close, T_moved=data.moves_alike(T))",
         "a chessboard is followed a square off",
         (_STARTS,),
     ),
@@ -74,9 +74,9 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-motion-tells-steps-apart",
-        "tracking/proposers/stepped_aside.py",
-        "T if len(data.track.branches) > 1 else None",
-        "None",
+        "tracking/likelihood.py",
+        "return T_world_object if len(self.track.branches) > 1 else None",
+        "return None",
         "a board with a row too many is believed to be where it moved least",
         (_STARTS,),
     ),

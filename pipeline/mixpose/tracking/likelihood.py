@@ -152,6 +152,10 @@ class FrameData:
             self.rules.judgement.detection,
         )
 
+    def moves_alike(self, T_world_object: Floats) -> Floats | None:
+        """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""
+        return T_world_object if len(self.track.branches) > 1 else None
+
     @cached_property
     def finest(self) -> MatchedObjective:
         """The matched objective at σ_ε."""
