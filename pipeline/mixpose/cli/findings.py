@@ -18,6 +18,7 @@ from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
+from mixpose.tracking import ASIDE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -245,6 +246,8 @@ class Findings:
             line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
             if doubt == APART:
                 line += f": {CAUSES}"
+            if doubt == ASIDE:
+                line += ": is a part of it hidden, or does the session say more rows than it has?"
             lines.append(line)
         return lines
 
