@@ -234,13 +234,16 @@ class Joint:
         return first
 
     def _together(self, keeps: int, other: int) -> float:
-        """Evidence of two bodies, if the one keeps what it meets and the other has the rest."""
+        """Evidence of two bodies, if the one keeps what it meets and the other has the rest.
+
+        One that the rest says nothing for is taken to be away, which has the odds of clutter.
+        """
         claims = {**self._claims, keeps: self._own_claims(keeps)}
         left = left_for(other, self._views, claimed(self._views, claims))
         tracker = self.members[other].tracker
         data = tracker.data(self.tracks[other], self._frame, self._time_s, left.views)
         rest = tracker.rejudged(data, self.ranked[other])
-        return self._evidence(keeps) + max((one.log_evidence for one in rest[:1]), default=0.0)
+        return self._evidence(keeps) + max([0.0, *(one.log_evidence for one in rest[:1])])
 
     def _is_trusted(self, k: int) -> bool:
         track = self.tracks[k]
