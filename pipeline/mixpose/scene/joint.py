@@ -225,7 +225,7 @@ class Joint:
                 continue
             if overlap(self._own_claims(first), self._own_claims(other)) < self._rules.rival:
                 continue
-            gain = self._together(first, other) - self._together(other, first)
+            gain = self.together(first, other) - self.together(other, first)
             rules = self.members[first].tracker.rules.acceptance
             if abs(gain) < -np.log(rules.rival):
                 self.close_calls |= {first, other}
@@ -233,7 +233,7 @@ class Joint:
                 first = other
         return first
 
-    def _together(self, keeps: int, other: int) -> float:
+    def together(self, keeps: int, other: int) -> float:
         """Evidence of two bodies, if the one keeps what it meets and the other has the rest.
 
         One that the rest says nothing for is taken to be away, which has the odds of clutter.
