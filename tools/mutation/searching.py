@@ -193,8 +193,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "visible.astype(float), shares, offsets",
-        "shares, shares, offsets",
+        "SensorMatches(weights, shares",
+        "SensorMatches(shares, shares",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),
@@ -209,8 +209,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-crowds-are-no-clutter",
         "search/evidence.py",
-        "np.maximum(overall, inside / (2 * half).prod(axis=1))",
-        "np.full(len(y), overall)",
+        "crowding(points, lower, upper, ",
+        "crowding(points, lower * 0 - 1e6, upper * 0 + 1e6, ",
         "where false detections crowd poses are found by chance",
         ("test_search_evidence.py",),
     ),

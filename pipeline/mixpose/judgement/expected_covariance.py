@@ -45,7 +45,8 @@ def expected_covariance(
     at = project_body(tuple(sensors), body).project(T_world_object[None])
     J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
     information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
-    return invert_information(information, free), at.seen[:, 0].sum(axis=1).tolist()
+    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
+    return invert_information(information, free), counts
 
 
 def invert_information(information: Floats, free: NDArray[np.bool_]) -> Floats:
