@@ -72,10 +72,7 @@ def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
 def test_clutter_is_as_dense_as_detections_around_the_body_where_they_are_denser() -> None:
     around = [(100.0, 100.0), (200.0, 100.0), (200.0, 200.0), (150.0, 150.0), (120.0, 180.0)]
     points = np.array([*around, (0.0, 0.0), (1000.0, 1000.0)])
-    lower, upper = (
-        np.array([[100.0, 100.0], [600.0, 100.0]]),
-        np.array([[200.0] * 2, [700.0, 200.0]]),
-    )
+    lower = np.array([[100.0, 100.0], [600.0, 100.0]])
     found = crowding(points, lower, lower + 100.0, 30.0)
     np.testing.assert_allclose(found, [5 / 100**2, 7 / 1000**2])
 

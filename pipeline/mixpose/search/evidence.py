@@ -80,5 +80,4 @@ def _matches_of(
     lower[empty], upper[empty] = 0.0, 0.0
     weights, by_world = visible.astype(np.float64), J[..., :m, :3] / sigma
     crowd = crowding(points, lower, upper, _ASSOCIATION.min_region * sigma) * sigma**m
-    by_world: Floats = J[..., :m, :3] / sigma
     return SensorMatches(weights, shares, offsets, by_world, crowd, float(len(points)))
