@@ -62,12 +62,15 @@ class Start:
         That it comes from.
     left_out : mapping of str to str
         Sensors that are not to take part, and why.
+    T_moved : (4, 4) float64 or None
+        A pose that has moved as this one must have, and was as likely before the frame.
     """
 
     T_world_object: Floats
     uncertainty: Floats | None = None
     prediction: Prediction | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    T_moved: Floats | None = None
 
 
 class Likelihood(Protocol):
@@ -148,6 +151,10 @@ class FrameData:
             self.rules.motion,
             self.rules.judgement.detection,
         )
+
+    def moves_alike(self, T_world_object: Floats) -> Floats | None:
+        """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""
+        return T_world_object if len(self.track.branches) > 1 else None
 
     @cached_property
     def finest(self) -> MatchedObjective:
@@ -305,7 +312,7 @@ class MatchedLikelihood:
             T,
             data.free,
             before=data.track.residuals,
-            prior=data.prior(T),
+            prior=data.prior(T if start.T_moved is None else start.T_moved),
             unmet=others,
             rules=rules,
         )
