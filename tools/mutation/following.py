@@ -272,9 +272,9 @@ _TRACKER = (
     Mutant(
         "tracking-sensors-left-out-are-tallied",
         "tracking/tracker.py",
-        "one.surplus\n        )\n        for one in judged.associations\n"
+        "len(one.features))\n        for one in judged.associations\n"
         "        if judged.sensors[one.name].used",
-        "one.surplus\n        )\n        for one in judged.associations\n"
+        "len(one.features))\n        for one in judged.associations\n"
         "        if judged.sensors[one.name].used or True",
         "the next frame is looked at as a whole although all is well",
         (_STARTS,),

@@ -11,7 +11,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-other-tilt-never-tried",
         "tracking/proposers/mirrored.py",
-        "return [Start(T_tilted, data.start_uncertainty / data.rules.proposals.narrowing)]",
+        "return [Start(T_tilted, close, T_moved=data.moves_alike(T))]",
         "return []",
         "a flat body followed at the wrong tilt stays there",
         (_PROPOSERS,),
