@@ -184,6 +184,7 @@ def noise_of(
     factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
     covariance = np.zeros((6, 6))
     inner = np.tensordot(shares.variances * factors, frame.parts, 1)
+    inner += frame.by_calibration @ frame.by_calibration.T
     fields = lasting.moments(model.fields)
     if fields is not None:
         inner += frame.by_fields @ fields @ frame.by_fields.T
@@ -251,12 +252,15 @@ class _Frame(NamedTuple):
         What it says of fields that last.
     by_fields : (k, q) float64
         How these move the pose.
+    by_calibration : (k, K) float64
+        How calibrations do that are off by a standard deviation in one thing each.
     """
 
     moments: Moments
     parts: Floats
     lasting: Lasting
     by_fields: Floats
+    by_calibration: Floats
 
 
 def _moments(
@@ -270,7 +274,7 @@ def _moments(
     count = int(free.sum())
     clear = offsets.squared <= model.errors.outlying**2 * variances[offsets.sensor]
     ends = np.cumsum(np.bincount(offsets.sensor, minlength=len(associations)))[:-1]
-    parts, blocks, shifts = [], [], []
+    parts, blocks, shifts, doubts = [], [], [], []
     for one, inlying, variance in zip(associations, np.split(clear, ends), variances.tolist()):
         shares = np.where(inlying, one.shares, 0.0)
         scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
@@ -278,6 +282,9 @@ def _moments(
         parts.append((scale * rows).reshape(-1, count + 1))
         blocks.append(_fields(one.places, shares))
         shifts.append((scale * one.J[..., :3]).reshape(-1, 3))
+        if one.by_calibration is not None:
+            rows = (scale * one.by_calibration).reshape(parts[-1].shape[0], -1)
+            doubts.append(parts[-1][:, :count].T @ rows)
     weighted, shift = np.concatenate(parts), np.concatenate(shifts)
     shift /= max(float(np.sqrt((shift**2).sum() / max(shift.size, 1))), _LEAST)
     J, r = weighted[:, :count], weighted[:, count]
@@ -304,7 +311,8 @@ def _moments(
     expected = np.block([[np.array([[degrees]]), once[None]], [once[:, None], K]])
     own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
     by_kind = np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
-    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes)
+    by_calibration = inverse @ np.hstack([np.zeros((count, 0)), *doubts])
+    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes, by_calibration)
 
 
 class _OfMarkers(NamedTuple):
