@@ -11,7 +11,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-other-tilt-never-tried",
         "tracking/proposers/mirrored.py",
-        "return [Start(T_tilted, data.start_uncertainty / data.rules.proposals.narrowing)]",
+        "return [Start(T_tilted, close, T_moved=data.moves_alike(T))]",
         "return []",
         "a flat body followed at the wrong tilt stays there",
         (_PROPOSERS,),
@@ -201,8 +201,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "visible.astype(float), shares, offsets",
-        "shares, shares, offsets",
+        "SensorMatches(weights, shares",
+        "SensorMatches(shares, shares",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),
@@ -217,8 +217,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-crowds-are-no-clutter",
         "search/evidence.py",
-        "np.maximum(overall, inside / (2 * half).prod(axis=1))",
-        "np.full(len(y), overall)",
+        "crowding(points, lower, upper, ",
+        "crowding(points, lower * 0 - 1e6, upper * 0 + 1e6, ",
         "where false detections crowd poses are found by chance",
         ("test_search_evidence.py",),
     ),
