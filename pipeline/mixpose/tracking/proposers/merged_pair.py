@@ -6,17 +6,13 @@ seen is a rival; its evidence tells whether it is the better one.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TypeAlias
+from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.judgement import Association, Judged
+from mixpose.judgement import Judged
 from mixpose.rigid import perturb
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _STEPS = 2  # of least squares: the second starts within 0.01 σ_ε of the first's end
 
@@ -27,19 +23,9 @@ def merged_pair(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iter
     for _ in range(_STEPS if likelihood.knows_detections else 0):
         if not any(one.merged for one in at.associations):
             break
-        step = _least_squares(at.associations, data.free)
+        rows = np.concatenate([one.rows for one in at.associations])
+        step = np.zeros(6)
+        step[data.free] = np.linalg.lstsq(rows[:, :6][:, data.free], rows[:, 6], rcond=None)[0]
         start = Start(perturb(at.T_world_object, step))
         at = likelihood.judge(likelihood.fit(start), start)
     return [] if at is judged else [Start(at.T_world_object)]
-
-
-def _least_squares(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:
-    """The step (6,) to where the features were met, merged ones in their middle."""
-    rows = [(np.sqrt(one.shares) / one.sigma)[:, None] for one in associations]
-    J = np.concatenate(
-        [(r[..., None] * m.J).reshape(-1, 6) for r, m in zip(rows, associations, strict=True)]
-    )
-    offsets = [(r * one.offsets).ravel() for r, one in zip(rows, associations, strict=True)]
-    step = np.zeros(len(free))
-    step[free] = np.linalg.lstsq(J[:, free], np.concatenate(offsets), rcond=None)[0]
-    return step
