@@ -98,7 +98,7 @@ class Verdict:
     kept : list of (Judged, float)
         Poses worth telling with their beliefs, best first.
     doubt : str
-        Why a frame is ambiguous whose pose has no rival.
+        Why a frame is ambiguous, other than for its rivals.
     """
 
     status: Status
