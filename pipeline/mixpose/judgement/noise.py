@@ -64,16 +64,11 @@ class NoiseModel:
     )
     lasting: float = constant(
         0.18,
-        "of the noise: an offset that all features of a sensor have in common, before it is seen "
-        "(a chessboard, web cams and action cameras: 0.6-5)",
+        "of the noise: an offset that all features of a sensor have in common, or what turns, "
+        "scales and shears them, before it is seen (half and twice of it do as well)",
     )
     lasting_fields: float = constant(
         3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
-    )
-    slanted: float = constant(
-        0.7,
-        "of `lasting`: what turns, scales and shears (a chessboard 0.65, web cams and action "
-        "cameras 0.25-0.4)",
     )
 
     def enlargement(self, directions: int, degrees: float) -> float:
@@ -230,7 +225,7 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     of_markers = model.lasting_fields * own.expected[3, 3] + _LEAST
     believed = np.array([_LEAST, weights[1], weights[1], of_markers])
     expected = moments.expected + np.diag(believed)
-    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2, 0.0])
+    size = np.array([1.0, model.lasting**2, model.lasting**2, 0.0])
     seen = moments.seen + believed * size
     scale = 1 / np.maximum(expected.diagonal(), _LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
