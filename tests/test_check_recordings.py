@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mixpose
-from mixpose.checking import Survey, judge
+from mixpose.checking import Survey, judge, told_apart
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.simulation import SimulationOptions, simulate
@@ -208,7 +208,8 @@ def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
 ) -> None:
     session = with_lamps(tmp_path, seed=4)
     advised = re.findall(
-        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in \[extract\] it would be (\d+)",
+        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in its own "
+        r"\[sensor.extract\] it would be (\d+)",
         report_on(session, capsys, quick=True),
     )
     assert [name for name, *_ in advised] == ["left", "right"]
@@ -314,6 +315,16 @@ def test_a_geometry_that_explains_no_frame_is_told(
         text = text.replace(old, new)
     session.write_text(text, encoding="utf-8")
     assert said in report_on(session, capsys, quick=True)
+
+
+def test_two_sensors_that_want_unlike_values_of_a_key_are_told_apart() -> None:
+    one, other = ("with threshold = 90 in [extract] it would be 7", "with threshold = 150 in "
+                  "[extract] it would be 7")  # fmt: skip
+    assert told_apart([one, one, "else"]) == [one, one, "else"]
+    assert told_apart([one, other]) == [
+        "with threshold = 90 in its own [sensor.extract] it would be 7",
+        "with threshold = 150 in its own [sensor.extract] it would be 7",
+    ]
 
 
 def test_lines_of_several_bodies_have_their_names(capsys: pytest.CaptureFixture[str]) -> None:

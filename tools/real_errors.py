@@ -28,7 +28,7 @@ from scipy.optimize import least_squares
 
 import mixpose
 from mixpose.objective import View
-from mixpose.poses.evaluate import normalised_error_squared
+from mixpose.poses.consistency import normalised_error_squared
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between

@@ -11,7 +11,7 @@ session names no start.
 
 from __future__ import annotations
 
-from mixpose.checking.advice import advice, judge
+from mixpose.checking.advice import advice, judge, told_apart
 from mixpose.checking.geometry import CAUSES, geometry_warnings
 from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
@@ -42,6 +42,7 @@ __all__ = [
     "shared_part_warnings",
     "shared_source_warnings",
     "survey",
+    "told_apart",
     "typical_poses",
     "with_image_sizes",
 ]

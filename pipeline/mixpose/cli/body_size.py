@@ -9,7 +9,7 @@ import numpy as np
 from mixpose.records import Estimate, Floats
 from mixpose.session import Session
 
-_FEWEST = 10  # frames before anything is said
+_FEWEST = 5  # frames before anything is said
 _FEATURES = 4  # of a body: three in any other size are three in another place
 _SHARE = 0.8  # of all squared offsets that the other size explains; one wrong marker stays below
 _LEAST = 1e-3  # a body measured to less than that is measured well

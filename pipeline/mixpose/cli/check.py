@@ -29,6 +29,7 @@ from mixpose.checking import (
     shared_part_warnings,
     shared_source_warnings,
     survey,
+    told_apart,
     typical_poses,
     with_image_sizes,
 )
@@ -105,6 +106,7 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, sources[setup.name], surveys)
+    report.warnings = told_apart(report.warnings)
     report.warnings += shared_source_warnings(session, {}) + _pairing_warnings(sources)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
