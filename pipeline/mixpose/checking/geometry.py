@@ -25,6 +25,7 @@ CAUSES = (
 """Why sensors may contradict each other."""
 
 _TRIED = 2  # frames
+_FIRST = 40  # frames among which they are: to get far into a video takes as long as to read it
 
 
 def geometry_warnings(
@@ -42,7 +43,10 @@ def geometry_warnings(
     surveys : mapping of str to Survey
         What their frames hold.
     """
-    streams = any(isinstance(each, Video) and each.size is None for each in sources.values())
+    streams = any(
+        each.kind == "live" or (isinstance(each, Video) and each.size is None)
+        for each in sources.values()
+    )
     if len(sources) < 2 or len(session.labels) > 1 or streams:
         return []
     frames, doubt = [], None
@@ -76,7 +80,7 @@ def _is_seen(session: Session, surveys: Mapping[str, Survey]) -> bool:
 def _shared(sources: Mapping[str, Source], surveys: Mapping[str, Survey]) -> Iterator[FrameSet]:
     """A few frames in which every sensor sees something."""
     seen = [{*each.numbers} - {*each.empty} for each in surveys.values()]
-    numbers = sorted(set.intersection(*seen))
+    numbers = sorted(set.intersection(*seen))[:_FIRST]
     for number in numbers[:: max(len(numbers) // _TRIED, 1)][:_TRIED]:
         frames = {}
         for name, source in sources.items():

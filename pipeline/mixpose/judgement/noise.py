@@ -64,16 +64,11 @@ class NoiseModel:
     )
     lasting: float = constant(
         0.18,
-        "of the noise: an offset that all features of a sensor have in common, before it is seen "
-        "(a chessboard, web cams and action cameras: 0.6-5)",
+        "of the noise: an offset that all features of a sensor have in common, or what turns, "
+        "scales and shears them, before it is seen (half and twice of it do as well)",
     )
     lasting_fields: float = constant(
         3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
-    )
-    slanted: float = constant(
-        0.7,
-        "of `lasting`: what turns, scales and shears (a chessboard 0.65, web cams and action "
-        "cameras 0.25-0.4)",
     )
 
     def enlargement(self, directions: int, degrees: float) -> float:
@@ -230,7 +225,7 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     of_markers = model.lasting_fields * own.expected[3, 3] + _LEAST
     believed = np.array([_LEAST, weights[1], weights[1], of_markers])
     expected = moments.expected + np.diag(believed)
-    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2, 0.0])
+    size = np.array([1.0, model.lasting**2, model.lasting**2, 0.0])
     seen = moments.seen + believed * size
     scale = 1 / np.maximum(expected.diagonal(), _LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
@@ -396,8 +391,5 @@ def _inverse(information: Floats) -> Floats:
 
 def information_of(associations: Sequence[Association], variances: Floats) -> Floats:
     """Σ_l Σ_i J_iᵀ J_i / s_l² (6, 6) over the met features, for noise (L,) in σ_ε²."""
-    information = np.zeros((6, 6))
-    for one, variance in zip(associations, variances.tolist(), strict=True):
-        weighted = (one.J * (one.shares / (variance * one.sigma**2))[:, None, None]).reshape(-1, 6)
-        information += weighted.T @ one.J.reshape(-1, 6)
-    return information
+    rows = [one.rows[:, :6] / s for one, s in zip(associations, np.sqrt(variances).tolist())]
+    return np.asarray(np.concatenate(rows).T @ np.concatenate(rows))
