@@ -189,7 +189,7 @@ def _residuals(
     # what the better half of the features looks like on its own
     full = float(np.median(np.sort(own)[len(own) // 2 :]))
     if full <= 0:
-        return FeaturesMet(shares, offsets, alone, nothing)
+        return FeaturesMet(np.zeros(len(y)), np.zeros(y.shape), alone, nothing)
     shares = np.clip(own / full, 0.0, 1.0)
     shares = np.where(shares > rules.min_share, shares, 0.0) * weights
     pull = sampled[:, 1:] - predicted_gradient
