@@ -1,8 +1,8 @@
 """The log-likelihood of grey values and profiles whose features are not equally bright.
 
 With one amplitude for all features, two that overlap pull each other aside where the one is
-brighter: a tenth of the difference, in parts of σ.  Here each feature i of a sensor has an amplitude
-of its own, α_i, about their mean.  With b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
+brighter.  Here each feature i of a sensor has an amplitude of its own, α_i, about their mean.  With
+b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
 
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 
