@@ -9,7 +9,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, ScheduleRules, blur_schedule, fit_near
-from mixpose.fit.prior import Likelihood, likelihood_at
+from mixpose.fit.prior import Likelihood, NormalPrior, likelihood_at, most_probable
 from mixpose.objective import View, matched_objective
 from mixpose.records import GridPattern
 from mixpose.rigid import Floats, perturb, twist_between
@@ -150,3 +150,21 @@ def test_spots_of_grey_values_that_overlap_give_the_pose_to_the_last_digits() ->
     # noise of cells is that of single precision: nothing but the look-up is left, which at 256
     # cells per standard deviation errs by 1e-5 of a slope
     np.testing.assert_allclose(fit.T_world_object[:2, 3], PLACE, atol=1e-4)
+
+
+def test_spots_that_overlap_and_are_not_equally_bright_pull_each_other_no_more() -> None:
+    pair = Body("pair", (PointFeature(np.zeros(3)), PointFeature(np.array([5.0, 1.0, 0.0]))))
+    v, u = np.mgrid[:81, :81] - 40.0
+    image = 0.01 * np.random.default_rng(0).standard_normal(u.shape)
+    for bright, (x, y) in zip((1.0, 0.7), PLACE + pair.means[:, :2], strict=True):
+        image += bright * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 8)
+    pattern = GridPattern(image.astype(np.float32), np.zeros(2), 1.0)
+    view = View("grey", BEAM, Observation(pattern, 2.0, intrinsic=2.0))
+    options, u6 = EstimatorOptions(free=("x", "y")), np.array([1.0, 1.0, 0, 0, 0, 0])
+    fit = fit_near([view], pair, shifted(1.0, 0.0), u6, options, np.zeros((2, 1, 3)))
+    # of two spots the place is known to noise / (height √2π); with one height it is 0.2 px off
+    np.testing.assert_allclose(fit.T_world_object[:2, 3], PLACE, atol=4 * 0.01 / np.sqrt(2 * np.pi))
+    objective = matched_objective([view], pair, [view.observation.sigma])
+    prior = NormalPrior(shifted(1.0, 0.0), np.full(6, 1.0), u6 > 0)
+    equal = most_probable(objective, fit.T_world_object, prior)
+    assert np.abs(equal[:2, 3] - PLACE).max() > 0.1

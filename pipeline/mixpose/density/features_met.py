@@ -21,6 +21,8 @@ from mixpose.records import GridPattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_ALIKE = 0.01  # of a height: features are told apart from a seventh of C's deviation on
+
 
 @dataclass(frozen=True)
 class AssociationRules:
@@ -169,23 +171,28 @@ def _residuals(
 ) -> FeaturesMet:
     """How far a grid of values puts each feature from its prediction.
 
-    Around a prediction that fits, C is `amplitude` times the predicted mixture blurred alike.
-    What is left of the gradient is the pull on this feature alone, without its neighbours'.
+    Around a prediction that fits, C is the predicted mixture blurred alike, each feature with an
+    amplitude of its own about `amplitude`.  What is left of the gradient once all are taken off is
+    the pull on this feature alone.
     """
     top = peak(variance, y.shape[1])
     away = y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
-    predicted_gradient = -(bells[..., None] * away).sum(axis=1) / variance
-    own = sampled[:, 0] - amplitude * (bells.sum(axis=1) - weights * top)
-    shares, offsets, alone = np.zeros(len(y)), np.zeros(y.shape), np.arange(len(y))
+    alone = np.arange(len(y))
+    # at one place features cannot be told apart: they are taken to be alike
+    rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
+    unlike = np.linalg.solve(bells + _ALIKE * top * np.diag(weights), rest)
+    amplitudes = amplitude + unlike
+    predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
+    own = amplitudes * weights * top
     nothing = np.full(len(y), -1)
     # what the better half of the features looks like on its own
     full = float(np.median(np.sort(own)[len(own) // 2 :]))
     if full <= 0:
-        return FeaturesMet(shares, offsets, alone, nothing)
+        return FeaturesMet(np.zeros(len(y)), np.zeros(y.shape), alone, nothing)
     shares = np.clip(own / full, 0.0, 1.0)
     shares = np.where(shares > rules.min_share, shares, 0.0) * weights
-    pull = sampled[:, 1:] - amplitude * predicted_gradient
+    pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(own, rules.min_share * full)[:, None]
     return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone, nothing)
 

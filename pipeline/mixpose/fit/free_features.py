@@ -50,10 +50,11 @@ def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
         return None
     y = grid[peaks][order[:count]]
     for _ in range(_STEPS):
-        rest, height = sensor.left(y)
-        if height <= 0:
+        rest, own = sensor.left(y)
+        if own.min() <= 0:
             return None
-        y = y + np.sqrt(sensor.variance) / height * rest[:, 1:]
+        y = y + np.sqrt(sensor.variance) * rest / own[:, None]
+    height = float(own.mean())
     chance = sensor.noise() * np.sqrt(2 * np.log(heights.size))
     others = heights[peaks][order[count:]].max(initial=chance)
     return y if others < 0.5 * height < sensor.density(y)[:, 0].min() else None

@@ -16,6 +16,7 @@ from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
 
+_SAME = 1e-9  # features nearer than 1e-4 of √2 σ have one height
 _ROUNDING = 1 / 512  # of a height: what a body may leave at its features and yet fit
 
 
@@ -25,6 +26,9 @@ class MisfitRules:
 
     believed: float = constant(
         0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
+    )
+    unlike: float = constant(
+        0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
     )
 
 
@@ -51,18 +55,17 @@ class SensorDensity:
     cell_variance: float
     extent: tuple[Floats, Floats]
 
-    def left(self, y: Floats) -> tuple[Floats, float]:
-        """What equal features (n, m) leave of the density at their places, and their height.
+    def left(self, y: Floats) -> tuple[Floats, Floats]:
+        """What features (n, m), each of its own height (n,), leave of the density's gradient.
 
-        Values and gradients (n, 1 + m), the gradients times √2 σ: all have the same noise.
+        Gradients (n, m) times √2 σ, which have the noise of the values.
         """
         away = (y[:, None] - y) / np.sqrt(self.variance)
         bells = np.exp(-0.5 * (away * away).sum(axis=2))
-        mixture = np.dstack([bells, -away * bells[..., None]]).sum(axis=1)
         here = self.density(y).astype(np.float64)
-        here[:, 1:] *= np.sqrt(self.variance)
-        height = float(here[:, 0].sum() / bells.sum())
-        return here - height * mixture, height
+        heights = np.linalg.solve(bells + _SAME * np.eye(len(y)), here[:, 0])
+        slopes = -((bells * heights)[..., None] * away).sum(axis=1)
+        return np.sqrt(self.variance) * here[:, 1:] - slopes, heights
 
     def noise(self) -> float:
         """Standard deviation of the noise of the matched density."""
@@ -84,15 +87,15 @@ def misfit(
     points_world : (n, 3) array
         The body's features.
     unknowns : int
-        Numbers of the pose that were fitted; each sensor's amplitude was, too.
+        Numbers of the pose that were fitted; each feature's height was, too.
     rules : MisfitRules
     """
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
-        rest, height = sensor.left(sensor.geometry.project(points_world)[0])
-        noise = np.hypot(sensor.noise(), _ROUNDING * height)
+        rest, heights = sensor.left(sensor.geometry.project(points_world)[0])
+        noise = np.hypot(sensor.noise(), _ROUNDING * float(heights.mean()))
         statistic += float((rest * rest).sum()) / noise**2
-        freedom += rest.size - 1
+        freedom += rest.size
     if freedom <= 0 or statistic < float(chdtri(freedom, 1 - rules.believed)):
         return 1.0
     return statistic / freedom

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.fit.free_features import fit_freed
 from mixpose.fit.misfit import MisfitRules, SensorDensity, misfit
-from mixpose.fit.prior import NormalPrior, likelihood_at, most_probable
+from mixpose.fit.prior import NormalPrior, most_probable, with_amplitudes
 from mixpose.objective import MatchedObjective, matched_objective
 from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.rigid import transform
@@ -45,8 +45,9 @@ def believed(
     body = objective.projection.body
     points = body.nodes.points
     T = most_probable(objective, T_world_object, prior)
+    T_unlike, noises = with_amplitudes(objective, T, prior, rules.unlike)
     if not objective.projection.project(T[None]).seen.all() or len(points) != len(body):
-        return T, False
+        return T_unlike, False
     densities = [
         SensorDensity(
             view.sensor,
@@ -55,13 +56,11 @@ def believed(
             float(noise),
             view.observation.extent,
         )
-        for k, (view, noise) in enumerate(
-            zip(objective.views, likelihood_at(objective, T).noise, strict=True)
-        )
+        for k, (view, noise) in enumerate(zip(objective.views, noises, strict=True))
     ]
-    ratio = misfit(densities, transform(T, points), int(prior.free.sum()), rules)
+    ratio = misfit(densities, transform(T_unlike, points), int(prior.free.sum()), rules)
     if ratio == 1:
-        return T, False
+        return T_unlike, False
     sigmas = [view.observation.sigma for view in objective.views]
     # to look for peaks everywhere
     rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
@@ -70,7 +69,8 @@ def believed(
     if T_freed is not None:
         return T_freed, True
     # what is left at features is no noise of cells: in a body that does not fit it is as large
-    return most_probable(objective, T, prior, ratio), False
+    T = most_probable(objective, T, prior, ratio)
+    return with_amplitudes(objective, T, prior, rules.unlike, ratio)[0], False
 
 
 def _sampled(objective: MatchedObjective, sensor: int, y: Floats) -> Floats:

@@ -18,14 +18,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.objective import MatchedObjective, Quadratic, View
+from mixpose.objective import AmplitudesObjective, MatchedObjective, Quadratic, View
 from mixpose.objective.matched import FINE_STEPS, value_error
-from mixpose.optimise import NewtonOptions, ascend
+from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 
 Floats: TypeAlias = NDArray[np.float64]
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
+_ROUNDS = 3  # of noise and pose by turns: the noise holds to a part in a hundred
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
 _VALUE_ERROR = value_error(FINE_STEPS)
 
@@ -161,17 +162,60 @@ def most_probable(
     return _highest(likelihood_at(objective, T, misfit), prior, [T], _NATS)
 
 
+def with_amplitudes(
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    prior: NormalPrior,
+    spread: float,
+    misfit: float = 1.0,
+) -> tuple[Floats, Floats]:
+    """The most probable pose (4, 4) near another where features are not equally bright.
+
+    Parameters
+    ----------
+    objective : MatchedObjective
+        As `likelihood_at` has it.
+    T_world_object : (4, 4) array
+        The most probable pose if they were.
+    prior : NormalPrior
+    spread : float
+        Of their amplitudes, relative.
+    misfit : float
+        As `likelihood_at` has it.
+
+    Returns
+    -------
+    (4, 4) array
+    (L,) array
+        Variance of a cell's noise times the size of a cell, per sensor.
+    """
+    T, noise = T_world_object, likelihood_at(objective, T_world_object).noise
+    for _ in range(_ROUNDS):
+        unlike = AmplitudesObjective(objective, noise, spread)
+        left = unlike.unexplained(T)
+        noise = np.maximum(left, 1e-9 * objective.energies[:, 0]) / [
+            view.observation.cells for view in objective.views
+        ]
+        T = _climbed(AmplitudesObjective(objective, misfit * noise, spread), prior, T, _NATS).state
+    return T, noise
+
+
 def _highest(
     likelihood: Likelihood, prior: NormalPrior, starts: Sequence[Floats], nats: float
 ) -> Floats:
     """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
+    ends = [_climbed(likelihood.objective, prior, T, nats) for T in starts]
+    return max(ends, key=lambda end: end.value).state
+
+
+def _climbed(
+    likelihood: MatchedObjective | AmplitudesObjective, prior: NormalPrior, T: Floats, nats: float
+) -> Ascent[Floats]:
+    """The maximum of likelihood and prior near a pose (4, 4), but for some nats."""
 
     def posterior(T: Floats) -> Quadratic:
-        return prior.joined(likelihood.objective.linearise(T), T)
+        return prior.joined(likelihood.linearise(T), T)
 
-    ends = []
-    for T in starts:
-        scale = max(abs(posterior(T).value), 1.0)
-        options = NewtonOptions(60, max(1e-11, nats / scale), value_error=_VALUE_ERROR)
-        ends.append(ascend(posterior, perturb, T, prior.free, options))
-    return max(ends, key=lambda end: end.value).state
+    scale = max(abs(posterior(T).value), 1.0)
+    options = NewtonOptions(60, max(1e-11, nats / scale), value_error=_VALUE_ERROR)
+    return ascend(posterior, perturb, T, prior.free, options)

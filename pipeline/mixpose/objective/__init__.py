@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mixpose.objective.amplitudes import AmplitudesObjective
 from mixpose.objective.base import Objective, Quadratic, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
 from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
@@ -11,6 +12,7 @@ from mixpose.objective.together import Together, can_be_together
 
 __all__ = [
     "OBJECTIVES",
+    "AmplitudesObjective",
     "BodyProjection",
     "IndependentObjective",
     "MatchedObjective",

@@ -1,0 +1,123 @@
+"""The log-likelihood of grey values and profiles whose features are not equally bright.
+
+With one amplitude for all features, two that overlap pull each other aside where the one is
+brighter.  Here each feature i of a sensor has an amplitude of its own, α_i, about their mean.  With
+b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
+
+    Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
+
+where P takes the mean off and λ = N / (s a)² for noise N of cells, relative spread s and common
+amplitude a.  Under much noise α are equal and Q is the matched kernel; under little they are free.
+As α are at their maximum, the gradient is that at fixed α; the curvature is Gauss-Newton's of the
+residual g − Σ_i α_i h_i with α solved for (variable projection).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.objective.base import Quadratic
+from mixpose.objective.matched import MatchedObjective
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+class _Mixture(NamedTuple):
+    """The n features that a sensor of m coordinates sees, and their amplitudes.
+
+    Attributes
+    ----------
+    alpha : (n,) float64
+    b : (n,) float64
+    B : (n, n) float64
+    inner : (n, n) float64
+        B + λP.
+    pull : (n, m) float64
+        ∇b.
+    away : (n, n, m) float64
+        p_i − p_j.
+    J : (n, m, 6) float64
+    """
+
+    alpha: Floats
+    b: Floats
+    B: Floats
+    inner: Floats
+    pull: Floats
+    away: Floats
+    J: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudesObjective:
+    """Σ_l Q_l / (2 N_l) over the pose, in nats.
+
+    Attributes
+    ----------
+    matched : MatchedObjective
+        At σ_ε of sensors with noise in their cells.
+    noise : (L,) float64
+        Variance of a cell's noise times the size of a cell, per sensor.
+    spread : float
+        s, relative.
+    """
+
+    matched: MatchedObjective
+    noise: Floats
+    spread: float
+
+    def linearise(self, T_world_object: Floats) -> Quadratic:
+        """Value, gradient and curvature at one pose (4, 4)."""
+        value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
+        for k, one in enumerate(self._mixtures(T_world_object)):
+            v, scale = float(self.matched.variances[k, 0]), 0.5 / float(self.noise[k])
+            alpha, n = one.alpha, len(one.alpha)
+            bells = alpha[:, None] * one.B * alpha
+            pull = alpha[:, None] * one.pull + (bells[..., None] * one.away).sum(axis=1) / v
+            J = one.J.reshape(-1, 6)
+            value += scale * float(alpha @ one.b)
+            gradient += 2 * scale * (pull.ravel() @ J)
+            # ⟨∂h_i, ∂h_jᵀ⟩, and ⟨∂h_i, h_j⟩
+            outer = one.away[..., :, None] * one.away[..., None, :] / v
+            m = one.away.shape[2]
+            gram = (bells / v)[..., None, None] * (np.eye(m) - outer)
+            gram = gram.swapaxes(1, 2).reshape(n * m, n * m)
+            cross = -((alpha[:, None] * one.B / v)[..., None] * one.away).swapaxes(1, 2)
+            mixed = cross.reshape(n * m, n).T @ J
+            solved = np.linalg.solve(one.inner, mixed)
+            curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
+        return Quadratic(value, gradient, curvature)
+
+    def unexplained(self, T_world_object: Floats) -> Floats:
+        """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
+        energies = self.matched.energies[:, 0]
+        explained = [
+            2 * float(one.alpha @ one.b) - float(one.alpha @ one.B @ one.alpha)
+            for one in self._mixtures(T_world_object)
+        ]
+        return np.asarray(energies - np.array(explained))
+
+    def _mixtures(self, T_world_object: Floats) -> list[_Mixture]:
+        at, sampled, over = self.matched.match(T_world_object[None])
+        found = []
+        for k, m in enumerate(self.matched.projection.dimensions.tolist()):
+            seen = np.flatnonzero(at.weights[k, 0] > 0)
+            w, y = at.weights[k, 0, seen], at.y[k, 0, seen, :m]
+            C = w[:, None] * sampled[k, 0, seen, : 1 + m]
+            away = y[:, None] - y[None]
+            v, top = float(self.matched.variances[k, 0]), float(self.matched.tops[k, 0])
+            B = top * np.outer(w, w) * np.exp(-0.5 * (away * away).sum(axis=2) / v)
+            common = max(float(C[:, 0].sum()), 0.0) / float(over.norm[k, 0])
+            # bounded, so that features at one place are told apart by nothing
+            least = 1e-9 * top * float(w @ w)
+            strength = float(self.noise[k]) / max(self.spread * common, 1e-300) ** 2 + least
+            inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1))
+            inner += least * np.eye(len(w))
+            alpha = np.linalg.solve(inner, C[:, 0])
+            J = at.J[k, 0, seen, :m]
+            found.append(_Mixture(alpha, C[:, 0], B, inner, C[:, 1:], away, J))
+        return found
