@@ -86,6 +86,8 @@ def features_met(
     sampled: Floats,
     amplitude: float,
     rules: AssociationRules,
+    *,
+    unlike: bool = True,
 ) -> FeaturesMet:
     """Compare predicted features with what was observed.
 
@@ -102,9 +104,11 @@ def features_met(
     amplitude : float
         The factor with which the predicted mixture meets the observed one.
     rules : AssociationRules
+    unlike : bool
+        Whether features of a grid of values have amplitudes of their own, as the fit gave them.
     """
     if isinstance(observation.pattern, GridPattern):
-        return _residuals(y, weights, variance, sampled, amplitude, rules)
+        return _residuals(y, weights, variance, sampled, amplitude, rules, unlike)
     reach = rules.reach_squared * variance
     found = _nearest(observation.pattern, y, weights, reach)
     if not rules.merged or np.count_nonzero(found.shares) == len(y):
@@ -168,6 +172,7 @@ def _residuals(
     sampled: Floats,
     amplitude: float,
     rules: AssociationRules,
+    unlike: bool,
 ) -> FeaturesMet:
     """How far a grid of values puts each feature from its prediction.
 
@@ -179,12 +184,12 @@ def _residuals(
     away = y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
     alone = np.arange(len(y))
-    # at one place features cannot be told apart: they are taken to be alike
     rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
-    unlike = np.linalg.solve(bells + _ALIKE * top * np.diag(weights), rest)
-    amplitudes = amplitude + unlike
+    # at one place features cannot be told apart: they are taken to be alike
+    widened = bells + _ALIKE * top * np.diag(weights)
+    amplitudes = amplitude + (np.linalg.solve(widened, rest) if unlike else np.zeros(len(y)))
     predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
-    own = amplitudes * weights * top
+    own = amplitudes * weights * top if unlike else rest + amplitude * weights * top
     nothing = np.full(len(y), -1)
     # what the better half of the features looks like on its own
     full = float(np.median(np.sort(own)[len(own) // 2 :]))

@@ -161,6 +161,8 @@ def associate(
     nodes = objective.projection.body.nodes
     node_weights, world = nodes.weights, transform(T_world_object, nodes.points)
     found, value = [], 0.0
+    # beside detections the fit gives all features of a sensor one amplitude
+    unlike = all(view.observation.cell is not None for view in objective.views)
     for k, view in enumerate(objective.views):
         m, observation = int(objective.projection.dimensions[k]), view.observation
         variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
@@ -172,7 +174,8 @@ def associate(
         shares, offsets, merged = np.zeros(len(y)), np.zeros(y.shape), 0
         detections = np.full(len(y), -1)
         if product > 0:
-            met = features_met(observation, y, weights, variance, C, product / norm, rules)
+            a = product / norm
+            met = features_met(observation, y, weights, variance, C, a, rules, unlike=unlike)
             shares, offsets, detections = met.shares, met.offsets, met.detections
             paired = met.partner != np.arange(len(y))
             merged = int(np.count_nonzero(paired)) // 2
