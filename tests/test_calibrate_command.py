@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import time
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mixpose.cli.calibrate import _watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.session import load_session
 
@@ -77,3 +79,34 @@ def test_the_session_itself_is_not_overwritten(bumped: Path) -> None:
     done = mixpose("calibrate", bumped, "-o", bumped)
     assert done.returncode == 2
     assert "is an input of this run" in done.stderr
+
+
+def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: Path) -> None:
+    for word in ("bodi@0", "body@77", "middle"):
+        done = mixpose("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--world", word)
+        assert done.returncode == 2
+        (line,) = done.stderr.strip().splitlines()  # no line about what is free and searched
+        assert f"--world {word}: allowed: left, right, or the body in a frame" in line
+        assert "body@0, body@5, body@10, ..." in line
+
+
+def test_the_sensor_that_is_held_is_called_so_in_a_check(bumped: Path) -> None:
+    done = mixpose("calibrate", bumped, "--check")
+    assert done.returncode == 0, done.stderr
+    left, right = done.stdout.splitlines()[1:3]
+    assert "held, the others are told against it; residual" in left
+    assert right.split()[:3] == ["right", "turned", "by"]
+    assert "e-1" not in done.stdout  # no rounding error among the figures
+
+
+def test_what_was_searched_before_does_not_count_in_the_time_to_expect(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    with _watched() as progress:
+        for done in range(41):
+            now[0] += 1e-4 if done <= 20 else 1.5
+            progress("searching in left", done, 40)
+    said = capsys.readouterr().err
+    assert said == "mixpose: 16 frames of cameras left to search, about 24 s\n"

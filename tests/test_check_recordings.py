@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mixpose
-from mixpose.checking import Survey, judge
+from mixpose.checking import Survey, judge, told_apart
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.simulation import SimulationOptions, simulate
@@ -208,7 +208,8 @@ def test_advice_that_is_followed_keeps_the_markers_where_clutter_is_larger(
 ) -> None:
     session = with_lamps(tmp_path, seed=4)
     advised = re.findall(
-        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in \[extract\] it would be (\d+)",
+        r"sensor '(\w+)': too many .*: with (\w+) = (\w+) in its own "
+        r"\[sensor.extract\] it would be (\d+)",
         report_on(session, capsys, quick=True),
     )
     assert [name for name, *_ in advised] == ["left", "right"]
@@ -274,3 +275,60 @@ def test_the_typical_frame_has_the_median_number_of_features() -> None:
     # in order the counts are 0, 3, 7, 9, 40
     assert seen.typical_frame == 8
     assert replace(seen, counts=None).typical_frame is None
+
+
+def test_files_that_are_given_to_two_sensors_are_told(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8").replace('"right*.png"', '"./left*.png"')
+    session.write_text(text, encoding="utf-8")
+    check_session(session, quick=True)
+    out = capsys.readouterr().out
+    assert "sensors 'left' and 'right' read the same recording, " in out
+    assert "files (left0000.png, ...): give each its own source" in out
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            [("left*.png", "x*.png"), ("right*.png", "left*.png"), ("x*.png", "right*.png")],
+            "'left' and 'right' are swapped: with the source of each given to the other, frames 0 "
+            "and 3 would be ok",
+        ),
+        (
+            [("[[812.4, 0.0, 322.7], [0.0, 811.9", "[[912.4, 0.0, 322.7], [0.0, 911.9")],
+            "frames 0 and 3: two sensors contradict each other: is one of them out of step",
+        ),
+    ],
+)
+def test_a_geometry_that_explains_no_frame_is_told(
+    changed: list[tuple[str, str]],
+    said: str,
+    recording: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    session = recording / "session.toml"
+    text = session.read_text(encoding="utf-8")
+    for old, new in changed:
+        text = text.replace(old, new)
+    session.write_text(text, encoding="utf-8")
+    assert said in report_on(session, capsys, quick=True)
+
+
+def test_two_sensors_that_want_unlike_values_of_a_key_are_told_apart() -> None:
+    one, other = ("with threshold = 90 in [extract] it would be 7", "with threshold = 150 in "
+                  "[extract] it would be 7")  # fmt: skip
+    assert told_apart([one, one, "else"]) == [one, one, "else"]
+    assert told_apart([one, other]) == [
+        "with threshold = 90 in its own [sensor.extract] it would be 7",
+        "with threshold = 150 in its own [sensor.extract] it would be 7",
+    ]
+
+
+def test_lines_of_several_bodies_have_their_names(capsys: pytest.CaptureFixture[str]) -> None:
+    report = report_on(SYNTHETIC / "several_bodies" / "session.toml", capsys, quick=True)
+    for title in ("symmetry", "in view", "accuracy"):
+        found = re.findall(rf"^{title} +(\w+): ", report, flags=re.MULTILINE)
+        assert found == ["tool", "reference", "rod"]

@@ -104,3 +104,26 @@ def test_a_format_that_cannot_be_written_along_the_way_is_refused(
     assert command("run", RANGES, "-o", tmp_path / "poses.rrd") == 2
     assert "mixpose convert POSES.jsonl" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_suffix_that_is_no_format_is_refused_and_those_allowed_are_listed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("run", RANGES, "-o", tmp_path / "poses.json") == 2
+    said = capsys.readouterr().err
+    assert "found the suffix .json, which is no format of poses" in said
+    assert ".jsonl, .bop.csv, .csv, .tum, .yaml, .yml; or name one with --format" in said
+    assert list(tmp_path.iterdir()) == []
+    named = ("--format", "jsonl", "--stop", "1")
+    assert command("run", RANGES, "-o", tmp_path / "poses.json", *named) == 0
+
+
+def test_the_name_of_a_file_makes_no_folder_for_several_sessions(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    beams = SYNTHETIC / "parallel_beams" / "session.toml"
+    assert command("run", RANGES, beams, "-o", tmp_path / "poses.jsonl") == 2
+    said = capsys.readouterr().err
+    assert "found the name of a file; allowed for 2 sessions: a folder" in said
+    assert len(said.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []

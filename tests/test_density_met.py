@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import AssociationRules, Observation, crowding, features_met, surplus
@@ -72,13 +71,10 @@ def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
 
 def test_clutter_is_as_dense_as_detections_around_the_body_where_they_are_denser() -> None:
     around = [(100.0, 100.0), (200.0, 100.0), (200.0, 200.0), (150.0, 150.0), (120.0, 180.0)]
-    observation = detections(*around, (0.0, 0.0), (1000.0, 1000.0))
-    body = np.array([[100.0, 100.0], [200.0, 200.0]])
-    count, density = crowding(observation, body, 1.5, 7.0, RULES)
-    assert count == 7
-    assert density == pytest.approx(5 / 100**2)
-    elsewhere = body + np.array([500.0, 0.0])
-    assert crowding(observation, elsewhere, 1.5, 7.0, RULES)[1] == pytest.approx(7 / 1000**2)
+    points = np.array([*around, (0.0, 0.0), (1000.0, 1000.0)])
+    lower = np.array([[100.0, 100.0], [600.0, 100.0]])
+    found = crowding(points, lower, lower + 100.0, 30.0)
+    np.testing.assert_allclose(found, [5 / 100**2, 7 / 1000**2])
 
 
 def test_detections_beside_the_body_that_belong_to_none_are_surplus() -> None:

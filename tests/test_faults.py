@@ -60,6 +60,10 @@ def test_a_recording_without_faults_gives_rise_to_no_remark(tmp_path: Path) -> N
         ("points in metres", "with points 1000 times as large"),
         ("translations in metres", "with points a thousandth as large"),
         ("mirrored image", "images of 'right' are mirrored"),
+        ("T_sensor_world inverted", "T_sensor_world of 'left' and 'right' are inverted"),
+        ("T_sensor_world of one inverted", "T_sensor_world of 'right' is inverted"),
+        ("body 5 % too large", "with points 0.952 times as large"),
+        ("one camera's files given for both", "'left' and 'right' read the same recording"),
     ],
 )
 def test_what_is_given_wrong_all_along_is_told_by_what_is_seen(
@@ -68,6 +72,15 @@ def test_what_is_given_wrong_all_along_is_told_by_what_is_seen(
     found = outcome(FAULTS[name], tmp_path / "recording", stop=6)  # none convinces: it searches
     assert found.right == found.wrong == 0
     assert any(said in line for line in found.said), found.said
+
+
+def test_a_body_that_is_one_per_cent_too_small_is_named_by_what_it_is_met_off(
+    tmp_path: Path,
+) -> None:
+    found = outcome(FAULTS["body 1 % too small"], tmp_path / "recording", stop=12)
+    assert found.wrong == 0
+    (said,) = found.said
+    assert "'tracker' are met as if it were 1.01 times as large" in said
 
 
 def association(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Association:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.fit import prior as prior_module
-from mixpose.fit.prior import Prior, cell_variances, most_probable
+from mixpose.fit.prior import NormalPrior, cell_variances, most_probable
 from mixpose.objective import MatchedObjective, Quadratic
 from mixpose.rigid import perturb, twist_between
 
@@ -52,7 +52,7 @@ class Parabola:
 
 
 Toy = Normals | Parabola
-MostProbable = Callable[[Toy, Floats, Prior], Floats]
+MostProbable = Callable[[Toy, Floats, NormalPrior], Floats]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Drawn:
 def most_probable_of(monkeypatch: pytest.MonkeyPatch) -> MostProbable:
     """The most probable pose of a likelihood that is given, not drawn."""
 
-    def maximise(toy: Toy, T: Floats, prior: Prior) -> Floats:
+    def maximise(toy: Toy, T: Floats, prior: NormalPrior) -> Floats:
         monkeypatch.setattr(prior_module, "likelihood_at", lambda *_: Drawn(toy))
         return most_probable(cast(MatchedObjective, None), T, prior)
 
@@ -82,7 +82,7 @@ def test_of_two_normal_distributions_the_mean_weighted_by_information_is_most_pr
 ) -> None:
     # shifts: start 0 ± 2 and measurement 10 ± 1 → (0/4 + 10/1) / (1/4 + 1/1) = 8
     # turns: start 0 ± 0.1 and measurement 0.02 ± 0.1 → 0.01
-    prior = Prior(np.eye(4), np.array([2.0] * 3 + [0.1] * 3), FREE)
+    prior = NormalPrior(np.eye(4), np.array([2.0] * 3 + [0.1] * 3), FREE)
     measured = perturb(np.eye(4), np.array([10.0, 0, 0, 0, 0, 0.02]))
     likelihood = Parabola(measured, np.diag([1.0] * 3 + [100.0] * 3))
     T = most_probable_of(likelihood, measured, prior)
@@ -91,7 +91,7 @@ def test_of_two_normal_distributions_the_mean_weighted_by_information_is_most_pr
 
 def test_directions_that_are_not_free_stay(most_probable_of: MostProbable) -> None:
     free = np.array([True, False, True, True, True, True])
-    prior = Prior(np.eye(4), np.array([2.0] * 3 + [0.1] * 3), free)
+    prior = NormalPrior(np.eye(4), np.array([2.0] * 3 + [0.1] * 3), free)
     measured = perturb(np.eye(4), np.array([10.0, 10.0, 0, 0, 0, 0]))
     likelihood = Parabola(measured, np.diag([1.0] * 3 + [100.0] * 3))
     T = most_probable_of(likelihood, np.eye(4), prior)
@@ -103,7 +103,7 @@ def test_the_highest_of_several_maxima_is_taken(
     near: float, far: float, expected: float, most_probable_of: MostProbable
 ) -> None:
     # log-likelihoods at x = 2 and x = -6; the start 0 ± 3 costs 0.2 and 2 nats there
-    prior = Prior(np.eye(4), np.array([3.0] * 3 + [0.1] * 3), FREE)
+    prior = NormalPrior(np.eye(4), np.array([3.0] * 3 + [0.1] * 3), FREE)
     centres = np.array([[2.0, 0, 0], [-6.0, 0, 0]])
     likelihood = Normals(centres, np.array([near, far]), 1.0)
     T = most_probable_of(likelihood, np.eye(4), prior)
@@ -113,14 +113,14 @@ def test_the_highest_of_several_maxima_is_taken(
 
 def test_points_of_the_prior_have_its_mean_and_its_covariance() -> None:
     uncertainty = np.array([1.0, 2, 3, 0.01, 0.02, 0.03])
-    prior = Prior(np.eye(4), uncertainty, FREE)
+    prior = NormalPrior(np.eye(4), uncertainty, FREE)
     twists = np.array([twist_between(np.eye(4), T) for T in prior.points()[1:]])
     assert twists.mean(axis=0) == pytest.approx(np.zeros(6), abs=1e-12)
     assert twists.T @ twists / len(twists) == pytest.approx(np.diag(uncertainty**2), abs=1e-9)
 
 
 def test_a_prior_alone_is_its_own_maximum(most_probable_of: MostProbable) -> None:
-    prior = Prior(np.eye(4), np.ones(6), FREE)
+    prior = NormalPrior(np.eye(4), np.ones(6), FREE)
     nothing = Parabola(np.eye(4), np.zeros((6, 6)))
     begin = perturb(np.eye(4), np.full(6, 0.3))
     assert most_probable_of(nothing, begin, prior) == pytest.approx(np.eye(4), abs=1e-6)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -292,35 +290,6 @@ def test_a_wrong_file_of_each_format_is_told_in_one_line(tmp_path: Path, name: s
     assert words in message
 
 
-def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mixpose", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
-    copied = texts.toml("cam_", names=True)
-    copied += copied.split("[metadata]")[0].replace("cam_", "cam_1").replace("view", "again")
-    (tmp_path / "calibration.toml").write_text(copied, encoding="utf-8")
-    (tmp_path / "marks.csv").write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
-    (tmp_path / "out").mkdir()
-    done = run("import", "calibration.toml", "marks.csv", "-o", "out/s.toml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout == ""
-    assert "view0 and again0 are the same camera at the same place" in done.stderr
-    assert "taken to be in mm, which the file does not say; if not, add --lengths" in done.stderr
-    assert "4 cameras (view0, view1, again0, again1), lengths in mm -> out/s.toml" in done.stderr
-    session = load_session(tmp_path / "out" / "s.toml")
-    assert session.body.name == "marks"
-    again = run("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "is there already" in again.stderr
-
-
 def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
     (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
     for folder, x in (("a", 5), ("b", 7)):
@@ -331,26 +300,6 @@ def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
     session = imported(paths, "mm", None, tmp_path / "s.toml")
     assert [one.body.name for one in session.objects] == ["marks_1", "marks_2"]
     assert [one.body.means[1, 0] for one in session.objects] == [5, 7]
-
-
-def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
-    """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
-    chain = texts.kalibr()
-    chain += chain[chain.index("cam1:") :].replace("cam1:", "cam2:")
-    (tmp_path / "chain.yaml").write_text(chain, encoding="utf-8")
-    output = tmp_path / "s.toml"
-    session = imported([tmp_path / "chain.yaml"], "m", None, output)
-    text = output.read_text(encoding="utf-8").replace('unit = "m"', 'unit = "mm"')
-    lines = text.replace("[0.06, 0.0, 0.0]", "[60, 0, 0]").replace("[0.0, 0.1, 0.0]", "[0, 90, 0]")
-    for setup in session.sensors:
-        source = f'# source = "{setup.name}/*.png"'
-        lines = lines.replace(source, f'source = "{setup.name}.csv"')
-        (tmp_path / f"{setup.name}.csv").write_text("frame,u,v\n0,9,9\n", encoding="utf-8")
-    output.write_text(lines, encoding="utf-8")
-    done = run("check", "s.toml", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "'cam0' and 'cam1' stand 0.32 mm apart" in done.stdout
-    assert "are translations in mm?" in done.stdout
 
 
 def test_every_real_calibration_file_is_read_or_refused_in_one_line(

@@ -129,8 +129,8 @@ def test_poses_of_which_some_have_overlapping_features_are_what_they_are_one_by_
     together = scene.slopes(several)
     for k in range(2):
         alone = scene.slopes(several[k : k + 1])
-        np.testing.assert_allclose(together.value[k], alone.value[0], rtol=1e-10)
-        np.testing.assert_allclose(together.gradient[k], alone.gradient[0], atol=1e-12)
+        for one, other in zip(together, alone, strict=True):
+            np.testing.assert_allclose(one[k], other[0], rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize("spacing", [2.0, 4.0, 60.0])

@@ -10,7 +10,8 @@ import pytest
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
-from mixpose.poses.evaluate import errors_to_truth, evaluate, normalised_error_squared
+from mixpose.poses.consistency import normalised_error_squared
+from mixpose.poses.evaluate import errors_to_truth, evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.poses.report import as_dict, as_table

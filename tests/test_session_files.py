@@ -21,6 +21,14 @@ from mixpose.session import load_session
         (b"a = " + b"[" * 100_000, ["nested too deeply"]),
         (b"a = " + b"1" * 5000, ["not TOML"]),
         (b"", ["unit: missing"]),
+        (b"\x89PNG\r\n\x1a\n\0\0", ["found an image; allowed: a text file in UTF-8"]),
+        (b"unit = mm\n", ["line 1", 'allowed: text in quotes, unit = "mm"']),
+        (b'unit: "mm"\n', ["line 1", 'allowed: an equals sign, unit = "mm"']),
+        ("unit = “mm”\n".encode(), ["line 1", 'allowed: straight quotes, "..."']),
+        (b"[[sensor]]\nfps = 29,97\n", ["line 2", "allowed: a decimal point, fps = 29.97"]),
+        (b'[[sensor]]\nsource = "C:\\data"\n', ["line 2", "allowed: paths with /"]),
+        (b"[sensor]\n[sensor]\n", ["line 2", "allowed for each of several: [[sensor]]"]),
+        (b"[object]\n[[object]]\n", ["line 2", "allowed for each of several: [[object]]"]),
     ],
 )
 def test_a_file_that_is_no_session(tmp_path: Path, content: bytes, words: list[str]) -> None:

@@ -25,6 +25,7 @@ from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
 from mixpose.scene import Member, Scene
+from mixpose.scene.joint import Joint
 from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, overlap
 from mixpose.search import SearchResult, search_frame
 from mixpose.sensors import PinholeCamera
@@ -131,6 +132,17 @@ def test_a_body_that_is_not_there_is_not_found_on_its_twin() -> None:
     scene = scene_of(one, one)
     outcomes = scene.advance(scene.begin(), 0, None, views_of(bodies, [at(20)], 2))
     assert [outcome.estimate.status for outcome in outcomes] == ["ok", "lost"]
+
+
+def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> None:
+    # three markers of four are where three of five are; without them nothing speaks for the small
+    small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
+    scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
+    joint = Joint(scene.members, scene.begin(), 0, None, views, scene.rules)
+    joint.solve()
+    keeps, hidden = joint.ranked[1][0].log_evidence, joint.ranked[0][:1]
+    assert joint.together(1, 0) == pytest.approx(keeps, abs=1e-6)
+    assert not hidden or hidden[0].log_evidence < 0.0
 
 
 def test_identical_bodies_found_from_nothing_are_numbered_along_x() -> None:

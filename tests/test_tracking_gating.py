@@ -63,24 +63,24 @@ def test_features_that_a_camera_does_not_see_have_no_part_in_its_window() -> Non
 
 @pytest.mark.parametrize(("count", "fewer"), [(7, True), (8, False), (9, False)])
 def test_fewer_detections_than_were_met_are_noticed(count: int, fewer: bool) -> None:
-    before = {"0": SensorTally(8, 8, 0.0, 0.0)}
+    before = {"0": SensorTally(8, 8)}
     views = [view_of("0", CAMERA, np.zeros((count, 2)))]
     assert have_fewer(views, before) is fewer
     assert have_fewer(views, {}) is False
 
 
 def test_a_sensor_that_misses_one_more_is_not_as_good() -> None:
-    before = {"0": SensorTally(7, 8, 1.0, 0.0)}
-    assert are_as_good({"0": SensorTally(7, 8, 1.0, 0.0)}, before)
-    assert not are_as_good({"0": SensorTally(6, 8, 2.0, 0.0)}, before)
-    assert are_as_good({"1": SensorTally(0, 8, 8.0, 0.0)}, before)
+    before = {"0": SensorTally(7, 8)}
+    assert are_as_good({"0": SensorTally(7, 8)}, before)
+    assert not are_as_good({"0": SensorTally(6, 8)}, before)
+    assert are_as_good({"1": SensorTally(0, 8)}, before)
 
 
 def test_a_covered_camera_does_not_count_where_two_others_agree() -> None:
     tallies = {
-        "0": SensorTally(8, 8, 0.0, 0.0),
-        "1": SensorTally(7, 8, 1.0, 0.0),
-        "2": SensorTally(1, 8, 7.0, 0.0),
+        "0": SensorTally(8, 8),
+        "1": SensorTally(7, 8),
+        "2": SensorTally(1, 8),
     }
     assert is_convincing(tallies, ["0", "1", "2"], 0.75)
     # of 16 features 9 are met

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from detections import EIGHT, TRUTH, detect, random_start, view_of
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
@@ -23,7 +24,9 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
+from mixpose.tracking.proposers.merged_pair import merged_pair
 
 Floats = NDArray[np.float64]
 
@@ -143,7 +146,8 @@ SIX = np.array(
 WAND = Body("wand", tuple(PointFeature(point) for point in SIX))
 
 
-def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:
+def two_in_one() -> tuple[PinholeCamera, Floats, Floats]:
+    """A camera, a pose, and six places: those of two features 4 px apart are their middle."""
     camera = PinholeCamera(
         np.array([[700.0, 0, 320], [0, 700, 240], [0, 0, 1]]), np.zeros(4), (640, 480)
     )
@@ -153,7 +157,34 @@ def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:
     turned = (apart * R).as_matrix()
     T = from_parts(turned, np.array([0.0, 0.0, 460.0]) - turned @ SIX[1])
     y = camera.project(transform(T, SIX))[0]
-    merged = np.vstack([np.delete(y, [1, 2], axis=0), y[1:3].mean(axis=0)])
+    y[1:3] = y[1:3].mean(axis=0)
+    return camera, T, y
+
+
+def test_a_detection_taken_for_one_of_two_features_may_be_both_of_them() -> None:
+    camera, T, y = two_in_one()
+    views = [view_of("camera", camera, np.delete(y, 2, axis=0))]
+    # as narrow blurs may have it: the first of the two is met exactly
+    weights = np.array([1.0, 10.0, 0.0, 1.0, 1.0, 1.0])[:, None]
+
+    def away(twist: Floats) -> Floats:
+        there = camera.project(transform(perturb(T, twist), SIX))[0]
+        return np.asarray((weights * (there - y)).ravel())
+
+    bent = perturb(T, least_squares(away, np.zeros(6), x_scale=np.repeat([100.0, 1.0], 3)).x)
+    tracker = Tracker.create(WAND, EstimatorOptions(), bent)
+    data = tracker.data(tracker.begin(), 1, None, views)
+    likelihood, here = likelihood_of(data), Start(bent)
+    judged = likelihood.judge(likelihood.fit(here), here)
+    assert judged.associations[0].shares[2] == 0.0
+    rivals = [start.T_world_object for start in merged_pair(data, likelihood, judged)]
+    assert min(float(rotation_angle_deg(rival, T)) for rival in rivals) < 0.02
+    assert rotation_angle_deg(bent, T) > 0.1
+
+
+def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:
+    camera, T, y = two_in_one()
+    merged = np.delete(y, 2, axis=0)
     views = [view_of("camera", camera, merged)]
     start = perturb(T, np.array([1.0, -1.0, 2.0, 0.01, -0.01, 0.01]))
     tracker = Tracker.create(WAND, EstimatorOptions(), start)

@@ -30,10 +30,11 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers.multistart import starts_around
-from mixpose.tracking.proposers.predicted import is_doubtful, predicted, stepped_aside
+from mixpose.tracking.proposers.predicted import is_doubtful, predicted
 from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.stepped_aside import ASIDE, stepped_aside
 from mixpose.tracking.proposers.without_sensor import disagreeing
-from mixpose.tracking.track import Branch, SensorTally
+from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
 
@@ -79,20 +80,50 @@ def test_every_place_where_the_body_may_be_is_a_start() -> None:
     np.testing.assert_allclose(starts[1].T_world_object, ELSEWHERE)
 
 
-def test_a_grid_that_may_have_slipped_is_tried_a_step_aside_along_its_own_axes() -> None:
-    places = [(20.0 * i, 20.0 * j, 0.0) for i in range(7) for j in range(5)]
-    grid = Body("grid", tuple(PointFeature(np.array(place)) for place in places))
-    tracker = Tracker.create(grid, EstimatorOptions(), TRUTH)
-    before = {"0": SensorTally(8, 8, 0.0, 0.0)}
-    data = data_of(tracker, [], replace(tracker.begin(), tallies=before))
-    slipped = TRUTH.copy()
-    slipped[:3, 3] += 20.0 * TRUTH[:3, 0]
-    ranked = [judged_at(slipped, association("0", 6.0, surplus=2.0))]
-    starts = [start.T_world_object for start in stepped_aside(data, ranked)]
+def grid(columns: int, rows: int) -> Body:
+    """Corners of a board of squares 20 wide."""
+    places = [(20.0 * i, 20.0 * j, 0.0) for j in range(rows) for i in range(columns)]
+    return Body("grid", tuple(PointFeature(np.array(place)) for place in places))
+
+
+def shifted(T: Floats, step: Floats) -> Floats:
+    T_object_aside = np.eye(4)
+    T_object_aside[:3, 3] = step
+    return np.asarray(T @ T_object_aside)
+
+
+def judged_here(data: FrameData, T: Floats) -> Judged:
+    likelihood, start = likelihood_of(data), Start(T)
+    return likelihood.judge(likelihood.fit(start), start)
+
+
+def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    board = grid(7, 5)
+    tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
+    data = data_of(tracker, detect(pinhole_cameras, board, TRUTH))
+    slipped = judged_here(data, shifted(TRUTH, np.array([20.0, 0.0, 0.0])))
+    starts = [start.T_world_object for start in stepped_aside(data, [slipped])]
     assert min(np.abs(T - TRUTH).max() for T in starts) < 1e-9
-    # misses alone are hidden features, detections beside the body alone are clutter
-    for one in (association("0", 6.0), association("0", 8.0, surplus=2.0)):
-        assert not list(stepped_aside(data, [judged_at(slipped, one)]))
+    # 30 of 35 at the most are met a step aside of the truth
+    assert not list(stepped_aside(data, [judged_here(data, TRUTH)]))
+
+
+def test_a_board_with_a_row_more_than_there_is_stays_ambiguous_however_it_moves(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    said = Tracker.create(grid(7, 5), EstimatorOptions())
+    track, real = said.begin(), grid(7, 4)
+    for frame in range(3):
+        T = perturb(TRUTH, frame * np.array([8.0, 3.0, -5.0, 0.2, 0.5, 0.3]))
+        views = detect(pinhole_cameras, real, T, noise=0.1, seed=frame)
+        track, estimate = said.advance(track, frame, None, views)
+        assert estimate.status == "ambiguous"
+        assert estimate.doubt == ASIDE
+        weights = sorted((one.weight for one in estimate.hypotheses), reverse=True)
+        # a shift of a row: motion says nothing about which it is
+        assert weights[1] > 0.4
 
 
 @pytest.mark.parametrize("live", [False, True])

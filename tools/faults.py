@@ -22,10 +22,11 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
+from mixpose.checking import shared_source_warnings
 from mixpose.cli.notices import Summary
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, Floats
-from mixpose.rigid import from_rotation_vector, rotation_angle_deg
+from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.session import load_session
@@ -178,6 +179,21 @@ class Fault:
     has_truth: bool = True
 
 
+def inverted(*sides: str) -> Change:
+    """Cameras of which the session gives their own poses in the world."""
+
+    def change(folder: Path) -> None:
+        for setup in load_session(folder / "session.toml").sensors:
+            if setup.name not in sides:
+                continue
+            T = inverse(setup.sensor.T_sensor_world)  # type: ignore[attr-defined]
+            rows = ", ".join(str(row) for row in T.tolist())
+            old = rf'(name = "{setup.name}"\n(?:.*\n)*?)rotation_vector = .*\ntranslation = .*\n'
+            rewritten((old, rf"\g<1>T_sensor_world = [{rows}]\n"))(folder)
+
+    return change
+
+
 FAULTS: dict[str, Fault] = {
     "nothing": Fault(lambda folder: None),
     "frames missing": Fault(missing("right", range(10, 16)), "'right' .*no frame.* 10 to 15"),
@@ -243,6 +259,19 @@ FAULTS: dict[str, Fault] = {
         "unit",
         False,
     ),
+    "T_sensor_world inverted": Fault(
+        both(NO_START, inverted("left", "right")), "T_sensor_world.*inverted", has_truth=False
+    ),
+    "T_sensor_world of one inverted": Fault(
+        both(NO_START, inverted("right")), "T_sensor_world of 'right' is inverted"
+    ),
+    "body 5 % too large": Fault(
+        points(lambda m: 1.05 * m), "0.952 times as large", has_truth=False
+    ),
+    "body 1 % too small": Fault(points(lambda m: 0.99 * m), "1.01 times as large"),
+    "one camera's files given for both": Fault(
+        rewritten((r'source = "right\*.png"', 'source = "left*.png"')), "same recording"
+    ),
     "marker gone": Fault(points(gone), "marker 8 .*gone"),
     "marker falls off": Fault(lambda folder: fallen(folder, 4, range(20, 40)), "marker 5 .*gone"),
     "marker measured 20 mm wrong": Fault(moved(3, (12.0, 0.0, 16.0)), "marker 4 .*measured wrong"),
@@ -297,7 +326,7 @@ def outcome(fault: Fault, folder: Path, stop: int | None = None) -> Result:
             counts[estimate.status] += 1
         else:
             counts["right" if fault.has_truth and is_right(estimate, truth) else "wrong"] += 1
-    said = summary.warnings()
+    said = [*shared_source_warnings(session, {}), *summary.warnings()]
     is_named = any(re.search(fault.named, line) for line in said) if fault.named else not said
     return Result(**counts, said=said, is_named=is_named)
 

@@ -2,8 +2,9 @@
 
     python tools/guided.py KIND [--seconds 60]
 
-A kind is one of `fuzz.py`; its file is what is changed, and read in this process, without any pose
-being estimated.  Whatever is no `MixposeError` of one line ends the fuzzer, which keeps the input.
+A kind is one of `fuzzed/recordings.py`; its file is what is changed, and read in this process,
+without any pose being estimated.  Whatever is no `MixposeError` of one line ends the fuzzer, which
+keeps the input.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ with atheris.instrument_imports(include=["mixpose"]):
     from mixpose.runner import open_sources
     from mixpose.session import load_session
 
-from fuzz import KINDS
+from fuzzed.recordings import KINDS
 
 LARGEST = 4096  # bytes of an input
 FRAMES = 3  # of a recording that are read

@@ -3,9 +3,10 @@
 python tools/real_errors.py [CASE ...] [--seeds 5] [--workers 2] [--json FILE]
 
 Recordings are made by `mixpose simulate`; then an arm is painted over their images, or the session
-is changed so that it no longer tells the truth.  Beside the errors of mixpose stand those of robust
-least squares (`scipy.optimize.least_squares`, soft_l1) on the same detections, told which detection
-is whose by the true pose, and whether the covariance holds.
+is changed so that it no longer tells the truth (`tools/rigs/`).  Beside the errors of mixpose stand
+those of robust least squares (`scipy.optimize.least_squares`, soft_l1) on the same detections, told
+which detection is whose by the true pose, or those of the same recording without the fault; then
+whether the covariance holds, and how many poses of the same scene without its body are ok.
 """
 
 from __future__ import annotations
@@ -14,71 +15,41 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import cv2
 import numpy as np
-from benchmarks.recordings import MARKERS
-from benchmarks.search_cases import looking_at
 from numpy.typing import NDArray
+from rigs.cases import CASES, Case
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 import mixpose
-from mixpose.frames import read_image
 from mixpose.objective import View
-from mixpose.poses.evaluate import normalised_error_squared
+from mixpose.poses.consistency import normalised_error_squared
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
 from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
-from mixpose.simulation import SimulationOptions, simulate
+from mixpose.simulation import simulate
 
 Floats: TypeAlias = NDArray[np.float64]
-Change: TypeAlias = Callable[[Path, int], None]
 
 INSIDE_95 = 12.592  # χ² of six
 WRONG = 20.0  # standard deviations of a dimension, and
 WRONG_DEG, WRONG_MM = 3.0, 15.0  # from which a pose called ok is a wrong one
 KNOWN_PX, SCALE_PX = 8.0, 0.05  # how far a detection may be off, and what is much for the oracle
-EYES = ([0.0, -1.0, 0.0], [1.0, 0.0, 0.0])
-BOARD = [[25.0 * i, 25.0 * j, 0.0] for i in range(6) for j in range(5)]
-SPOTS = SimulationOptions(40, noise=1.0, spot_sigma=4.0, period_s=3.0)
-TABLE = SimulationOptions(40, pixel_noise=0.05, clutter=2, hidden=0.1)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A body before cameras, and what is wrong.
-
-    Attributes
-    ----------
-    options : SimulationOptions
-    cameras : int
-    distance : float
-    points : list
-    images : bool
-        Whether frames are images, not tables of detections.
-    change : callable or None
-        What is done to a finished recording.
-    focal : float
-    """
-
-    options: SimulationOptions
-    cameras: int = 2
-    distance: float = 1000.0
-    points: tuple[tuple[float, ...], ...] = tuple(map(tuple, MARKERS))
-    images: bool = True
-    change: Change | None = None
-    focal: float = 900.0
+WITHOUT = 12  # frames of the scene without its body
 
 
 @dataclass(frozen=True)
 class Figures:
-    """RMS errors in degrees and length units of mixpose and of the oracle, and the covariance."""
+    """RMS errors in degrees and length units of mixpose and of the oracle, and the covariance.
+
+    `wrong` poses are ok and far off, or of a body that is away; `absent` ones are ok in a scene
+    that never had one.
+    """
 
     rotation_deg: float
     position: float
@@ -88,127 +59,57 @@ class Figures:
     inside: float
     ok: float
     wrong: int
-
-
-def arm(folder: Path, seed: int) -> None:
-    """Paint a dark arm over all images, which sweeps across them."""
-    rng = np.random.default_rng([seed, 7])
-    for camera in range(2):
-        angle, speed = rng.uniform(0, np.pi), rng.uniform(5, 9)
-        along = np.array([np.cos(angle), np.sin(angle)])
-        across = np.array([-along[1], along[0]])
-        for k, path in enumerate(sorted(folder.glob(f"c{camera}_*.png"))):
-            image = read_image(path)
-            middle = np.array([319.5, 255.5]) + across * (speed * (k - 20))
-            mask = np.zeros_like(image)
-            ends = [tuple(np.round(16 * (middle + s * 900 * along)).astype(int)) for s in (-1, 1)]
-            cv2.line(mask, ends[0], ends[1], 255, 24, cv2.LINE_AA, 4)
-            share = cv2.GaussianBlur(mask, (0, 0), 1.0).astype(np.float64) / 255
-            dark = 10 + rng.normal(0, 1, image.shape)
-            cv2.imwrite(str(path), np.clip(image + share * (dark - image) + 0.5, 0, 255))
-
-
-def turned(folder: Path, seed: int) -> None:
-    """Turn the last camera by 0.1° after its calibration, about any axis."""
-    axis = np.random.default_rng([seed, 9]).normal(size=3)
-    turn = Rotation.from_rotvec(0.1 * axis / np.linalg.norm(axis), degrees=True).as_matrix()
-    _changed(folder, lambda T: np.vstack([turn @ T[:3], T[3]]))
-
-
-def _changed(folder: Path, change: Callable[[Floats], Floats]) -> None:
-    lines = (folder / "session.toml").read_text(encoding="utf-8").splitlines()
-    k = max(k for k, line in enumerate(lines) if line.startswith("T_sensor_world"))
-    T = np.array(json.loads(lines[k].split("=")[1]))
-    lines[k] = f"T_sensor_world = {change(T).tolist()}"
-    (folder / "session.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def bad_lens(folder: Path, seed: int) -> None:
-    """Tell the session another principal point, focal length and distortion than there were."""
-    path = folder / "session.toml"
-    text = path.read_text(encoding="utf-8")
-    text = text.replace(
-        "[[900.0, 0, 319.5], [0, 900.0, 255.5]", "[[900.4, 0, 319.9], [0, 900.2, 255.2]"
-    )
-    path.write_text(text.replace("distortion = [0.0,", "distortion = [0.002,"), encoding="utf-8")
-
-
-def bad_body(folder: Path, seed: int) -> None:
-    """Tell the session markers that are off by 0.1 mm."""
-    path = folder / "session.toml"
-    off = np.array(MARKERS) + np.random.default_rng([seed, 8]).normal(0, 0.1, (len(MARKERS), 3))
-    text = path.read_text(encoding="utf-8").replace(
-        f"points = {MARKERS}", f"points = {off.tolist()}"
-    )
-    path.write_text(text, encoding="utf-8")
-
-
-_flat = tuple(map(tuple, BOARD))
-CASES = {
-    "ideal": Case(replace(SPOTS, spot_sigma=1.6)),
-    "one camera": Case(replace(SPOTS, spot_sigma=1.6), cameras=1),
-    "large spots that merge": Case(replace(SPOTS, spot_sigma=6.0, amplitude_rotation_deg=60)),
-    "far spots that merge": Case(replace(SPOTS, spot_sigma=2.0), distance=5000.0),
-    "cut by the edge": Case(replace(SPOTS, amplitude_translation=230.0, period_s=2.0)),
-    "arm in front": Case(SPOTS, change=arm),
-    "turned camera": Case(TABLE, images=False, change=turned),
-    "bad lens": Case(TABLE, images=False, change=bad_lens),
-    "bad lens, one camera": Case(TABLE, images=False, cameras=1, points=_flat, change=bad_lens),
-    "bad lens, board": Case(TABLE, images=False, points=_flat, change=bad_lens),
-    "bad body": Case(TABLE, images=False, change=bad_body),
-}
+    absent: int = 0
 
 
 def figures_of(name: str, seed: int) -> Figures:
     """Make a recording with a seed, estimate it, and compare."""
     case = CASES[name]
     with tempfile.TemporaryDirectory() as scratch:
-        draft, folder = Path(scratch) / "draft.toml", Path(scratch) / "made"
-        draft.write_text(_session_text(case), encoding="utf-8")
-        simulate(mixpose.load_session(draft), folder, replace(case.options, seed=seed))
-        if case.change:
-            case.change(folder, seed)
-        return _compared(folder)
+        found = _compared(_recorded(case, seed, Path(scratch) / "own"), case)
+        if case.against is not None:
+            plain = CASES[case.against]
+            other = _compared(_recorded(plain, seed, Path(scratch) / "plain"), plain)
+            found = replace(found, oracle_deg=other.rotation_deg, oracle_position=other.position)
+        options = replace(case.options, frames=WITHOUT, away_from=0)
+        empty = _recorded(replace(case, options=options), seed, Path(scratch) / "empty")
+        session = mixpose.load_session(empty / "session.toml")
+        return replace(found, absent=sum(one.status == "ok" for one in mixpose.run(session)))
 
 
-def _session_text(case: Case) -> str:
-    turn = Rotation.from_euler("xyz", [0.2, -0.3, 0.4]).as_rotvec().tolist()
-    lines = [
-        'unit = "mm"', "[object]", 'name = "body"', f"points = {[list(p) for p in case.points]}",
-        "[start]", f"rotation_vector = {turn}", "translation = [0, 0, 0]",
-        "rotation_deg = 10", "distance = 20",
-    ]  # fmt: skip
-    for k, eye in enumerate(EYES[: case.cameras]):
-        T = looking_at(case.distance * np.array(eye), np.zeros(3))
-        f = case.focal
-        lines += [
-            "[[sensor]]", f'name = "c{k}"', 'model = "pinhole"',
-            f'source = "{f"c{k}_*.png" if case.images else f"c{k}.csv"}"',
-            "fps = 25.0", "resolution = [640, 512]",
-            f"camera_matrix = [[{f}, 0, 319.5], [0, {f}, 255.5], [0, 0, 1]]",
-            "distortion = [0.0, 0.0, 0.0, 0.0]", f"T_sensor_world = {T.tolist()}",
-        ]  # fmt: skip
-    return "\n".join(lines) + "\n"
+def _recorded(case: Case, seed: int, folder: Path) -> Path:
+    folder.mkdir()
+    draft, made = folder / "draft.toml", folder / "made"
+    draft.write_text(case.session(), encoding="utf-8")
+    simulate(mixpose.load_session(draft), made, replace(case.options, seed=seed))
+    if case.change:
+        case.change(made, seed)
+    return made
 
 
-def _compared(folder: Path) -> Figures:
+def _compared(folder: Path, case: Case) -> Figures:
     session = mixpose.load_session(folder / "session.toml")
     truth = {one.frame: one.T_world_object for one in read_poses(folder / "truth.jsonl").poses}
+    # the oracle does not know of moments and sizes
+    oracle = case.against is None and session.body.shape == "point"
     rows: list[tuple[float, ...]] = []
-    count = 0
+    count = phantoms = 0
 
     def watch(frames: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        nonlocal count
-        count += 1
-        T_true = truth[estimate.frame]
-        assert T_true is not None
-        if estimate.status != "ok" or estimate.T_world_object is None:
+        nonlocal count, phantoms
+        T_true, T = truth.get(estimate.frame), estimate.T_world_object
+        count += T_true is not None
+        if estimate.status != "ok" or T is None:
             return
-        T = estimate.T_world_object
+        if T_true is None:
+            phantoms += 1
+            return
         assert estimate.covariance is not None
         total, dimensions = normalised_error_squared(twist_between(T_true, T), estimate.covariance)
-        known = robust_least_squares(views, session.body.means, T_true)
-        rows.append((*_errors(T, T_true), *_errors(known, T_true), total or np.inf, dimensions))
+        known = (np.nan, np.nan)
+        if oracle:
+            known = _errors(robust_least_squares(views, session.body.means, T_true), T_true)
+        rows.append((*_errors(T, T_true), *known, total or np.inf, dimensions))
 
     for _ in mixpose.run(session, watch=watch):
         pass
@@ -221,9 +122,9 @@ def _compared(folder: Path) -> Figures:
         oracle_deg=float(rms[2]),
         oracle_position=float(rms[3]),
         squared=float((found[:, 4] / found[:, 5]).mean()),
-        inside=float((found[:, 4] < INSIDE_95).mean()),
+        inside=float((found[:, 4] <= INSIDE_95).mean()),
         ok=len(found) / count,
-        wrong=int((off & (found[:, 4] > WRONG**2)).sum()),
+        wrong=int((off & (found[:, 4] > WRONG**2)).sum()) + phantoms,
     )
 
 
@@ -267,7 +168,8 @@ def line_of(name: str, found: Sequence[Figures]) -> str:
     squared, inside = column["squared"], column["inside"]
     cells.append(f"{np.median(squared):.2f} ({squared.min():.2f}-{squared.max():.2f})")
     cells.append(f"{np.median(inside):.0%} ({inside.min():.0%})")
-    cells.append(f"{column['ok'].mean():.0%}, {int(column['wrong'].sum())}")
+    counts = [int(column[key].sum()) for key in ("wrong", "absent")]
+    cells.append(f"{column['ok'].mean():.0%}, {counts[0]}, {counts[1]}")
     return f"| {name} | " + " | ".join(cells) + " |"
 
 
@@ -282,7 +184,7 @@ def main() -> int:
     if unknown:
         parser.error(f"no such case: {sorted(unknown)[0]!r}; allowed: {', '.join(CASES)}")
     titles = ("recording", "deg", "mm", "oracle, deg", "mm", "ratio (worst)", "squared error")
-    print("| " + " | ".join((*titles, "inside 95 %", "ok, wrong")) + " |")
+    print("| " + " | ".join((*titles, "inside 95 %", "ok, wrong, without")) + " |")
     print("| --- " * (len(titles) + 2) + "|")
     stored: dict[str, Any] = {}
     with ProcessPoolExecutor(options.workers) as pool:

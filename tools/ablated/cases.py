@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import Judged
 from mixpose.objective import View
-from mixpose.poses.evaluate import normalised_error_squared
+from mixpose.poses.consistency import normalised_error_squared
 from mixpose.records import Estimate
 from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate

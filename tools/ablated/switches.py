@@ -12,8 +12,8 @@ from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
-from mixpose.tracking.proposers.predicted import stepped_aside
 from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 FREE = 0.0

@@ -227,15 +227,15 @@ _MET = (
     Mutant(
         "density-crowd-of-the-whole-image",
         "density/features_met.py",
-        "return count, max(overall, found / _area(2 * half, smallest))",
-        "return count, overall",
+        "np.maximum(overall, inside / sides.prod(axis=1))",
+        "np.full(len(sides), overall)",
         "a crowd of false detections around the body counts as rare",
     ),
     Mutant(
         "density-crowd-constant",
         "density/features_met.py",
-        "return count, max(overall, found / _area(2 * half, smallest))",
-        "return count, 1e-6",
+        "np.maximum(overall, inside / sides.prod(axis=1))",
+        "np.full(len(sides), 1e-6)",
         "clutter does not make a pose less sure",
     ),
     Mutant(
@@ -248,8 +248,8 @@ _MET = (
     Mutant(
         "density-surplus-with-those-met",
         "density/features_met.py",
-        "half) - met, 0.0)",
-        "half), 0.0)",
+        " - met, 0.0)",
+        ", 0.0)",
         "every frame with a missed feature looks like a slip",
     ),
 )

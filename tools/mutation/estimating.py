@@ -38,8 +38,8 @@ _NEAR = (
     Mutant(
         "fit-prior-around-the-answer",
         "fit/near.py",
-        "Prior(T_start, uncertainty, free)",
-        "Prior(T, uncertainty, free)",
+        "NormalPrior(T_start, uncertainty, free)",
+        "NormalPrior(T, uncertainty, free)",
         "what is known of the start does not count",
     ),
 )
@@ -83,16 +83,16 @@ _PROBABLE = (
     Mutant(
         "fit-start-ignored",
         "fit/prior.py",
-        "return np.where(self.free, 1 / np.where(self.free, self.uncertainty, 1.0) ** 2, 0.0)",
-        "return np.zeros(6)",
+        "np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)",
+        "np.zeros(6)",
         "what is known of the start does not count",
         (_PRIOR,),
     ),
     Mutant(
         "fit-start-repels",
         "fit/prior.py",
-        "one.gradient - information * away",
-        "one.gradient + information * away",
+        "gradient - information * away",
+        "gradient + information * away",
         "the gradient of the prior has the wrong sign",
         (_PRIOR,),
     ),

@@ -222,14 +222,14 @@ _EVALUATION = (
     ),
     Mutant(
         "poses-error-per-six-dimensions",
-        "poses/evaluate.py",
+        "poses/consistency.py",
         "np.mean(nees / dimensions)",
         "np.mean(nees / 6)",
         "covariances of held directions look too careful",
     ),
     Mutant(
         "poses-ellipsoid-of-five-per-cent",
-        "poses/evaluate.py",
+        "poses/consistency.py",
         "chdtri(dimensions, 1.0 - CONFIDENCE)",
         "chdtri(dimensions, CONFIDENCE)",
         "right covariances look far too small",
@@ -237,13 +237,13 @@ _EVALUATION = (
     Mutant(
         "poses-ambiguous-covariances-count",
         "poses/evaluate.py",
-        "nees=_consistency(trusted)",
-        "nees=_consistency(with_pose)",
+        "for e in trusted if e.nees is not None",
+        "for e in with_pose if e.nees is not None",
         "covariances are judged by frames that say themselves that they may be wrong",
     ),
     Mutant(
         "poses-held-directions-count",
-        "poses/evaluate.py",
+        "poses/consistency.py",
         "free = np.flatnonzero(variance > 1e-12 * kind)",
         "free = np.flatnonzero(variance >= 0 * kind)",
         "a direction without variance makes the squared error infinite",

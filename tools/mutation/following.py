@@ -222,7 +222,7 @@ _RANGE_POSTERIOR = (
         "tracking-ranges-any-clutter",
         "tracking/association_likelihood.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
-        "false = np.full(len(poses), 1 - probability)",
+        "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
         (_RANGES,),
     ),
@@ -240,14 +240,6 @@ _RANGE_POSTERIOR = (
         "return max(1.0, float(np.sqrt(stated.variance)))",
         "return 1.0",
         "ranges that err by more than said are believed",
-        (_RANGES,),
-    ),
-    Mutant(
-        "tracking-ranges-prediction-pushes",
-        "tracking/range_posterior.py",
-        "value - 0.5 * away @ P @ away, gradient - P @ away",
-        "value - 0.5 * away @ P @ away, gradient + P @ away",
-        "the prediction pushes the pose away",
         (_RANGES,),
     ),
     Mutant(
@@ -280,9 +272,9 @@ _TRACKER = (
     Mutant(
         "tracking-sensors-left-out-are-tallied",
         "tracking/tracker.py",
-        "one.surplus\n        )\n        for one in judged.associations\n"
+        "len(one.features))\n        for one in judged.associations\n"
         "        if judged.sensors[one.name].used",
-        "one.surplus\n        )\n        for one in judged.associations\n"
+        "len(one.features))\n        for one in judged.associations\n"
         "        if judged.sensors[one.name].used or True",
         "the next frame is looked at as a whole although all is well",
         (_STARTS,),

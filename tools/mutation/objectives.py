@@ -32,8 +32,8 @@ _KERNEL = (
     Mutant(
         "objective-overlap-pushes-instead-of-pulling",
         "objective/kernel.py",
-        "rest - amplitude[..., None] * half",
-        "rest + amplitude[..., None] * half",
+        "gradient[near] -= ",
+        "gradient[near] += ",
         "the gradient is wrong where features overlap",
     ),
     Mutant(
@@ -53,8 +53,8 @@ _KERNEL = (
     Mutant(
         "objective-curvature-with-the-amplitude",
         "objective/kernel.py",
-        "(level * (gram - outer))",
-        "(level * gram)",
+        "(gram - outer)",
+        "gram",
         "steps are too short where features overlap",
     ),
     Mutant(

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from mixpose.calibration.checking import displacements
+from mixpose.calibration.checking import Displacement, displacements
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block, centre_of
 from mixpose.calibration.rules import CalibrationRules
@@ -14,6 +14,7 @@ from mixpose.records import Floats
 from mixpose.rigid import rotation_angle_deg
 
 _WORST = 3
+_ROUNDING = 1e-9  # of a degree or a length unit
 _CELLS = 4  # by which an image is divided along each side to tell its coverage
 
 
@@ -215,8 +216,7 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     for index, one in enumerate(told):
         of = "px" if found.after.sensors[index].unit == "px" else unit
         lines.append(
-            f"{one.name:<20}turned by {one.turn_deg:.3g} ± {one.turn_deviation_deg:.2g} deg, moved "
-            f"by {one.shift:.3g} ± {one.shift_deviation:.2g} {unit}; residual "
+            f"{one.name:<20}{_displaced(one, unit)}; residual "
             f"{one.residual_before:.3g} {of}, calibrated anew {one.residual_after:.3g} {of}"
             + ("  MOVED" if one.moved and len(told) > 2 else "")
         )
@@ -228,3 +228,13 @@ def check_lines(found: Calibration, unit: str) -> list[str]:
     else:
         lines.append(f"the calibration no longer holds: {', '.join(bumped)} moved")
     return lines
+
+
+def _displaced(one: Displacement, unit: str) -> str:
+    """By how much a sensor is off; the one that is held is off by rounding errors only."""
+    if one.turn_deg < _ROUNDING and one.shift < _ROUNDING * max(one.shift_deviation, 1.0):
+        return "held, the others are told against it"
+    return (
+        f"turned by {one.turn_deg:.3g} ± {one.turn_deviation_deg:.2g} deg, moved by "
+        f"{one.shift:.3g} ± {one.shift_deviation:.2g} {unit}"
+    )

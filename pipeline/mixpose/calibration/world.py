@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
@@ -57,6 +58,29 @@ def _scaled(sensor: Any, factor: float) -> Any:
     return replace(sensor, position=sensor.position * factor)
 
 
+def check_world(rig: Rig, words: str, numbers: Collection[int]) -> None:
+    """See, before anything is searched, that there is such a frame.
+
+    Parameters
+    ----------
+    rig : Rig
+    words : str
+        A sensor, or ``body@FRAME``.
+    numbers : collection of int
+        Frames of the recording.
+
+    Raises
+    ------
+    SessionError
+        If there is none.
+    """
+    body, at, number = words.partition("@")
+    if at and body == "body" and number.isdecimal() and int(number) in numbers:
+        return
+    if words not in _placed(rig):
+        raise _no_such_frame(words, rig, numbers)
+
+
 def in_world(found: Calibration, words: str) -> Calibration:
     """The calibration in another frame: that of a sensor, or of the body in a frame.
 
@@ -86,10 +110,17 @@ def _frame(found: Calibration, words: str) -> Floats:
         sensor: Any = found.after.sensors[found.after.names.index(words)]
         if hasattr(sensor, "T_sensor_world"):
             return np.asarray(sensor.T_sensor_world)
-    frames = ", ".join(f"body@{n}" for n in list(found.poses)[:3])
-    cameras = [
-        n for n, s in zip(found.after.names, found.after.sensors) if hasattr(s, "T_sensor_world")
-    ]
-    raise SessionError(
-        f"--world {words}: allowed: {', '.join(cameras)}, or the body in a frame: {frames}, ..."
+    raise _no_such_frame(words, found.after, found.poses)
+
+
+def _placed(rig: Rig) -> list[str]:
+    """Sensors that have a frame of their own."""
+    return [n for n, s in zip(rig.names, rig.sensors) if hasattr(s, "T_sensor_world")]
+
+
+def _no_such_frame(words: str, rig: Rig, numbers: Collection[int]) -> SessionError:
+    frames = ", ".join(f"body@{n}" for n in sorted(numbers)[:3])
+    return SessionError(
+        f"--world {words}: allowed: {', '.join(_placed(rig))}, or the body in a frame, whatever "
+        f"it is called: {frames}, ..."
     )

@@ -3,28 +3,34 @@
 `recordings` reads every frame and counts features, `advice` says which key to change where the
 count is off and the body is found with that change, `sensor_keys` doubts calibrations and widths,
 `placement` looks at where sensors stand and the body starts, `lookalikes` finds poses that the
-sensors could not tell apart, `shared_parts`
-bodies that could be taken for each other, `typical` poses where the session names no start.
+sensors could not tell apart, `shared_parts` bodies that could be taken for each other,
+`shared_sources` recordings that are given twice, `trials` tries what else the session could have
+said, `geometry` does so with a few frames that it does not explain, `typical` has poses where the
+session names no start.
 """
 
 from __future__ import annotations
 
-from mixpose.checking.advice import advice, judge
+from mixpose.checking.advice import advice, judge, told_apart
+from mixpose.checking.geometry import CAUSES, geometry_warnings
 from mixpose.checking.lookalikes import LookAlike, look_alikes, noise_of
 from mixpose.checking.placement import expected_count, placement_lines, placement_warnings
 from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
 from mixpose.checking.sensor_keys import key_warnings
 from mixpose.checking.shared_parts import shared_part_warnings
+from mixpose.checking.shared_sources import shared_source_warnings
 from mixpose.checking.trials import explanation
 from mixpose.checking.typical import depends_on_distance, typical_poses, with_image_sizes
 
 __all__ = [
+    "CAUSES",
     "LookAlike",
     "Survey",
     "advice",
     "depends_on_distance",
     "expected_count",
     "explanation",
+    "geometry_warnings",
     "image_of",
     "judge",
     "key_warnings",
@@ -34,7 +40,9 @@ __all__ = [
     "placement_lines",
     "placement_warnings",
     "shared_part_warnings",
+    "shared_source_warnings",
     "survey",
+    "told_apart",
     "typical_poses",
     "with_image_sizes",
 ]

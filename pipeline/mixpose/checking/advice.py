@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -18,6 +19,8 @@ from mixpose.runner import begin, observe
 from mixpose.session import SensorSetup, Session
 
 _FEW = 0.6  # of the expected features: fewer are too few
+_SHARED, _OWN = "in [extract]", "in its own [sensor.extract]"
+_ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
 _MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
 
 
@@ -68,7 +71,7 @@ def advice(
     if chosen is not None:
         value = chosen.value
         written = f'"{value}"' if isinstance(value, str) else f"{value:g}"
-        return f"with {chosen.key} = {written} in [extract] it would be {chosen.found}"
+        return f"with {chosen.key} = {written} {_SHARED} it would be {chosen.found}"
     if before > expected:
         return (
             "none of the values tried leaves what can be the body; clutter is allowed for, and "
@@ -77,6 +80,20 @@ def advice(
     keys = {"corners": "threshold", "log": "polarity, threshold and spot_sigma"}
     usual = "polarity, threshold, min_area and max_area"
     return f"change {keys.get(options.method, usual)} in [extract]"
+
+
+def told_apart(warnings: Sequence[str]) -> list[str]:
+    """Warnings about sensors, where two that want unlike values of a key each get their own."""
+    values: dict[str, set[str]] = {}
+    for warning in warnings:
+        if advised := _ADVISED.search(warning):
+            values.setdefault(advised[1], set()).add(advised[2])
+    return [
+        warning.replace(_SHARED, _OWN)
+        if (advised := _ADVISED.search(warning)) and len(values[advised[1]]) > 1
+        else warning
+        for warning in warnings
+    ]
 
 
 class _Trial(NamedTuple):

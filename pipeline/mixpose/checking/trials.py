@@ -1,4 +1,4 @@
-"""What a session would have to say for its frames to be explained: swapped, mirrored, other units.
+"""What a session would have to say for its frames to be explained: inverted, swapped, other sizes.
 
 Each change is tried by itself on a few frames that are not explained as they are.
 """
@@ -16,13 +16,15 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.objective import View
 from mixpose.records import PointPattern
-from mixpose.rigid import Floats
+from mixpose.rigid import Floats, inverse
 from mixpose.runner import begin
-from mixpose.session import Session
+from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.session import SensorSetup, Session
 
 Views: TypeAlias = Sequence[View]
 
 PATIENCE_S = 20.0  # of processor time, for all trials together
+_OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | 
         Frames, by number, that are not explained as they are.
     """
     began = time.process_time()
-    for trial in _trials(session):
+    for trial in _trials(session, frames):
         if time.process_time() - began > PATIENCE_S:
             return None
         body = session.body if trial.points is None else _of(session.body, trial.points)
@@ -63,10 +65,10 @@ def _explains(session: Session, number: int, views: Views) -> bool:
     return estimate.status == "ok" and min(shares, default=0.0) > 0.1
 
 
-def _trials(session: Session) -> Iterator[Trial]:
+def _trials(session: Session, frames: Sequence[tuple[int, Views]]) -> Iterator[Trial]:
     cameras = [s for s in session.sensors if s.sensor.unit == "px" and s.sensor.dimension == 2]
-    names = [setup.name for setup in cameras]
-    for a, b in combinations(names, 2):
+    yield from _inversions(cameras)
+    for a, b in combinations([setup.name for setup in cameras], 2):
         text = f"{a!r} and {b!r} are swapped: with the source of each given to the other"
         yield Trial(text, lambda views, a=a, b=b: _swapped(views, a, b))  # type: ignore[misc]
     if not all(isinstance(feature, PointFeature) for feature in session.body.features):
@@ -84,6 +86,69 @@ def _trials(session: Session) -> Iterator[Trial]:
             text = f"images of {setup.name!r} are mirrored: with left and right of them exchanged"
             width, name = setup.resolution[0], setup.name
             yield Trial(text, lambda views, n=name, w=width: _mirrored(views, n, w))  # type: ignore[misc]
+    size = _size(session, frames)
+    if size is not None:
+        yield Trial(
+            "the body of [object] is not of the size that was seen, or translations are in another "
+            f"unit than points: with points {size:.3g} times as large",
+            points=lambda means: size * means,
+        )
+
+
+def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Trial]:
+    """Cameras of which the session has their own poses in the world: all of them, or one."""
+    placed = [s.name for s in cameras if not np.allclose(s.sensor.T_sensor_world, np.eye(4))]  # type: ignore[attr-defined]
+    groups = [placed] if placed else []
+    groups += [[name] for name in placed] if len(placed) > 1 else []
+    for names in groups:
+        called = " and ".join(repr(name) for name in names)
+        text = (
+            f"T_sensor_world of {called} {'is' if len(names) == 1 else 'are'} inverted (it maps "
+            "world to sensor coordinates): with the inverse"
+        )
+        yield Trial(text, lambda views, names=names: _turned_round(views, names))  # type: ignore[misc]
+
+
+def _turned_round(views: Views, names: Sequence[str]) -> Views:
+    return [_inverted(view) if view.name in names else view for view in views]
+
+
+def _inverted(view: View) -> View:
+    sensor: Any = view.sensor
+    return replace(view, sensor=replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world)))
+
+
+def _size(session: Session, frames: Sequence[tuple[int, Views]]) -> float | None:
+    """How many times as large as given the body looks to several cameras together.
+
+    Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
+    in two cameras that stand at (R, t) to each other.
+    """
+    middle = np.append(session.body.means.mean(axis=0), 1.0)
+    found = []
+    for number, views in frames:
+        places = [(view.sensor, _alone(session, number, view)) for view in views]
+        seen = [(each, T) for each, T in places if T is not None]
+        for (a, T_a), (b, T_b) in combinations(seen, 2):
+            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)  # type: ignore[attr-defined]
+            p_a = (a.T_sensor_world @ T_a @ middle)[:3]  # type: ignore[attr-defined]
+            p_b = (b.T_sensor_world @ T_b @ middle)[:3]  # type: ignore[attr-defined]
+            apart = p_b - T_ba[:3, :3] @ p_a
+            found.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
+    if not found:
+        return None
+    size, (least, most) = float(np.median(found)), _OTHER_SIZE
+    return size if abs(size - 1) > least and 1 / most < size < most else None
+
+
+def _alone(session: Session, number: int, view: View) -> Floats | None:
+    """T_world_object (4, 4) that one camera finds by itself."""
+    if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
+        return None
+    tracker, track = begin(replace(session, start=None))
+    with np.errstate(all="ignore"):
+        _, estimate = tracker.advance(track, number, None, [view])
+    return estimate.T_world_object
 
 
 def _of(body: Body, points: Callable[[Floats], Floats]) -> Body:

@@ -112,17 +112,18 @@ def run(
 ) -> None:
     """Estimate a pose per frame."""
     from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
+    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
     sources, debug = tuple(source or ()), bool(context.obj)
-    written = format_of(output, None if format is None else format.value)
+    many = are_many(sessions, scheduler)
+    named = None if format is None else format.value
+    written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
     request = RunRequest(
         output, written, sources, selection, resume, overlay, debug, allow_code, scheduler
     )
-    from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
-
-    if are_many(sessions, request):
+    if many:
         raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415
     from mixpose.cli.run import run_session  # noqa: PLC0415

@@ -20,7 +20,7 @@ from mixpose.calibration.saved import MARK as SAVED_MARK
 from mixpose.calibration.saved import Saved
 from mixpose.calibration.task import Progress
 from mixpose.calibration.telling import check_lines, lines_of
-from mixpose.calibration.world import in_world, with_length
+from mixpose.calibration.world import check_world, in_world, with_length
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
@@ -33,6 +33,9 @@ from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
+
+_TIMED = 4  # frames by which it is told how long the search takes
+_FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,8 @@ def task_of(
             f"{session.path}: --free delay: found frames without times; allowed: fps or times for "
             "every sensor, or a video"
         )
+    if request.world is not None:
+        check_world(rig, request.world, [frame.number for frame in frames])
     start = session.start
     return Task(
         rig=rig,
@@ -235,15 +240,21 @@ def _warn(found: Calibration) -> None:
 @contextmanager
 def _watched() -> Iterator[Progress]:
     """Progress: a bar on a terminal; and how long the search will take, before it does."""
-    said: dict[str, float] = {}
+    last: dict[str, float] = {}
+    took: dict[str, list[float]] = {}
 
     def expect(stage: str, done: int, total: int) -> None:
-        if stage.startswith("searching") and total > 20:
-            if done == 0:
-                said[stage] = time.perf_counter()
-            elif done == 4 and stage in said:
-                each = (time.perf_counter() - said.pop(stage)) / 4
-                say(f"{total} frames of cameras to search, about {_duration(each * total)}")
+        if not stage.startswith("searching") or total <= 20:
+            return
+        now = time.perf_counter()
+        step, last[stage] = now - last.get(stage, now), now
+        steps = took.setdefault(stage, [])
+        if step < _FOUND_BEFORE_S or len(steps) == _TIMED:
+            return
+        steps.append(step)
+        if len(steps) == _TIMED:
+            left, each = total - done, sum(steps) / _TIMED
+            say(f"{left} frames of cameras left to search, about {_duration(each * left)}")
 
     if not sys.stderr.isatty():
         yield expect

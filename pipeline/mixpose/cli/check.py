@@ -17,6 +17,7 @@ from mixpose.checking import (
     advice,
     depends_on_distance,
     expected_count,
+    geometry_warnings,
     image_of,
     judge,
     key_warnings,
@@ -26,7 +27,9 @@ from mixpose.checking import (
     placement_lines,
     placement_warnings,
     shared_part_warnings,
+    shared_source_warnings,
     survey,
+    told_apart,
     typical_poses,
     with_image_sizes,
 )
@@ -51,9 +54,13 @@ class _Report:
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     untested: str = ""
+    of: str = ""  # of several bodies, which one is spoken of
 
     def say(self, title: str, text: str) -> None:
-        self.lines.append(f"{title:<10}{text}")
+        self.lines.append(f"{title:<10}{self.of}{text}")
+
+    def warn(self, text: str) -> None:
+        self.warnings.append(f"{self.of}{text}")
 
     def write(self) -> None:
         for warning in self.warnings:
@@ -99,12 +106,16 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, sources[setup.name], surveys)
-    report.warnings += _pairing_warnings(sources)
+    report.warnings = told_apart(report.warnings)
+    report.warnings += shared_source_warnings(session, {}) + _pairing_warnings(sources)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
     for one in session.objects:
+        report.of = f"{one.body.name}: " if len(session.objects) > 1 else ""
         _say_accuracy(report, sized.alone(one.body.name))
+    report.of = ""
     report.warnings += shared_part_warnings(sized)
+    report.warnings += geometry_warnings(session, sources, surveys)
     report.untested = _untested(surveys)
     report.write()
     damage = [text for each in surveys.values() for text in each.damage]
@@ -131,6 +142,8 @@ def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:
         text = (
             f"{alike} orientations look the same; the pose nearest to the previous one is written"
         )
+    if len(session.objects) > 1:
+        text = f"{body.name}: {text}"
     report.say("symmetry", text)
 
 
@@ -292,7 +305,7 @@ def _say_accuracy_at(
         )
         unknown = [TWIST_NAMES[k] for k in np.flatnonzero(free & ~np.isfinite(deviations))]
         if unknown:
-            report.warnings.append(
+            report.warn(
                 f"{where}, the sensors do not determine {', '.join(unknown)}: hold what is known "
                 "at the pose of [start] with free in [estimator], or add a sensor"
             )
@@ -303,7 +316,7 @@ def _say_accuracy_at(
     ]
     found = [alike for alike in others if alike]
     if found:
-        report.warnings.append(_look_alike_text(session, found, len(poses), where))
+        report.warn(_look_alike_text(session, found, len(poses), where))
     return bool(found)
 
 

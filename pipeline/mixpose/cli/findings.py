@@ -12,11 +12,13 @@ from statistics import median
 
 import numpy as np
 
-from mixpose.checking import explanation
+from mixpose.checking import CAUSES, explanation
+from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
+from mixpose.tracking import ASIDE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -107,6 +109,11 @@ class Findings:
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
         self._markers: dict[str, dict[int, _Marker]] = {}
+        self._sizes = {
+            label: BodySize(session, one.body.means)
+            for one in session.objects
+            for label in one.labels
+        }
         self._frames: list[tuple[int, list[View]]] = []
         self._agreed_before = 0
 
@@ -144,6 +151,8 @@ class Findings:
             self._agreed_before += not self._doubts
             self._add_residuals(estimate)
             self._add_markers(estimate)
+            if estimate.label in self._sizes:
+                self._sizes[estimate.label].add(estimate)
 
     def _add_residuals(self, estimate: Estimate) -> None:
         if estimate.label != self._session.labels[0]:
@@ -189,7 +198,10 @@ class Findings:
 
     def warnings(self) -> list[str]:
         """What is most likely at fault, a line each."""
-        return [*self._of_sensors(), *self._of_doubts(), *self._of_markers()]
+        sizes = size_warnings(self._sizes)
+        # a body of another size is met off at all of its markers
+        of_bodies = sizes or self._of_markers()
+        return [*self._of_sensors(), *self._of_doubts(), *of_bodies]
 
     def _of_sensors(self) -> list[str]:
         total, lines = self._places + 1, []
@@ -233,10 +245,9 @@ class Findings:
                 continue
             line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
             if doubt == APART:
-                line += (
-                    ": is one of them out of step, or its calibration, T_sensor_world or source "
-                    "that of another?"
-                )
+                line += f": {CAUSES}"
+            if doubt == ASIDE:
+                line += ": is a part of it hidden, or does the session say more rows than it has?"
             lines.append(line)
         return lines
 

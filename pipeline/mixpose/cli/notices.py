@@ -38,8 +38,14 @@ def warn(message: str) -> None:
     say(f"warning: {' '.join(message.split())}")
 
 
-def warn_of_sources(sources: Mapping[str, Source]) -> None:
-    """Say what is odd about the recordings."""
+def warn_of_sources(
+    session: Session, sources: Mapping[str, Source], replaced: Mapping[str, str]
+) -> None:
+    """Say what is odd about the recordings; `replaced` are those in place of the session's."""
+    from mixpose.checking import shared_source_warnings  # noqa: PLC0415 - only a run needs it
+
+    for warning in shared_source_warnings(session, replaced):
+        warn(warning)
     for name, source in sources.items():
         caution = source.caution()
         if caution:

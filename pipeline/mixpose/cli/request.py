@@ -40,17 +40,27 @@ class RunRequest:
 def format_of(output: Path | None, named: str | None) -> str:
     """The format of poses: the one that is named, else that of the file's suffix.
 
+    Without either, poses are JSON lines: to standard output, a pipe, or a name without a suffix.
+
     Raises
     ------
     SessionError
-        If no poses can be written to a file of this suffix while they are estimated.
+        If the suffix is that of no format, or of one that is not written while poses are estimated.
     """
     if named is not None:
         return named
     name = "" if output is None else output.name.casefold()
+    if output is None or not output.suffix or (output.exists() and not output.is_file()):
+        return "jsonl"
     if name.endswith(".rrd"):
         raise SessionError(
             f"-o {output}: poses are not written in this format while they are estimated; write "
             f".jsonl, and then: mixpose convert POSES.jsonl -o {output}"
         )
-    return next((each for end, each in SUFFIXES.items() if name.endswith(end)), "jsonl")
+    told = next((each for end, each in SUFFIXES.items() if name.endswith(end)), None)
+    if told is None:
+        raise SessionError(
+            f"-o {output}: found the suffix {output.suffix}, which is no format of poses; allowed: "
+            f"{', '.join(SUFFIXES)}; or name one with --format"
+        )
+    return told

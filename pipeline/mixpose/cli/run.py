@@ -64,7 +64,7 @@ def run_session(path: Path, request: RunRequest) -> None:
     if go_on.is_done:
         say(f"nothing left to do: {request.output} has all frames asked for already")
         return
-    warn_of_sources(opened)
+    warn_of_sources(session, opened, replaced)
     summary = Summary(session)
     output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:

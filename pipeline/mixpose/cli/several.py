@@ -31,7 +31,7 @@ from mixpose.cli.recording_job import (
     finished,
     run_job,
 )
-from mixpose.cli.request import RunRequest
+from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_threads, on_cluster
 from mixpose.whole_files import appearing_whole
@@ -46,11 +46,11 @@ _COLUMNS = ("name", "state", "ok", "ambiguous", "lost", "warnings", "seconds", "
 _STATUSES = ("ok", "ambiguous", "lost")
 
 
-def are_many(named: Sequence[str], request: RunRequest) -> bool:
+def are_many(named: Sequence[str], scheduler: str | None) -> bool:
     """Whether recordings get a folder each: several sessions, a pattern, a list, or a cluster."""
     first = named[0]
     pattern = glob.has_magic(first) and not Path(first).exists()
-    return request.scheduler is not None or len(named) > 1 or first.endswith(".txt") or pattern
+    return scheduler is not None or len(named) > 1 or first.endswith(".txt") or pattern
 
 
 def sessions_of(named: Sequence[str]) -> list[Path]:
@@ -230,8 +230,14 @@ def _sha256(session: Path) -> str:
 def _folder(folder: Path | None, count: int) -> Path:
     if folder is None:
         raise SessionError(f"-o DIR: missing; {count} sessions need a folder for the poses")
+    sessions = f"{count} session{'s' * (count != 1)}"
     if folder.exists() and not folder.is_dir():
-        raise SessionError(f"-o {folder}: is a file; {count} sessions need a folder for the poses")
+        raise SessionError(f"-o {folder}: is a file; {sessions} need a folder for the poses")
+    if not folder.exists() and folder.name.casefold().endswith((*SUFFIXES, ".rrd")):
+        raise SessionError(
+            f"-o {folder}: found the name of a file; allowed for {sessions}: a folder, in which "
+            f"each gets its own; as -o {folder.with_suffix('')}, and --format for the format"
+        )
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

@@ -190,41 +190,23 @@ def _residuals(
     return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone, nothing)
 
 
-def crowding(
-    observation: Observation, y: Floats, sigma: float, participation: float, rules: AssociationRules
-) -> tuple[float, float]:
-    """Number of observed features, and their density over the whole pattern or near the body.
+def crowding(points: Floats, lower: Floats, upper: Floats, smallest: float) -> Floats:
+    """Detections (H,) per unit of a sensor's coordinates, in all or in boxes where they are denser.
 
     Parameters
     ----------
-    observation : Observation
-    y : (n, m) array
-        Predicted features.
-    sigma : float
-        σ_ε.
-    participation : float
-        Number of equal features that give the pattern's energy, which counts where the pattern is
-        not made of detections.
-    rules : AssociationRules
-
-    Returns
-    -------
-    float
-        Number.
-    float
-        Per unit of the sensor's coordinates; the larger of the two.
+    points : (M, m) array
+        Of the detections.
+    lower, upper : (H, m) array
+        Boxes around the predicted features of H poses.
+    smallest : float
+        What the side of a region counts at least.
     """
-    smallest = rules.min_region * sigma
-    lower, upper = observation.extent
-    pattern = observation.pattern
-    count = float(len(pattern.points)) if isinstance(pattern, PointPattern) else participation
-    overall = count / _area(upper - lower, smallest)
-    if not rules.crowded or not isinstance(pattern, PointPattern) or not len(y):
-        return count, overall
-    near, far = y.min(axis=0), y.max(axis=0)
-    half = np.maximum(far - near, smallest) / 2
-    found = _detected(pattern, (near + far) / 2, half)
-    return count, max(overall, found / _area(2 * half, smallest))
+    overall = len(points) / np.maximum(np.ptp(points, axis=0), smallest).prod()
+    sides = np.maximum(upper - lower, smallest)
+    away = np.abs(points - (lower + upper)[:, None] / 2)
+    inside = (away <= sides[:, None] / 2).all(axis=2).sum(axis=1)
+    return np.asarray(np.maximum(overall, inside / sides.prod(axis=1)))
 
 
 def surplus(observation: Observation, y: Floats, met: float, rules: AssociationRules) -> float:
@@ -234,14 +216,5 @@ def surplus(observation: Observation, y: Floats, met: float, rules: AssociationR
         return 0.0
     near, far = y.min(axis=0), y.max(axis=0)
     half = (far - near) / 2 + rules.slip * float((far - near).max())
-    return max(_detected(pattern, (near + far) / 2, half) - met, 0.0)
-
-
-def _detected(pattern: PointPattern, middle: Floats, half: Floats) -> int:
-    """Number of detections in a box (m,) about its middle."""
-    return int(np.count_nonzero((np.abs(pattern.points - middle) <= half).all(axis=1)))
-
-
-def _area(sides: Floats, smallest: float) -> float:
-    """Size of a box, no side of which counts as less than the smallest."""
-    return math.prod(max(side, smallest) for side in sides.tolist())
+    inside = np.abs(pattern.points - (near + far) / 2) <= half
+    return max(int(np.count_nonzero(inside.all(axis=1))) - met, 0.0)

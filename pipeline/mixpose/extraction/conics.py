@@ -1,4 +1,4 @@
-"""Ellipses by their equation: many fitted at once, and distances from them."""
+"""Ellipses side by side: fitted to points, and distances from them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 FEWEST = 6  # points of an ellipse: five always lie on a conic
 
-_ROUNDING = 1e-12  # of the matrix of slopes, which points on a line leave singular
+_LEAST = 1e-3  # px, of a half-axis: points on a line make none
 
 
 @dataclass(frozen=True)
@@ -80,106 +81,34 @@ def together(ellipses: list[Ellipse]) -> Ellipses:
     )
 
 
-@dataclass(frozen=True)
-class Monomials:
-    """Products of coordinates, of which sums make up every fit to some of the points.
+def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:
+    """Ellipses through points: of all conics those of least mean square distance.
 
-    Attributes
-    ----------
-    values : (B, n, 6) float64
-        u², uv, v², u, v, 1 about the middle, as shares of the size.
-    middle : (B, 2) float64
-    size : (B,) float64
-    """
-
-    values: Floats
-    middle: Floats
-    size: Floats
-
-    def select(self, chosen: NDArray[np.intp]) -> Monomials:
-        """Those of some rows."""
-        return Monomials(self.values[chosen], self.middle[chosen], self.size[chosen])
-
-
-def monomials(points: Floats, there: Mask) -> Monomials:
-    """Prepare points (B, n, 2), of which (B, n) are there."""
-    x = np.where(there[..., None], points, 0.0)
-    count = np.maximum(there.sum(axis=1), 1)
-    middle = np.ones(x.shape[1]) @ x / count[:, None]
-    x = (x - middle[:, None]) * there[..., None]
-    size = np.sqrt(np.einsum("bni,bni->b", x, x) / count)
-    size[size == 0] = 1.0
-    u, v = np.moveaxis(x / size[:, None, None], 2, 0)
-    values = np.ones((*u.shape, 6))
-    for k, term in enumerate((u * u, u * v, v * v, u, v)):
-        values[..., k] = term
-    return Monomials(values, middle, size)
-
-
-def fit_conics(terms: Monomials, chosen: Mask, oblique: float) -> Ellipses:
-    """Ellipses through points: of all conics those of least mean square distance (Taubin).
-
-    Taubin, IEEE PAMI 13 (1991): the sum of squares of the equation, over that of its gradient.
+    That is the sum of squares of the equation over that of its gradient (Taubin, IEEE PAMI 13,
+    1991), by `cv2.fitEllipseAMS`; `cv2.fitEllipseDirect` where that conic is no ellipse.
 
     Parameters
     ----------
-    terms : Monomials
+    points : (B, n, 2) float64
     chosen : (B, n) bool
         Which points count.
     oblique : float
         Least width by length.
     """
-    count = chosen.sum(axis=1)
-    weights = chosen / np.maximum(count, 1)[:, None]
-    moments = (terms.values * weights[..., None]).swapaxes(1, 2) @ terms.values
-    mean = moments[:, :5, 5]
-    square = moments[:, :5, :5] - mean[:, :, None] * mean[:, None]
-    slope = (moments[:, 5] @ _SLOPES).reshape(-1, 5, 5) + _ROUNDING * np.eye(5)
-    whitening = np.linalg.inv(np.linalg.cholesky(slope))
-    across = whitening.swapaxes(1, 2)
-    least = np.linalg.eigh(whitening @ square @ across)[1][:, :, :1]
-    equation = (across @ least)[..., 0]
-    constant = -(equation * mean).sum(axis=1)
-    centre, half_axes, angle, sound = _shape(equation, constant)
-    sound &= (count >= FEWEST) & (half_axes[:, 0] >= oblique * half_axes[:, 1])
-    half_axes = np.where(sound[:, None], half_axes * terms.size[:, None], 1.0)
-    return Ellipses(terms.middle + centre * terms.size[:, None], half_axes, angle, sound)
-
-
-def _slopes() -> Floats:
-    """What makes the mean product (25) of the gradients of five monomials of means (6)."""
-    by_u, by_v = np.zeros((2, 5, 6))
-    by_u[0, 3], by_u[1, 4], by_u[3, 5] = 2, 1, 1
-    by_v[1, 3], by_v[2, 4], by_v[4, 5] = 1, 2, 1
-    # the product of two of u, v and 1, as one of the six
-    product = np.zeros((6, 6, 6))
-    for (i, j), k in zip([(3, 3), (3, 4), (4, 4), (3, 5), (4, 5), (5, 5)], range(6), strict=True):
-        product[i, j, k] = product[j, i, k] = 1
-    terms = [np.einsum("ai,bj,ijk->kab", by, by, product) for by in (by_u, by_v)]
-    return np.asarray(sum(terms)).reshape(6, 25)
-
-
-_SLOPES = _slopes()
-
-
-def _shape(equation: Floats, constant: Floats) -> tuple[Floats, Floats, Floats, Mask]:
-    """Centre, half-axes, angle of a u² + b uv + c v² + d u + e v + f = 0, and if it is one.
-
-    The first half-axis is the shorter one.
-    """
-    sign = np.where(equation[:, 0] + equation[:, 2] < 0, -1.0, 1.0)
-    a, b, c, d, e = (equation * sign[:, None]).T
-    determinant = 4 * a * c - b * b
-    sound = determinant > 0
-    divisor = np.where(sound, determinant, 1.0)
-    centre = np.stack([b * e - 2 * c * d, b * d - 2 * a * e], axis=1) / divisor[:, None]
-    depth = -(constant * sign + (d * centre[:, 0] + e * centre[:, 1]) / 2)
-    root = np.sqrt((a - c) ** 2 + b * b)
-    steep, flat = (a + c + root) / 2, (a + c - root) / 2
-    sound &= (depth > 0) & (flat > 0)
-    depth, steep, flat = (np.where(sound, x, 1.0) for x in (depth, steep, flat))
-    half_axes = np.sqrt(np.stack([depth / steep, depth / flat], axis=1))
-    return centre, half_axes, np.arctan2(b, a - c) / 2, sound
+    found = np.ones((len(points), 5))
+    sound = chosen.sum(axis=1) >= FEWEST
+    # in single precision, which is exact near the ellipse only
+    middle = points[np.arange(len(points)), chosen.argmax(axis=1)]
+    near = (points - middle[:, None]).astype(np.float32)
+    for k in np.flatnonzero(sound).tolist():
+        centre, axes, angle = cv2.fitEllipseAMS(near[k][chosen[k]])
+        found[k] = *centre, *axes, angle
+    sound &= np.isfinite(found).all(axis=1)
+    half_axes = found[:, 2:4] / 2
+    sound &= half_axes.min(axis=1) >= np.maximum(oblique * half_axes.max(axis=1), _LEAST)
+    found = np.where(sound[:, None], found, 0.0)
+    half_axes = np.where(sound[:, None], half_axes, 1.0)
+    return Ellipses(middle + found[:, :2], half_axes, np.radians(found[:, 4]), sound)
 
 
 def distances(ellipses: Ellipses, points: Floats) -> Floats:

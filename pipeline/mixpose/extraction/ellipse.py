@@ -6,7 +6,7 @@ All features of an image are looked at together, as arrays with one row for each
 of calls that takes time, not that of pixels.
 
 `skimage.measure` beside it: `EllipseModel` fits as well, but ten times slower than
-`cv2.fitEllipseAMS`, whose fit (Taubin's) is the one here; `ransac` triples the error where a
+`cv2.fitEllipseAMS`, the one here; `ransac` triples the error where a
 straight edge cuts a disk (0.17 to 0.05 px).  `find_contours` has one level for all of the rim: a
 disk half in shadow is off by 0.32 px instead of 0.01, and disks behind cables or broken by their
 hole are not found.
@@ -31,7 +31,6 @@ from mixpose.extraction.conics import (
     Mask,
     distances,
     fit_conics,
-    monomials,
     turns,
 )
 from mixpose.extraction.contours import Contour
@@ -206,8 +205,7 @@ def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules
     Ellipses
         Sound but for less than six points, or where they are not on an ellipse.
     """
-    terms = monomials(points, there)
-    best = fit_conics(terms, there, rules.oblique)
+    best = fit_conics(points, there, rules.oblique)
     distance, spread = _spreads(best, points, there)
     used = there.copy()
     doubtful = np.flatnonzero(~(spread < rules.spread) & (there.sum(axis=1) >= FEWEST))
@@ -223,7 +221,7 @@ def fit_ellipses(points: Floats, there: Mask, rules: EllipseRules = EllipseRules
         changed = np.flatnonzero((near != used).any(axis=1) & best.sound)
         if not changed.size:
             break
-        refitted = fit_conics(terms.select(changed), near[changed], rules.oblique)
+        refitted = fit_conics(points[changed], near[changed], rules.oblique)
         best, used = best.replaced(changed, refitted), near
         distance, spread = _spreads(best, points, there)
     return best
@@ -257,11 +255,7 @@ def _without_an_arc(
     ahead = (order[:, None] - first[:, :, None]) % counts[:, :, None]
     parts = there[:, None] & (ahead < shown[:, :, None])
     around = np.repeat(points, arcs, axis=0)
-    tried = fit_conics(
-        monomials(around, np.repeat(there, arcs, axis=0)),
-        parts.reshape(len(around), -1),
-        rules.oblique,
-    )
+    tried = fit_conics(around, parts.reshape(len(around), -1), rules.oblique)
     spreads = _spreads(tried, around, np.repeat(there, arcs, axis=0))[1].reshape(-1, arcs)
     good = spreads < rules.spread
     chosen = np.where(good.any(axis=1), good.argmax(axis=1), spreads.argmin(axis=1))

@@ -5,11 +5,13 @@ from __future__ import annotations
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.near import Fit, FitRules, fit_near, fit_together
 from mixpose.fit.options import EstimatorOptions, SearchName, free_mask
+from mixpose.fit.prior import NormalPrior
 
 __all__ = [
     "EstimatorOptions",
     "Fit",
     "FitRules",
+    "NormalPrior",
     "ScheduleRules",
     "SearchName",
     "blur_schedule",

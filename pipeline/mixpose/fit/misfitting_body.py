@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.fit.free_features import fit_freed
 from mixpose.fit.misfit import MisfitRules, SensorDensity, misfit
-from mixpose.fit.prior import Prior, likelihood_at, most_probable
+from mixpose.fit.prior import NormalPrior, likelihood_at, most_probable
 from mixpose.objective import MatchedObjective, matched_objective
 from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.rigid import transform
@@ -22,7 +22,7 @@ Floats: TypeAlias = NDArray[np.float64]
 def believed(
     objective: MatchedObjective,
     T_world_object: Floats,
-    prior: Prior,
+    prior: NormalPrior,
     rules: MisfitRules = MisfitRules(),
 ) -> tuple[Floats, bool]:
     """The most probable pose, or the fit to freed features of a body that does not fit.
@@ -33,7 +33,7 @@ def believed(
         At σ_ε of sensors with noise in their cells.
     T_world_object : (4, 4) array
         A maximum of the objective.
-    prior : Prior
+    prior : NormalPrior
     rules : MisfitRules
 
     Returns

@@ -23,7 +23,7 @@ from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import Prior, has_likelihood
+from mixpose.fit.prior import NormalPrior, has_likelihood
 from mixpose.objective import (
     MatchedObjective,
     Objective,
@@ -150,7 +150,7 @@ def fit_near(
         ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
-        T, is_freed = believed(finest, T, Prior(T_start, uncertainty, free), rules.misfit)
+        T, is_freed = believed(finest, T, NormalPrior(T_start, uncertainty, free), rules.misfit)
     return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
 
 

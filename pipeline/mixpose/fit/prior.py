@@ -31,7 +31,7 @@ _VALUE_ERROR = value_error(FINE_STEPS)
 
 
 @dataclass(frozen=True)
-class Prior:
+class NormalPrior:
     """A normal distribution of the pose.
 
     Attributes
@@ -48,9 +48,17 @@ class Prior:
     uncertainty: Floats
     free: NDArray[np.bool_]
 
-    def information(self) -> Floats:
-        """Inverse variances (6,), 0 where not free."""
-        return np.where(self.free, 1 / np.where(self.free, self.uncertainty, 1.0) ** 2, 0.0)
+    def joined(self, likelihood: Quadratic, T_world_object: Floats) -> Quadratic:
+        """A log-likelihood at a pose (4, 4), with the logarithm of the prior."""
+        information = np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)
+        away = twist_between(self.T_world_object, T_world_object)
+        value, gradient, C, H, _ = likelihood
+        return Quadratic(
+            value - 0.5 * float(away @ (information * away)),
+            gradient - information * away,
+            C + np.diag(information),
+            None if H is None else H + np.diag(information),
+        )
 
     def points(self) -> list[Floats]:
         """The mean, and √k standard deviations to either side along each of k directions."""
@@ -131,7 +139,7 @@ def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) ->
 
 
 def most_probable(
-    objective: MatchedObjective, T_world_object: Floats, prior: Prior, misfit: float = 1.0
+    objective: MatchedObjective, T_world_object: Floats, prior: NormalPrior, misfit: float = 1.0
 ) -> Floats:
     """The pose (4, 4) that maximises likelihood and prior.
 
@@ -141,7 +149,7 @@ def most_probable(
         As `likelihood_at` has it, and `misfit`.
     T_world_object : (4, 4) array
         A maximum of the objective.
-    prior : Prior
+    prior : NormalPrior
     """
     T = T_world_object
     likelihood = likelihood_at(objective, T, misfit)
@@ -153,18 +161,13 @@ def most_probable(
     return _highest(likelihood_at(objective, T, misfit), prior, [T], _NATS)
 
 
-def _highest(likelihood: Likelihood, prior: Prior, starts: Sequence[Floats], nats: float) -> Floats:
+def _highest(
+    likelihood: Likelihood, prior: NormalPrior, starts: Sequence[Floats], nats: float
+) -> Floats:
     """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
-    information = prior.information()
 
     def posterior(T: Floats) -> Quadratic:
-        one = likelihood.objective.linearise(T)
-        away = twist_between(prior.T_world_object, T)
-        return Quadratic(
-            one.value - 0.5 * float(away @ (information * away)),
-            one.gradient - information * away,
-            one.curvature + np.diag(information),
-        )
+        return prior.joined(likelihood.objective.linearise(T), T)
 
     ends = []
     for T in starts:

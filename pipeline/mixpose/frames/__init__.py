@@ -4,7 +4,7 @@
 """
 
 from mixpose.frames.images import read_image
-from mixpose.frames.opening import open_source
+from mixpose.frames.opening import files_of, open_source
 from mixpose.frames.pairing import pair
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import ALL_NUMBERS, Source, SourceSpec
@@ -14,6 +14,7 @@ __all__ = [
     "ALL_NUMBERS",
     "Source",
     "SourceSpec",
+    "files_of",
     "open_source",
     "pair",
     "paired_by_stamp",

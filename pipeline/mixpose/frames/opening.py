@@ -76,6 +76,17 @@ def open_source(spec: SourceSpec) -> Source:
     return _OPENERS[kind](spec, places, clock)
 
 
+def files_of(spec: SourceSpec) -> list[str]:
+    """The files that a recording is read from, or the address of a camera or stream.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such recording.
+    """
+    return _recognise(spec, spec.source)[1]
+
+
 def _open_live(spec: SourceSpec, source: str, clock: Clock | None) -> LiveSource:
     """A camera or a stream, opened when its frames are asked for."""
     address = live_address(source)

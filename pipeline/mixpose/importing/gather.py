@@ -67,12 +67,14 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
     try:
         for body in bodies:
             read_marker_file(body, unit)
-        rigs = read_rigs([path for path in paths if path not in bodies])
+        others = [path for path in paths if path not in bodies]
+        rigs = read_rigs(others, also=f"; or a body: {', '.join(_TABLES)}")
     except BadKeyError as problem:
         raise SessionError(one_line("import", problem.key, problem.text)) from problem
     if not rigs:
         raise SessionError(
-            "import: found no calibration file among the files; allowed: at least one"
+            "import: found no calibration file among the files; allowed: at least one, beside "
+            f"bodies ({', '.join(_TABLES)})"
         )
     placed = [rig for rig in rigs if rig.is_placed]
     if len(placed) > 1:
@@ -102,7 +104,7 @@ def gather(paths: Sequence[Path], unit: Unit, lengths: Unit | None) -> Imported:
 
 def _stated_unit(rig: Rig, unit: Unit, lengths: Unit | None) -> tuple[Unit, str, str]:
     """The unit of a rig's translations, with a remark and perhaps a warning about it."""
-    name = Path(rig.files[0]).name
+    name = " and ".join(Path(file).name for file in rig.files)
     if not any(
         camera.T_camera_rig is not None and camera.T_camera_rig[:3, 3].any()
         for camera in rig.cameras

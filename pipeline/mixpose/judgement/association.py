@@ -10,8 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import AssociationRules, ErrorRules, crowding, features_met, surplus
+from mixpose.density import (
+    AssociationRules,
+    ErrorRules,
+    Observation,
+    crowding,
+    features_met,
+    surplus,
+)
 from mixpose.objective import MatchedObjective
+from mixpose.records import PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -156,8 +164,8 @@ def associate(
             merged = int(np.count_nonzero(paired)) // 2
             J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
         sigma = math.sqrt(variance / 2)
-        participation = float(objective.tops[k, 0]) / energy
-        count, crowd = crowding(observation, y, sigma, participation, rules)
+        # of grey values as many equal features as would give their energy
+        count, crowd = _crowd(observation, y, sigma, float(objective.tops[k, 0]) / energy, rules)
         complete = np.count_nonzero(shares) == len(y)
         found.append(
             Association(
@@ -180,3 +188,16 @@ def associate(
             )
         )
     return found, value
+
+
+def _crowd(
+    observation: Observation, y: Floats, sigma: float, equal: float, rules: AssociationRules
+) -> tuple[float, float]:
+    """Number of observed features, and their density around predicted ones (n, m)."""
+    pattern, smallest = observation.pattern, rules.min_region * sigma
+    if not isinstance(pattern, PointPattern):
+        lower, upper = observation.extent
+        return equal, equal / float(np.maximum(upper - lower, smallest).prod())
+    around = y if rules.crowded and len(y) else pattern.points
+    lower, upper = around.min(axis=0, keepdims=True), around.max(axis=0, keepdims=True)
+    return float(len(pattern.points)), float(crowding(pattern.points, lower, upper, smallest)[0])

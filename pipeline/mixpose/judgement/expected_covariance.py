@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.objective import pose_jacobian
-from mixpose.rigid import transform
+from mixpose.objective import project_body
 from mixpose.sensors import Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -43,14 +42,10 @@ def expected_covariance(
     list of int
         Number of features that each sensor sees.
     """
-    information = np.zeros((6, 6))
-    counts = []
-    points = body.means
-    for sensor, sigma in zip(sensors, sigmas, strict=True):
-        _, by_world, seen = sensor.linearise(transform(T_world_object, points))
-        counts.append(int(seen.sum()))
-        J = pose_jacobian(by_world, points @ T_world_object[:3, :3].T)[seen].reshape(-1, 6)
-        information += J.T @ J / sigma**2
+    at = project_body(tuple(sensors), body).project(T_world_object[None])
+    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
+    information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
+    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
     return invert_information(information, free), counts
 
 

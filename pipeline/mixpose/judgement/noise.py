@@ -248,7 +248,7 @@ def _moments(
         blocks.append(_fields(one.places, shares))
         shifts.append((scale * one.J[..., :3]).reshape(-1, 3))
     weighted, shift = np.concatenate(parts), np.concatenate(shifts)
-    shift /= max(float(np.sqrt((shift**2).mean())), _LEAST)
+    shift /= max(float(np.sqrt((shift**2).sum() / max(shift.size, 1))), _LEAST)
     J, r = weighted[:, :count], weighted[:, count]
     P = [_side_by_side(kind) for kind in zip(*blocks)]
     inverse = _inverse(J.T @ J)

@@ -16,7 +16,6 @@ is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -29,7 +28,6 @@ from mixpose.objective.projection import Projected
 Floats: TypeAlias = NDArray[np.float64]
 
 _NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
-NEGLIGIBLE_BELL = math.exp(_NEGLIGIBLE)
 _FEW = 24  # features up to which all pairs are looked at first
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 _NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
@@ -52,7 +50,7 @@ class Overlaps(NamedTuple):
     pairs : (P, 2) int
         i < j.
     bells : (L, H, P) float64
-        w_i w_j N(p_i − p_j; 0, v).
+        w_i w_j N(p_i − p_j; 0, v); 0 where the two do not overlap.
     away : (L, H, P, 2) float64
         p_i − p_j.
     """
@@ -70,6 +68,15 @@ class Match(NamedTuple):
     sampled: Floats
     over: Overlaps
 
+    def of(self, poses: slice | NDArray[np.intp], n: int | None = None) -> Match:
+        """The same at some of the poses, of the first n features; the others have no weight."""
+        norm, pairs, bells, away = self.over
+        bells = bells[:, poses]
+        near = bells.any(axis=(0, 1))
+        over = Overlaps(norm[:, poses], pairs[near], bells[..., near], away[:, poses][:, :, near])
+        at = Projected._make(one[:, poses, :n] for one in self.at)
+        return Match(at, self.sampled[:, poses, :n], over)
+
 
 def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
     """How far the predicted features overlap.
@@ -84,16 +91,18 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
     pairs = _NO_PAIRS if _are_apart(y, variances) else _pairs(y, variances)
     if not len(pairs):
-        return Overlaps(np.maximum(norm, _NONE), pairs, norm, norm)
+        away = np.empty((*norm.shape, 0, 2))
+        return Overlaps(np.maximum(norm, _NONE), pairs, away[..., 0], away)
     i, j = pairs[:, 0], pairs[:, 1]
     away = y[:, :, i] - y[:, :, j]
     exponents = np.einsum("lhpm,lhpm->lhp", away, away) * (-0.5 / variances)[..., None]
     products = weights[:, :, i] * weights[:, :, j]
-    near = ((exponents > _NEGLIGIBLE) & (products > 0)).any(axis=(0, 1))
+    overlap = (exponents > _NEGLIGIBLE) & (products > 0)
+    near = overlap.any(axis=(0, 1))
     if not near.all():
-        pairs, away = pairs[near], away[:, :, near]
+        pairs, away, overlap = pairs[near], away[:, :, near], overlap[..., near]
         exponents, products = exponents[..., near], products[..., near]
-    bells = products * np.exp(exponents) * tops[..., None]
+    bells = np.where(overlap, products * np.exp(exponents) * tops[..., None], 0.0)
     norm += 2 * bells.sum(axis=2)
     return Overlaps(np.maximum(norm, _NONE), pairs, bells, away)
 
@@ -145,15 +154,19 @@ def slopes(
     amplitude = product / over.norm
     strength = 2 * scales * amplitude
     value = (scales * product * amplitude).sum(axis=0)
-    if len(over.pairs):
-        half, gram = _pair_terms(at, over, variances, tops)
-        gradient = (strength[..., None] * (rest - amplitude[..., None] * half)).sum(axis=0)
-        outer = half[..., :, None] * half[..., None, :] / over.norm[..., None, None]
-        level = (2 * scales * amplitude**2)[..., None, None]
-        return Slopes(value, gradient, (level * (gram - outer)).sum(axis=0))
+    gradient = (strength[..., None] * rest).sum(axis=0)
     drawn = (strength / variances)[..., None] * C
     curvature = J.swapaxes(2, 3) @ (drawn[..., None, None] * at.J).reshape(L, H, 2 * n, 6)
-    return Slopes(value, (strength[..., None] * rest).sum(axis=0), curvature.sum(axis=0))
+    curvature = curvature.sum(axis=0)
+    if len(over.pairs):
+        near = np.flatnonzero(over.bells.any(axis=(0, 2)))
+        some, _, own = Match(at, sampled, over).of(near)
+        half, gram = _pair_terms(some, own, variances, tops)
+        level = (strength * amplitude)[:, near, None]
+        gradient[near] -= (level * half).sum(axis=0)
+        outer = half[..., :, None] * half[..., None, :] / own.norm[..., None, None]
+        curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
+    return Slopes(value, gradient, curvature)
 
 
 def _pair_terms(

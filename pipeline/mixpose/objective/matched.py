@@ -113,16 +113,17 @@ class MatchedObjective:
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
-        parts = [self._slopes(self.match(some)) for some in self._blocks(poses)]
+        parts = [self.slopes_of(self.match(some)) for some in self._blocks(poses)]
         return Slopes(*map(np.concatenate, zip(*parts)))
 
-    def _slopes(self, match: Match) -> Slopes:
+    def slopes_of(self, match: Match) -> Slopes:
+        """The same, of what is predicted and found at some poses."""
         return slopes(*match, self.variances, self.tops, self.weights / self.energies)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and curvature at one pose (4, 4)."""
         match = self.match(T_world_object[None])
-        value, gradient, curvature = self._slopes(match)
+        value, gradient, curvature = self.slopes_of(match)
         return Quadratic(float(value[0]), gradient[0], curvature[0], match=match)
 
     def _blocks(self, poses: Floats) -> list[Floats]:

@@ -43,17 +43,6 @@ class Projected(NamedTuple):
     faced: Mask
     weights: Floats
 
-    def of(self, k: int, n: int) -> Projected:
-        """The same at one of the poses, of the first n features."""
-        one = slice(k, k + 1)
-        return Projected(
-            self.y[:, one, :n],
-            self.J[:, one, :n],
-            self.seen[:, one, :n],
-            self.faced[:, one, :n],
-            self.weights[:, one, :n],
-        )
-
 
 class BodyProjection:
     """Sensors that look at a body; made once for the same ones by `project_body`.

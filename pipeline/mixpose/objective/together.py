@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Quadratic
-from mixpose.objective.kernel import NEGLIGIBLE_BELL, Match, Overlaps, overlaps, slopes
+from mixpose.objective.kernel import Match
 from mixpose.objective.matched import MatchedObjective
 from mixpose.objective.projection import BodyProjection
 from mixpose.sensors import Sensor
@@ -73,48 +73,17 @@ class Together:
 
     def models(self, poses: Sequence[Floats]) -> list[Quadratic]:
         """Value, gradient and curvature of each objective at a pose (4, 4) of its own."""
-        joint = self.joint
-        found = at, sampled, over = joint.match(np.array(poses))
-        scales = joint.weights / joint.energies
-        apart = over._replace(pairs=over.pairs[:0])
-        values, gradients, curvatures = slopes(
-            at, sampled, apart, joint.variances, joint.tops, scales
-        )
-        overlapping = self._overlapping(over)
-        models = []
-        for k in range(len(poses)):
-            own = self._own(found, k, alone=k not in overlapping)
-            if k in overlapping:  # it steps otherwise
-                terms = joint.variances, joint.tops, scales[:, k : k + 1]
-                lone = slopes(*own, *terms)
-                models.append(Quadratic(float(lone[0][0]), lone[1][0], lone[2][0], match=own))
-                continue
-            value = float(values[k])
-            models.append(Quadratic(value, gradients[k], curvatures[k], match=own))
-        return models
-
-    def _overlapping(self, over: Overlaps) -> list[int]:
-        """Bodies of which features overlap."""
-        if not len(over.pairs):
-            return []
-        near = over.bells > NEGLIGIBLE_BELL * self.joint.tops[..., None]
-        return np.flatnonzero(near.any(axis=(0, 2))).tolist()
+        match = self.joint.match(np.array(poses))
+        models = zip(*self.joint.slopes_of(match), self._own(match), strict=True)
+        return [Quadratic(float(v), g, C, match=own) for v, g, C, own in models]
 
     def match(self, poses: Sequence[Floats]) -> None:
         """Let each objective have at hand what it sees at a pose (4, 4) of its own."""
-        found = self.joint.match(np.array(poses))
-        overlapping = self._overlapping(found[2])
-        for k, (one, T) in enumerate(zip(self.each, poses, strict=True)):
-            one.at_hand[:] = [(T, self._own(found, k, alone=k not in overlapping))]
+        found = self._own(self.joint.match(np.array(poses)))
+        for one, T, own in zip(self.each, poses, found, strict=True):
+            one.at_hand[:] = [(T, own)]
 
-    def _own(self, found: Match, k: int, *, alone: bool) -> Match:
-        """What one of the bodies has of what all match; none of its features overlap if alone."""
-        at, sampled, over = found
-        n = len(self.each[k].projection.body.nodes.points)
-        own, norm = at.of(k, n), over.norm[:, k : k + 1]
-        if not alone:
-            joint = self.joint
-            over = overlaps(own.y, own.weights, joint.variances, joint.tops)
-        else:
-            over = Overlaps(norm, over.pairs[:0], norm, norm)
-        return Match(own, sampled[:, k : k + 1, :n], over)
+    def _own(self, match: Match) -> list[Match]:
+        """What each of the bodies has of what all match."""
+        counts = [len(one.projection.body.nodes.points) for one in self.each]
+        return [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]

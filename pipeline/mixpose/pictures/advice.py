@@ -278,7 +278,7 @@ def _about_measurements(finding: Finding, body: Body) -> list[str]:
         if finding.count > 2 * len(body):
             lines.append(
                 "far more echoes than features: noise fills the profile; take its floor off, or "
-                "raise extract.sigma"
+                "raise sigma in [extract]"
             )
         return lines
     if expected is None:
@@ -299,7 +299,8 @@ def _about_sigma(finding: Finding) -> list[str]:
         return []
     return [
         f"met features are off by more than sigma = {finding.setup.extract.sigma:g} says: raise "
-        f"extract.sigma to about {expected.rms:.2g}, or check calibration and markers"
+        f"sigma in [extract] to about {expected.rms:.2g}, where markers give way on the body set "
+        "sigma in [object], or check calibration and markers"
     ]
 
 

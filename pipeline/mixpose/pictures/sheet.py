@@ -15,7 +15,7 @@ from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, words
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.layout import in_grid, stacked
-from mixpose.pictures.overlay import STATUS_COLOURS
+from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
 from mixpose.pictures.plots import objective_picture, ranges_picture
 from mixpose.pictures.slices import objective_around
 from mixpose.pictures.stages import (
@@ -68,7 +68,7 @@ def inspection_pictures(
     ]
     blurs = blur_levels(views, tracker, estimate)
     pictures: dict[str, Picture] = {}
-    rows = [_heading(session, body, estimate)]
+    rows = [_heading(session, estimate)]
     names = file_names(_names(session))
     for finding, name in zip(findings, names, strict=True):
         if finding.setup.sensor.dimension != 2:
@@ -167,14 +167,19 @@ def _camera_row(
     return in_grid(panels, 4, _SMALL)
 
 
-def _heading(session: Session, body: Body, estimate: Estimate) -> Picture:
+def _heading(session: Session, estimate: Estimate) -> Picture:
+    """What the sheet is of, and what its marks mean."""
     picture = np.zeros((40, _WIDTH, 3), np.uint8)
     whose = f"{estimate.label} " if len(session.labels) > 1 else ""
     text = f"{session.path.name}, frame {estimate.frame}: {whose}"
     u = words(picture, text, (10, 27), WHITE, size=1.2)
-    u = words(
-        picture, f"{estimate.status}  ", (u + 8, 27), STATUS_COLOURS[estimate.status], size=1.2
-    )
+    colour = STATUS_COLOURS[estimate.status]
+    u = words(picture, f"{estimate.status}  ", (u + 8, 27), colour, size=1.2)
+    if any(setup.sensor.dimension == 2 for setup in session.sensors):
+        u = words(picture, "+ found", (u + 40, 27), FOUND)
+        if estimate.T_world_object is not None:
+            u = words(picture, "o where the pose has a feature, numbered", (u + 24, 27), colour)
+            words(picture, "ellipse: its place with 95 %", (u + 24, 27), WHITE)
     return picture
 
 

@@ -25,10 +25,11 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.special import chdtri
 
 from mixpose import rigid
 from mixpose.errors import RecordingError
+from mixpose.poses.consistency import Consistency, consistency, normalised_error_squared
+from mixpose.poses.constant_offset import ConstantOffset, constant_offset
 from mixpose.poses.instances import Swaps, renumbered
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
@@ -36,7 +37,6 @@ from mixpose.poses.units import in_unit
 from mixpose.records import Floats, Status
 
 TIE_DEG = 0.5
-CONFIDENCE = 0.95
 
 FrameKey: TypeAlias = tuple[int, str]
 
@@ -57,6 +57,8 @@ class FrameError:
         Normalised estimation error squared; None without a covariance.
     dimensions : int
         Directions in which the covariance lets the pose err; what `nees` is expected to be.
+    pair : pair of (4, 4) float64, or None
+        Pose and right answer.
     """
 
     frame: int
@@ -66,6 +68,7 @@ class FrameError:
     best_twist: Floats | None = None
     nees: float | None = None
     dimensions: int = 0
+    pair: tuple[Floats, Floats] | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -77,25 +80,6 @@ class Spread:
     p95: float
     max: float
     worst_frame: int
-
-
-@dataclass(frozen=True)
-class Consistency:
-    """Whether the covariances tell the truth, over "ok" frames that have one.
-
-    Attributes
-    ----------
-    frames : int
-    nees_per_dimension : float
-        Mean NEES divided by its dimensions: 1 if the covariances are right, above 1 if they
-        promise too much.
-    inside_95 : float
-        Share of frames whose truth lies inside the 95 % ellipsoid.
-    """
-
-    frames: int
-    nees_per_dimension: float
-    inside_95: float
 
 
 @dataclass(frozen=True)
@@ -127,6 +111,10 @@ class Evaluation:
         Each body by itself, where there are several.
     swaps : Swaps or None
         None where no bodies are identical.
+    offset : ConstantOffset or None
+        The one transform that explains most of the errors of "ok" frames, if there is one.
+    exchanged : bool
+        Whether the truth has covariances, as estimates do, and the poses have none.
     """
 
     unit: str | None
@@ -146,6 +134,8 @@ class Evaluation:
     nees: Consistency | None
     bodies: Mapping[str, Evaluation] = field(default_factory=dict)
     swaps: Swaps | None = None
+    offset: ConstantOffset | None = None
+    exchanged: bool = False
 
 
 def evaluate_files(poses: str | Path, truth: str | Path) -> Evaluation:
@@ -222,7 +212,10 @@ def _evaluation(poses: PoseFile, truth: PoseFile, errors: Sequence[FrameError]) 
         ok_translation=ok_translation,
         best_rotation_deg=best_rotation_deg,
         best_translation=best_translation,
-        nees=_consistency(trusted),
+        nees=consistency([(e.nees, e.dimensions) for e in trusted if e.nees is not None]),
+        offset=constant_offset([error.pair for error in trusted if error.pair is not None]),
+        exchanged=any(line.covariance is not None for line in truth.poses)
+        and all(line.covariance is None for line in poses.poses),
     )
 
 
@@ -300,57 +293,26 @@ def _frame_error(key: FrameKey, line: PoseLine | None, answers: Floats) -> Frame
         return FrameError(frame, name, "missing")
     if line.T_world_object is None:
         return FrameError(frame, name, line.status)
-    twist = _nearest_twist(answers, line.T_world_object[None])
+    twist, answer = _nearest_twist(answers, line.T_world_object[None])
     best_twist = None
     if line.status == "ambiguous":
         rivals = [line.T_world_object, *(rival.T_world_object for rival in line.hypotheses)]
-        best_twist = _nearest_twist(answers, np.stack(rivals))
+        best_twist, _ = _nearest_twist(answers, np.stack(rivals))
     nees, dimensions = None, 0
     if line.covariance is not None:
         nees, dimensions = normalised_error_squared(twist, line.covariance)
-    return FrameError(frame, name, line.status, twist, best_twist, nees, dimensions)
+    pair = (line.T_world_object, answer)
+    return FrameError(frame, name, line.status, twist, best_twist, nees, dimensions, pair)
 
 
-def _nearest_twist(answers: Floats, poses: Floats) -> Floats:
-    """The smallest error (6,) between answers (n, 4, 4) and poses (k, 4, 4)."""
+def _nearest_twist(answers: Floats, poses: Floats) -> tuple[Floats, Floats]:
+    """The smallest error (6,) between answers (n, 4, 4) and poses (k, 4, 4), and its answer."""
     twists = rigid.twist_between(answers[:, None], poses[None]).reshape(-1, 6)
     angle_deg = np.degrees(np.linalg.norm(twists[:, 3:], axis=1))
     distance = np.linalg.norm(twists[:, :3], axis=1)
     tied = np.flatnonzero(angle_deg <= angle_deg.min() + TIE_DEG)
-    nearest: Floats = twists[tied[np.argmin(distance[tied])]]
-    return nearest
-
-
-def normalised_error_squared(twist: Floats, covariance: Floats) -> tuple[float | None, int]:
-    """Mahalanobis distance squared of an error, and its number of dimensions.
-
-    Only directions that the covariance leaves free count: an axis that is held at the start pose
-    has no variance, and its error no measure.
-
-    Parameters
-    ----------
-    twist : (6,) array
-    covariance : (6, 6) array
-
-    Returns
-    -------
-    nees : float or None
-        None if the covariance leaves no direction free.
-    dimensions : int
-        Rank of the covariance.
-    """
-    variance = np.diag(covariance)
-    kind = np.repeat([variance[:3].max(), variance[3:].max()], 3)
-    free = np.flatnonzero(variance > 1e-12 * kind)
-    scale = np.sqrt(variance[free])
-    correlation = covariance[np.ix_(free, free)] / scale[:, None] / scale
-    values, vectors = np.linalg.eigh(correlation)
-    kept = values > 1e-9
-    along = vectors.T @ (twist[free] / scale)
-    dimensions = int(kept.sum())
-    if not dimensions:
-        return None, 0
-    return float(np.sum(along[kept] ** 2 / values[kept])), dimensions
+    nearest = int(tied[np.argmin(distance[tied])])
+    return twists[nearest], answers[nearest // len(poses)]
 
 
 def _spreads(twists: Sequence[tuple[int, Floats]]) -> tuple[Spread | None, Spread | None]:
@@ -379,16 +341,3 @@ def _per_axis_rms(twists: Sequence[Floats]) -> dict[str, float] | None:
     rms = np.sqrt(np.mean(np.stack(twists) ** 2, axis=0))
     rms[3:] = np.degrees(rms[3:])
     return dict(zip(rigid.TWIST_NAMES, rms.tolist()))
-
-
-def _consistency(errors: Sequence[FrameError]) -> Consistency | None:
-    measured = [(error.nees, error.dimensions) for error in errors if error.nees is not None]
-    if not measured:
-        return None
-    nees, dimensions = np.array(measured, dtype=np.float64).T
-    limits = chdtri(dimensions, 1.0 - CONFIDENCE)
-    return Consistency(
-        frames=len(measured),
-        nees_per_dimension=float(np.mean(nees / dimensions)),
-        inside_95=float(np.mean(nees <= limits)),
-    )

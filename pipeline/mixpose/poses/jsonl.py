@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,6 +16,8 @@ from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
 from mixpose.records import Estimate, Floats
+
+_NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
 
 
 class JsonlWriter:
@@ -328,7 +331,7 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
         try:
             values = json.loads(line, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
-            what = "not JSON; a poses file holds one JSON object per line"
+            what = f"{_kind_of(line)}; a poses file holds one JSON object per line (.jsonl)"
             if isinstance(error, _NotFiniteError):
                 what = str(error)
             elif number == len(lines):
@@ -337,6 +340,18 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, dict[str, Any]]]:
         if not isinstance(values, dict):
             raise RecordingError(f"{path}:{number}: not a JSON object; a line is {{...}}")
         yield number, values
+
+
+def _kind_of(line: str) -> str:
+    """What a line is that is no JSON: one of another format that poses are written in."""
+    others = {
+        "frame,time_s,": "found a .csv table of poses, which is not read back",
+        "scene_id,im_id,": "found a .bop.csv table, which is not read back",
+        "# time is the frame number": "found a .tum trajectory, which is not read back",
+    }
+    if _NUMBERS.fullmatch(line.strip()):
+        return others["# time is the frame number"]
+    return next((each for start, each in others.items() if line.startswith(start)), "not JSON")
 
 
 class _NotFiniteError(ValueError):

@@ -51,13 +51,22 @@ def as_dict(evaluation: Evaluation) -> dict[str, Any]:
             "mean_per_dimension": nees.nees_per_dimension,
             "inside_95": nees.inside_95,
         },
-        **_of_several(evaluation),
+        **_sometimes(evaluation),
     }
 
 
-def _of_several(evaluation: Evaluation) -> dict[str, Any]:
-    """What an evaluation says only where there are several bodies."""
+def _sometimes(evaluation: Evaluation) -> dict[str, Any]:
+    """What an evaluation says only where there are several bodies, or something is odd."""
     found: dict[str, Any] = {}
+    if evaluation.offset is not None:
+        found["constant_offset"] = {
+            "of": evaluation.offset.of,
+            "T": evaluation.offset.T.tolist(),
+            "rotation_deg_rms": evaluation.offset.rotation_deg,
+            "translation_rms": evaluation.offset.translation,
+        }
+    if evaluation.exchanged:
+        found["exchanged"] = True
     if evaluation.bodies:
         found["bodies"] = {label: as_dict(one) for label, one in evaluation.bodies.items()}
     if evaluation.swaps is not None:
@@ -122,6 +131,14 @@ def _one_body(evaluation: Evaluation) -> list[str]:
             f"covariance, {counted}: "
             f"squared error per dimension {nees.nees_per_dimension:.3g} (right: 1), "
             f"inside the 95 % ellipsoid {100 * nees.inside_95:.3g} %",
+        ]
+    if evaluation.offset is not None:
+        lines += ["", evaluation.offset.text(unit)]
+    if evaluation.exchanged:
+        lines += [
+            "",
+            "the truth has covariances, as estimates do, and the poses have none: were the two "
+            "files exchanged? mixpose evaluate POSES.jsonl TRUTH.jsonl",
         ]
     return lines
 

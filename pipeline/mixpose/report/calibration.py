@@ -74,7 +74,7 @@ def _sensor_chart(found: Calibration, index: int, unit: str) -> Chart | None:
             width=0.003,
             **POSE,
         )
-        axes.set_xlabel(f"px; residuals times {1 / max(scale, 1e-12):.3g}")
+        axes.set_xlabel(f"px; residuals are drawn {1 / max(scale, 1e-12):.2g} times as long")
     rms = float(np.sqrt((sights.offset**2).sum(axis=1).mean()))
     title = f"{found.after.names[index]}: what was met, and by how much it is off"
     alt = f"{len(sights.y)} detections, residual {rms:.3g} RMS"

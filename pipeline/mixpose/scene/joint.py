@@ -225,7 +225,7 @@ class Joint:
                 continue
             if overlap(self._own_claims(first), self._own_claims(other)) < self._rules.rival:
                 continue
-            gain = self._together(first, other) - self._together(other, first)
+            gain = self.together(first, other) - self.together(other, first)
             rules = self.members[first].tracker.rules.acceptance
             if abs(gain) < -np.log(rules.rival):
                 self.close_calls |= {first, other}
@@ -233,14 +233,17 @@ class Joint:
                 first = other
         return first
 
-    def _together(self, keeps: int, other: int) -> float:
-        """Evidence of two bodies, if the one keeps what it meets and the other has the rest."""
+    def together(self, keeps: int, other: int) -> float:
+        """Evidence of two bodies, if the one keeps what it meets and the other has the rest.
+
+        One that the rest says nothing for is taken to be away, which has the odds of clutter.
+        """
         claims = {**self._claims, keeps: self._own_claims(keeps)}
         left = left_for(other, self._views, claimed(self._views, claims))
         tracker = self.members[other].tracker
         data = tracker.data(self.tracks[other], self._frame, self._time_s, left.views)
         rest = tracker.rejudged(data, self.ranked[other])
-        return self._evidence(keeps) + max((one.log_evidence for one in rest[:1]), default=0.0)
+        return self._evidence(keeps) + max([0.0, *(one.log_evidence for one in rest[:1])])
 
     def _is_trusted(self, k: int) -> bool:
         track = self.tracks[k]

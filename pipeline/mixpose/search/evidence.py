@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
-from mixpose.density import AssociationRules, ErrorRules
+from mixpose.density import AssociationRules, ErrorRules, crowding
 from mixpose.judgement import DetectionModel, SensorMatches, odds_of, paid_by_count
-from mixpose.rigid import transform
+from mixpose.objective import project_body
 from mixpose.search.detections import SensorDetections
-from mixpose.sensors import facing
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -40,7 +39,10 @@ def evidence(
     gate : float
         Within which a detection is met, in σ_ε.
     """
-    matches = [_matches_of(one, body, poses, gate) for one in detections if len(one.points)]
+    seen = [one for one in detections if len(one.points)]
+    at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
+    parts = zip(seen, at.y, at.J, at.seen, strict=True)
+    matches = [_matches_of(one, y, J, visible, gate) for one, y, J, visible in parts]
     squares, coordinates, met = np.zeros((3, len(poses)))
     for one in matches:
         squares += (one.offsets**2).sum(axis=(1, 2))
@@ -55,11 +57,12 @@ def evidence(
     return paid_by_count(odds, matches, free), met
 
 
-def _matches_of(seen: SensorDetections, body: Body, poses: Floats, gate: float) -> SensorMatches:
-    sensor, points, sigma = seen.view.sensor, seen.points, seen.sigma
-    world = transform(poses, body.means)
-    y, by_world, visible = sensor.linearise(world)
-    visible = visible & facing(sensor, poses, world, body.normals)
+def _matches_of(
+    seen: SensorDetections, y: Floats, J: Floats, visible: NDArray[np.bool_], gate: float
+) -> SensorMatches:
+    """What a sensor has at places (H, n, 2), with the Jacobians (H, n, 2, 6) by the pose."""
+    points, sigma, m = seen.points, seen.sigma, seen.points.shape[1]
+    y = y[..., :m]
     pose, feature = np.nonzero(visible)
     away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=gate * sigma)
     # a detection is met by the nearest of the features to which it is the nearest
@@ -71,21 +74,10 @@ def _matches_of(seen: SensorDetections, body: Body, poses: Floats, gate: float) 
     shares, offsets = np.zeros(visible.shape), np.zeros(y.shape)
     shares[pose, feature] = 1.0
     offsets[pose, feature] = (found - y[pose, feature]) / sigma
-    crowd = _crowd(points, y, visible, sigma) * sigma ** y.shape[-1]
-    return SensorMatches(
-        visible.astype(float), shares, offsets, by_world / sigma, crowd, float(len(points))
-    )
-
-
-def _crowd(points: Floats, y: Floats, visible: NDArray[np.bool_], sigma: float) -> Floats:
-    """Detections (H,) per unit of the sensor's coordinates, everywhere or around the body."""
-    smallest = _ASSOCIATION.min_region * sigma
-    overall = len(points) / np.maximum(np.ptp(points, axis=0), smallest).prod()
+    empty = ~visible.any(axis=1)
     lower = np.where(visible[..., None], y, np.inf).min(axis=1)
     upper = np.where(visible[..., None], y, -np.inf).max(axis=1)
-    empty = ~visible.any(axis=1)
     lower[empty], upper[empty] = 0.0, 0.0
-    half = np.maximum(upper - lower, smallest) / 2
-    middle = (lower + upper) / 2
-    inside = (np.abs(points - middle[:, None]) <= half[:, None]).all(axis=2).sum(axis=1)
-    return np.asarray(np.maximum(overall, inside / (2 * half).prod(axis=1)))
+    weights, by_world = visible.astype(np.float64), J[..., :m, :3] / sigma
+    crowd = crowding(points, lower, upper, _ASSOCIATION.min_region * sigma) * sigma**m
+    return SensorMatches(weights, shares, offsets, by_world, crowd, float(len(points)))

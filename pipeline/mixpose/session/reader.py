@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from mixpose.session.schema import EstimatorTable, SessionTable, StartTable
 from mixpose.session.sensor_setups import build_sensors
 from mixpose.session.setup import ObjectSetup, Session, Start
 from mixpose.session.text_files import as_text, read_bytes
+from mixpose.session.toml_text import parse_toml
 from mixpose.session.validation import validate
 
 
@@ -52,22 +52,13 @@ def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     data: dict[str, Any] = {}
     try:
         content = read_bytes(path)
-        data = _parse(as_text(content))
+        data = parse_toml(as_text(content))
         session = _build(path, hashlib.sha256(content).hexdigest(), data)
         return replace(session, allow_code=allow_code)
     except BadKeyError as problem:
         raise SessionError(one_line(path, problem.key, problem.text, data)) from problem
     except RecursionError as error:
         raise SessionError(f"{path}: lists or tables in it are nested too deeply") from error
-
-
-def _parse(text: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise BadKeyError(f"not TOML: {error}") from error
-    except ValueError as error:  # a number of thousands of digits
-        raise BadKeyError(f"not TOML: {error}") from error
 
 
 def _build(path: Path, sha256: str, data: dict[str, Any]) -> Session:

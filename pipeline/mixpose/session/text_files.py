@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from mixpose.limits import MOST_BYTES
 from mixpose.session.messages import BadKeyError
+
+_NO_TEXT = tuple(
+    (re.compile(start, re.DOTALL), name)
+    for start, name in (
+        (rb"\x89PNG|\xff\xd8\xff|BM....\x00\x00|II\*\x00|MM\x00\*|GIF8", "an image"),
+        (rb"RIFF....AVI |....ftyp|\x1aE\xdf\xa3", "a video"),
+        (rb"%PDF", "a PDF file"),
+        (rb"PK\x03\x04|\x1f\x8b", "a packed file"),
+    )
+)
+"""How files begin that are given in place of text by mistake."""
 
 
 def read_bytes(path: Path) -> bytes:
@@ -39,8 +51,11 @@ def as_text(content: bytes) -> str:
     Raises
     ------
     BadKeyError
-        Naming the line that is not UTF-8.
+        Naming what it is in place of text, or the line that is not UTF-8.
     """
+    kind = next((name for start, name in _NO_TEXT if start.match(content)), None)
+    if kind is not None:
+        raise BadKeyError(f"found {kind}; allowed: a text file in UTF-8")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -213,7 +213,7 @@ def _make_room(plan: _Plan, folder: Path, *, overwrite: bool) -> None:
     if held and not overwrite:
         raise SessionError(
             f"simulate: {folder}: holds a recording already ({held[0].name}); choose another "
-            "folder, or allow to overwrite it"
+            "folder, or --overwrite (in Python overwrite=True)"
         )
     for path in held:
         path.unlink(missing_ok=True)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from mixpose.tracking.delays import UNKNOWN_S
 from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
+from mixpose.tracking.proposers.stepped_aside import ASIDE
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.single_frame import estimate_pose
 from mixpose.tracking.track import Prediction, Track, predict
 from mixpose.tracking.tracker import Tracker
 
 __all__ = [
+    "ASIDE",
     "UNKNOWN_S",
     "Expectation",
     "Prediction",

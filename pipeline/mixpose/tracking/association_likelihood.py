@@ -24,10 +24,8 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import DetectionModel
-from mixpose.objective import View, pose_jacobian
+from mixpose.objective import View, project_body
 from mixpose.records import PointPattern
-from mixpose.rigid import transform
-from mixpose.sensors import facing
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -58,7 +56,7 @@ def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeR
 
 @dataclass(frozen=True)
 class AssociationSum:
-    """AssociationSums of all sensors, summed at H poses.
+    """The likelihood over all associations in all sensors, at H poses.
 
     Attributes
     ----------
@@ -100,71 +98,34 @@ def sum_associations(
         Standard deviation of offsets, in σ_ε.
     detection : DetectionModel
     """
-    ranges = [_detections(view) for view in views]
-    width = max(len(one) for one in ranges)
-    world = transform(poses, body.means)
-    parts = [_pairs(view, body, poses, world, noise, width, detection) for view in views]
-    log_odds, odds, away, J, sigma = (np.stack(column, axis=1) for column in zip(*parts))
+    patterns = [view.observation.pattern for view in views]
+    ranges = [one.points[one.weights > 0, 0] for one in patterns if isinstance(one, PointPattern)]
+    counts = np.array([len(one) for one in ranges])
+    there = np.arange(counts.max()) < counts[:, None]
+    detected = np.zeros(there.shape)  # those that never were make widths alike
+    detected[there] = np.concatenate(ranges)
+    sigma = np.array([[view.observation.sigma] for view in views])
+    at = project_body(tuple(view.sensor for view in views), body).project(poses)
+    J, away = at.J[..., 0, :], detected[:, None, None] - at.y[..., :1]
+    probability, found = detection.probability, counts[:, None]
+    expected = at.seen.sum(axis=2)
+    false = np.maximum(found - probability * expected, 1 - probability)
+    room = np.maximum(2 * detection.room * body.radius, 20 * sigma)
+    missed = expected * np.log(1 - probability) + found * np.log(false / found) + found - false
+    error = (noise * sigma)[..., None, None]
+    odds = np.exp(-0.5 * (away / error) ** 2) / (np.sqrt(2 * np.pi) * error)
+    odds *= (probability / (1 - probability) * room / false)[..., None, None]
+    odds *= at.seen[..., None] & there[:, None, None]
     total, shares = _summed(odds.reshape(-1, *odds.shape[2:]))
     shares = shares.reshape(odds.shape)
-    weights = shares / (noise * sigma[..., None, None]) ** 2
-    known = weights.sum(axis=3)
+    weights = shares / error**2
     return AssociationSum(
-        log_odds=(log_odds + np.log(total).reshape(log_odds.shape)).sum(axis=1),
-        gradient=np.einsum("hlnj,hlnj,hlnk->hk", weights, away, J),
-        information=np.einsum("hln,hlnk,hlnq->hkq", known, J, J),
-        met=shares.sum(axis=(1, 2, 3)),
-        squares=noise**2 * (weights * away**2).sum(axis=(1, 2, 3)),
+        log_odds=(missed + np.log(total).reshape(missed.shape)).sum(axis=0),
+        gradient=np.einsum("lhnj,lhnj,lhnk->hk", weights, away, J),
+        information=np.einsum("lhnj,lhnk,lhnq->hkq", weights, J, J),
+        met=shares.sum(axis=(0, 2, 3)),
+        squares=noise**2 * (weights * away**2).sum(axis=(0, 2, 3)),
     )
-
-
-def _pairs(
-    view: View,
-    body: Body,
-    poses: Floats,
-    world: Floats,
-    noise: float,
-    width: int,
-    detection: DetectionModel,
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """One sensor at H poses, with detections that never were for a width alike in all sensors.
-
-    Returns
-    -------
-    (H,) array
-        Logarithm of the odds where every feature is missed.
-    (H, n, width) array
-        Odds of each feature having each detection, against both being by themselves.
-    (H, n, width) array
-        Detected minus predicted ranges.
-    (H, n, 6) array
-        Jacobian of the predicted ranges.
-    (H,) array
-        σ_ε.
-    """
-    detections, sigma = _detections(view), view.observation.sigma
-    y, by_world, seen = view.sensor.linearise(world)
-    seen = seen & facing(view.sensor, poses, world, body.normals)
-    J = pose_jacobian(by_world, world - poses[:, None, :3, 3])[..., 0, :]
-    probability = detection.probability
-    found, expected = len(detections), seen.sum(axis=1)
-    false = np.maximum(found - probability * expected, 1 - probability)
-    room = max(2 * detection.room * body.radius, 20 * sigma)
-    away = np.zeros((*y.shape[:2], width))
-    away[..., :found] = detections - y
-    odds = np.exp(-0.5 * (away / (noise * sigma)) ** 2) / (np.sqrt(2 * np.pi) * noise * sigma)
-    odds *= (probability / (1 - probability) * room / false)[:, None, None]
-    odds[~seen] = 0.0
-    odds[..., found:] = 0.0
-    missed = expected * np.log(1 - probability) + found * np.log(false / found) + found - false
-    return missed, odds, away, J, np.full(len(poses), sigma)
-
-
-def _detections(view: View) -> Floats:
-    """Ranges (M,) of one sensor."""
-    pattern = view.observation.pattern
-    assert isinstance(pattern, PointPattern)
-    return np.asarray(pattern.points[pattern.weights > 0, 0])
 
 
 def _summed(odds: Floats) -> tuple[Floats, Floats]:

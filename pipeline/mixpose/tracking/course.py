@@ -34,7 +34,7 @@ class CourseRules:
     )
     fastest_deg: float = constant(180.0, "the same, of its turns: a hand's wave")
     quickest: float = constant(
-        10.0, "per second: by which derivatives are larger from one to the next, hands at 1.5 Hz"
+        5.0, "per second: by which derivatives are larger from one to the next, hands at 0.8 Hz"
     )
     steadiest: float = constant(
         -2.0, "power of ten of the least change of jerk, squared radii or radians per s⁷"

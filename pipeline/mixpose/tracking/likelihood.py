@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Noise, errors_seen
-from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
+from mixpose.fit import EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
 from mixpose.judgement import (
     Association,
     Judged,
@@ -42,7 +42,7 @@ from mixpose.tracking.association_likelihood import are_associated
 from mixpose.tracking.course import Expected, unknown
 from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion, unsure_by
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
-from mixpose.tracking.range_posterior import Posterior, fit_ranges, judge_ranges, noise_ratio
+from mixpose.tracking.range_posterior import Posterior, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
 
@@ -62,12 +62,15 @@ class Start:
         That it comes from.
     left_out : mapping of str to str
         Sensors that are not to take part, and why.
+    T_moved : (4, 4) float64 or None
+        A pose that has moved as this one must have, and was as likely before the frame.
     """
 
     T_world_object: Floats
     uncertainty: Floats | None = None
     prediction: Prediction | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
+    T_moved: Floats | None = None
 
 
 class Likelihood(Protocol):
@@ -148,6 +151,10 @@ class FrameData:
             self.rules.motion,
             self.rules.judgement.detection,
         )
+
+    def moves_alike(self, T_world_object: Floats) -> Floats | None:
+        """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""
+        return T_world_object if len(self.track.branches) > 1 else None
 
     @cached_property
     def finest(self) -> MatchedObjective:
@@ -305,7 +312,7 @@ class MatchedLikelihood:
             T,
             data.free,
             before=data.track.residuals,
-            prior=data.prior(T),
+            prior=data.prior(T if start.T_moved is None else start.T_moved),
             unmet=others,
             rules=rules,
         )
@@ -335,20 +342,11 @@ class AssociationLikelihood:
 
     def fit(self, start: Start) -> Fit:
         """Climb the posterior; the matched objective leads to where it begins."""
-        T, data = start.T_world_object, self.data
-        if _prior_of(start) is None:
+        T, data, posterior = start.T_world_object, self.data, self._posterior(start)
+        if posterior.prior is None:
             T = MatchedLikelihood(data).fit(start).T_world_object
             T = nearest_alike(T, data.body, data.T_reference)
-        posterior = self._posterior(start)
-        found = fit_ranges(
-            data.views,
-            data.body,
-            T,
-            data.free,
-            posterior.noise,
-            posterior.prior,
-            posterior.detection,
-        )
+        found = posterior.climbed(T)
         return Fit(found.state, found.value, found.converged, found.iterations)
 
     def judge(self, fit: Fit, start: Start) -> Judged:
@@ -369,13 +367,10 @@ class AssociationLikelihood:
     def _posterior(self, start: Start) -> Posterior:
         data = self.data
         noise = noise_ratio(data.track.residuals.total, data.rules.ranges)
-        detection = data.rules.judgement.detection
-        return Posterior(data.views, data.body, data.free, noise, _prior_of(start), detection)
-
-
-def _prior_of(start: Start) -> Prediction | None:
-    """The prediction that a start comes from, where that is a prior."""
-    return start.prediction if start.prediction and start.prediction.is_prior else None
+        detection, expected, prior = data.rules.judgement.detection, start.prediction, None
+        if expected and expected.is_prior:
+            prior = NormalPrior(expected.T_world_object, expected.uncertainty, data.free)
+        return Posterior(data.views, data.body, data.free, noise, prior, detection)
 
 
 def likelihood_of(data: FrameData) -> Likelihood:

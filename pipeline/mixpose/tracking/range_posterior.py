@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Noise
-from mixpose.fit import blur_schedule
+from mixpose.fit import NormalPrior, blur_schedule
 from mixpose.judgement import DetectionModel, Judged, NoiseModel, Prior, Residuals
 from mixpose.objective import Quadratic, View
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.rigid import perturb, twist_between
-from mixpose.tracking.association_likelihood import RangeRules, sum_associations
-from mixpose.tracking.track import Prediction
+from mixpose.rigid import perturb
+from mixpose.tracking.association_likelihood import AssociationSum, RangeRules, sum_associations
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -38,72 +37,60 @@ def noise_ratio(noise: Noise, rules: RangeRules) -> float:
     return max(1.0, float(np.sqrt(stated.variance)))
 
 
-def fit_ranges(
-    views: Sequence[View],
-    body: Body,
-    T_start: Floats,
-    free: NDArray[np.bool_],
-    noise: float,
-    prior: Prediction | None,
-    detection: DetectionModel,
-) -> Ascent[Floats]:
-    """Climb the posterior of all associations.
+@dataclass(frozen=True)
+class Posterior:
+    """Logarithm of the likelihood over all associations, with the prior.
 
-    Parameters
+    Attributes
     ----------
     views : sequence of View
         For which `are_associated` holds.
     body : Body
-    T_start : (4, 4) array
-        Where to begin.
     free : (6,) bool
     noise : float
         Standard deviation of ranges, in σ_ε.
-    prior : Prediction or None
+    prior : NormalPrior or None
         What was known before; None: nothing.
     detection : DetectionModel
     """
-    widths = [noise]
-    if prior is not None:
-        levels = blur_schedule(views, body, T_start, np.where(free, prior.uncertainty, 0.0))
-        ratios = [max(s / v.observation.sigma for s, v in zip(level, views)) for level in levels]
-        widths = [ratio for ratio in ratios if ratio > noise] + widths
-    ascent = Ascent(T_start, 0.0, False, 0)
-    for width in widths:
-        posterior = Posterior(views, body, free, width, prior, detection)
-        ascent = ascend(posterior.linearise, perturb, ascent.state, free, _OPTIONS)
-    return ascent
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """Logarithm of the likelihood over all associations, with the prior."""
 
     views: Sequence[View]
     body: Body
     free: NDArray[np.bool_]
     noise: float
-    prior: Prediction | None
+    prior: NormalPrior | None
     detection: DetectionModel
+
+    def climbed(self, T_start: Floats) -> Ascent[Floats]:
+        """Climb from a pose (4, 4), at first with ranges that err as far as the prior may."""
+        widths = [self.noise]
+        if self.prior is not None:
+            uncertainty = np.where(self.free, self.prior.uncertainty, 0.0)
+            levels = blur_schedule(self.views, self.body, T_start, uncertainty)
+            sigmas = [view.observation.sigma for view in self.views]
+            ratios = [max(np.divide(level, sigmas).tolist()) for level in levels]
+            widths = [ratio for ratio in ratios if ratio > self.noise] + widths
+        ascent = Ascent(T_start, 0.0, False, 0)
+        for width in widths:
+            posterior = replace(self, noise=width)
+            ascent = ascend(posterior.linearise, perturb, ascent.state, self.free, _OPTIONS)
+        return ascent
+
+    def sums(self, poses: Floats) -> AssociationSum:
+        """The likelihood at poses (H, 4, 4)."""
+        return sum_associations(self.views, self.body, poses, self.noise, self.detection)
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Second-order model; the second derivatives are differences of gradients."""
         scale = self._steps()
         steps = scale[:, None] * np.eye(6)[self.free]
-        twists = np.vstack([np.zeros(6), steps, -steps])
-        poses = perturb(T_world_object, twists)
-        found = sum_associations(self.views, self.body, poses, self.noise, self.detection)
+        found = self.sums(perturb(T_world_object, np.vstack([np.zeros(6), steps, -steps])))
         here, ahead, behind = np.split(found.gradient, [1, 1 + len(steps)])
         H = np.zeros((6, 6))
         H[self.free] = (behind - ahead) / (2 * scale[:, None])
-        H = (H + H.T) / 2
-        value, gradient, curvature = found.log_odds[0], here[0], found.information[0]
-        if self.prior is not None:
-            P = np.diag(np.where(self.free, 1 / np.maximum(self.prior.uncertainty, 1e-12) ** 2, 0))
-            away = twist_between(self.prior.T_world_object, T_world_object)
-            value, gradient = value - 0.5 * away @ P @ away, gradient - P @ away
-            curvature, H = curvature + P, H + P
-        return Quadratic(float(value), gradient, curvature, H)
+        value, C = float(found.log_odds[0]), found.information[0]
+        model = Quadratic(value, here[0], C, (H + H.T) / 2)
+        return model if self.prior is None else self.prior.joined(model, T_world_object)
 
     def _steps(self) -> Floats:
         """Twists that move ranges by a small part of their error."""
@@ -134,9 +121,7 @@ def judge_ranges(
     rules : RangeRules
     """
     T, free = judged.T_world_object, posterior.free
-    found = sum_associations(
-        posterior.views, posterior.body, T[None], posterior.noise, posterior.detection
-    )
+    found = posterior.sums(T[None])
     degrees = max(float(found.met[0]) - int(free.sum()), 0.0)
     noise = Noise(float(found.squares[0]) if degrees else 0.0, degrees)
     inner = np.ix_(free, free)

@@ -18,8 +18,10 @@ from mixpose.tracking.static_clutter import StaticRules
 class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
-    slipped: float = constant(
-        0.5, "of a feature, more that are missed and more beside it that belong to none: a step"
+    aside: float = constant(
+        1.5,
+        "features fewer that a pose a step aside may meet to be a rival still: each is worth four "
+        "of the log odds, or so",
     )
     drawn: int = constant(
         512, "poses scored around a prediction: one lies within a third of the uncertainty in six"

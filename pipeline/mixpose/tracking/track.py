@@ -61,16 +61,10 @@ class SensorTally:
     ----------
     met, in_view : int
         Features with a detection, and all that should have one.
-    missed : float
-        Sum of the weights of those without.
-    surplus : float
-        Detections around the body that belonged to none.
     """
 
     met: int
     in_view: int
-    missed: float
-    surplus: float
 
 
 @dataclass(frozen=True)

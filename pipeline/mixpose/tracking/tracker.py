@@ -23,6 +23,7 @@ from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.proposers.stepped_aside import ASIDE, is_a_step
 from mixpose.tracking.recognition import TRIANGLE, is_known
 from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
@@ -135,8 +136,11 @@ class Tracker:
         """The decision about a frame from all its poses, the most evident first."""
         verdict = decide(ranked, self.free, self.rules.acceptance)
         best = verdict.best
-        if best is None or verdict.status != "ok":
+        if best is None:
             return verdict
+        if verdict.status != "ok":
+            aside = any(is_a_step(self.body, best, one) for one, _ in verdict.kept)
+            return replace(verdict, doubt=ASIDE) if aside else verdict
         if is_reflection(data, best):
             return replace(verdict, status="ambiguous", doubt=MIRRORED)
         track, noise = data.track, self.rules.judgement.noise
@@ -342,9 +346,7 @@ def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
 def _tallies(judged: Judged) -> dict[str, SensorTally]:
     """How each sensor met the body."""
     return {
-        one.name: SensorTally(
-            int(np.count_nonzero(one.shares)), len(one.features), one.missed, one.surplus
-        )
+        one.name: SensorTally(int(np.count_nonzero(one.shares)), len(one.features))
         for one in judged.associations
         if judged.sensors[one.name].used
     }

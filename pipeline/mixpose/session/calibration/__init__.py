@@ -65,8 +65,14 @@ def read_calibration(
     return camera
 
 
-def read_rigs(paths: Sequence[Path]) -> list[Rig]:
+def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
     """Read all cameras of several files; files that belong together may be among them.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    also : str
+        What may be given besides, for the message about a file in no known format.
 
     Raises
     ------
@@ -77,7 +83,7 @@ def read_rigs(paths: Sequence[Path]) -> list[Rig]:
     for path in paths:
         content = read_content(path, str(path))
         with in_file(content.name):
-            format_found = format_of(content)
+            format_found = format_of(content, also)
         formats.setdefault(format_found.name, (format_found, []))[1].append(content)
     rigs: list[Rig] = []
     for each, contents in formats.values():
@@ -90,7 +96,7 @@ def read_rigs(paths: Sequence[Path]) -> list[Rig]:
     return rigs
 
 
-def format_of(content: Content) -> Format:
+def format_of(content: Content, also: str = "") -> Format:
     """The format that a file is in.
 
     Raises
@@ -106,7 +112,7 @@ def format_of(content: Content) -> Format:
     shown = ", ".join(map(str, keys)) if isinstance(keys, dict | list) and keys else "no keys"
     if isinstance(keys, list) and not content.toml:
         shown = "no keys"
-    raise BadKeyError(f"found {shown[:80]}; allowed: {known}")
+    raise BadKeyError(f"found {shown[:80]}; allowed: {known}{also}")
 
 
 def _read(content: Content, wanted: CalibrationTable, model: CameraModel) -> CalibratedCamera:

@@ -117,6 +117,11 @@ def _usual(opened: _Nodes, names: tuple[str, ...]) -> str | None:
 def _names(group: Group) -> list[str]:
     opened = _open(group)
     names = list(_cameras(opened, group[0].stem))
+    if not names and {"R", "T"} <= set(opened.nodes):
+        raise BadKeyError(
+            "holds R and T, where one camera stands to another, and no camera matrix; allowed: "
+            "beside it the file that has the matrices of the two"
+        )
     if not names:  # which says what is there and how to name it
         choose_node(opened, "camera_matrix", None)
     return names

@@ -14,8 +14,9 @@ from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
-from mixpose.tracking.proposers.predicted import predicted, stepped_aside
+from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
+from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 
@@ -39,5 +40,5 @@ class Refinement(Protocol):
         ...
 
 
-PROPOSERS: tuple[Proposer, ...] = (predicted, stepped_aside, multistart, searched, mirrored)
+PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, stepped_aside, mirrored)
 REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair)

@@ -1,12 +1,14 @@
 """Two features that run into each other: one detection, in their middle.
 
-It pulls at both and bends the pose.  The pose that puts their middle where the one detection is
-seen is a rival; its evidence tells whether it is the better one.
+It pulls at both and bends the pose, or is taken for one of them while the other seems hidden.  The
+pose that puts their middle where the one detection is seen is a rival; its evidence tells whether
+it is the better one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -23,14 +25,45 @@ _STEPS = 2  # of least squares: the second starts within 0.01 σ_ε of the first
 
 def merged_pair(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
     """Least squares with merged features in their middle."""
+    if not likelihood.knows_detections:
+        return []
+    reach = data.rules.judgement.association.reach_squared
+    associations: Sequence[Association] = [_paired(one, reach) for one in judged.associations]
     at = judged
-    for _ in range(_STEPS if likelihood.knows_detections else 0):
-        if not any(one.merged for one in at.associations):
+    for _ in range(_STEPS):
+        if not any(one.merged for one in associations):
             break
-        step = _least_squares(at.associations, data.free)
+        step = _least_squares(associations, data.free)
         start = Start(perturb(at.T_world_object, step))
         at = likelihood.judge(likelihood.fit(start), start)
+        associations = at.associations
     return [] if at is judged else [Start(at.T_world_object)]
+
+
+def _paired(one: Association, reach: float) -> Association:
+    """Features that were not met in one with those whose detection is within their reach, too.
+
+    Parameters
+    ----------
+    one : Association
+    reach : float
+        Squared, in variances of C.
+    """
+    met = np.flatnonzero(one.detections >= 0)
+    lost = np.flatnonzero((one.shares == 0) & (one.detections < 0))
+    if not len(met) or not len(lost) or one.merged:
+        return one
+    away = (one.places[met] + one.offsets[met])[None] - one.places[lost, None]
+    squared = (away * away).sum(axis=2) / (2 * one.sigma**2)
+    i, k = np.unravel_index(int(squared.argmin()), squared.shape)
+    if squared[i, k] > reach:
+        return one
+    pair = [int(lost[i]), int(met[k])]
+    shares, offsets, J = one.shares.copy(), one.offsets.copy(), one.J.copy()
+    shares[pair] = one.shares[pair[1]] / 2
+    offsets[pair] = (away[i, k] + one.offsets[pair[1]]) / 2
+    J[pair] = one.J[pair].mean(axis=0)
+    return replace(one, shares=shares, offsets=offsets, J=J, merged=1)
 
 
 def _least_squares(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:

@@ -1,7 +1,8 @@
 """The other tilt of a flat body in one view.
 
 A flat body that is small in the image looks almost the same when it is tilted the other way:
-turned so that depths about its centre change their sign.
+turned so that depths about its centre change their sign.  Both tilts move as smoothly: where the
+frame before left open which is right, motion does not tell.
 """
 
 from __future__ import annotations
@@ -33,4 +34,5 @@ def mirrored(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
     # two mirrors make a turn: across the body's own plane, which leaves it alone, and in depth
     R_tilted = (np.eye(3) - 2 * np.outer(v, v)) @ R @ (np.eye(3) - 2 * np.outer(n, n))
     T_tilted = from_parts(R_tilted, centre_world - R_tilted @ centre)
-    return [Start(T_tilted, data.start_uncertainty / data.rules.proposals.narrowing)]
+    close = data.start_uncertainty / data.rules.proposals.narrowing
+    return [Start(T_tilted, close, T_moved=data.moves_alike(T))]

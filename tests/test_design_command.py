@@ -1,0 +1,84 @@
+"""`mixpose design`, as it is typed."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mixpose.cli import main
+
+TWO_CAMERAS = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
+
+
+def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mixpose", "design", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Path) -> None:
+    text = TWO_CAMERAS.read_text(encoding="utf-8")
+    markers = text[text.index("points = [") : text.index("# Near")].replace("points = ", "")
+    rows = [row.strip(" [],\n") for row in markers.strip().strip("[]").splitlines() if row.strip()]
+    table = "name,x,y,z\n" + "".join(f"mark{k},{row}\n" for k, row in enumerate(rows))
+    (tmp_path / "markers.csv").write_text(table, encoding="utf-8")
+    named = text.replace(f"points = {markers}", 'file = "markers.csv"\n\n')
+    (tmp_path / "two.toml").write_text(named, encoding="utf-8")
+    one = text[: text.index('[[sensor]]\nname = "right"')].replace('"tracker"', '"other"')
+    (tmp_path / "one.toml").write_text(one, encoding="utf-8")
+    options = ("--count", "6", "--tip", "0,0,-100", "--json", "d.json", "--plot", "d.png")
+    noise = ("--noise", "one:left=0.1", "--noise", "two:right=1.2")
+    done = run("two.toml", "one.toml", *options, *noise, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "two: features err by left 0.3 px, right 1.2 px" in done.stdout
+    assert "one: features err by left 0.1 px" in done.stdout
+    assert (
+        "weights   sigma in proportion to what features err by (left 0.25, right 1)" in done.stdout
+    )
+    assert "sigma     features err by much of sigma: right 0.8 of it" in done.stdout
+    assert "moving mark" in done.stdout
+    assert "7 markers of tracker (mark0, mark1" in done.stdout
+    result: dict[str, Any] = json.loads((tmp_path / "d.json").read_text(encoding="utf-8"))
+    assert [system["name"] for system in result["systems"]] == ["two", "one"]
+    equal = result["systems"][1]["equals_first_with"]
+    assert equal["noise"]["left"] == pytest.approx(0.1 * equal["factor"])
+    assert len(result["systems"][0]["deviations"]) == 6
+    assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--tip", "1,2"], "--tip: found '1,2'; allowed: three numbers"),
+        (["--volume", "1,-2,3"], "--volume: found 1,-2,3; allowed"),
+        (["--noise", "left"], "--noise: found 'left'; allowed: SENSOR=NUMBER"),
+        (["--noise", "middle=1"], "--noise: found no sensor 'middle'; sensors: left, right"),
+        (["--noise", "x:left=1"], "--noise: found no system 'x'"),
+        (["--turn", "200"], "--turn: found 200"),
+        (["--plot", "a.gif"], "--plot a.gif: found '.gif'"),
+        (["--poses", "none.jsonl"], "none.jsonl"),
+    ],
+)
+def test_wrong_options_are_told_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as leaving:
+        main(["design", str(TWO_CAMERAS), *options])
+    assert leaving.value.code in (2, 3)
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert words in said

@@ -1,0 +1,90 @@
+"""The command ``mixpose import``: what it takes for granted, and files that are not for it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import calibration_texts as texts
+import cv2
+import numpy as np
+import pytest
+
+from mixpose.errors import SessionError
+from mixpose.importing import gather, session_text
+from mixpose.session import load_session
+
+
+def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mixpose", *map(str, arguments)],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
+    copied = texts.toml("cam_", names=True)
+    copied += copied.split("[metadata]")[0].replace("cam_", "cam_1").replace("view", "again")
+    (tmp_path / "calibration.toml").write_text(copied, encoding="utf-8")
+    (tmp_path / "marks.csv").write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
+    (tmp_path / "out").mkdir()
+    done = run("import", "calibration.toml", "marks.csv", "-o", "out/s.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == ""
+    assert "view0 and again0 are the same camera at the same place" in done.stderr
+    assert "taken to be in mm, which the file does not say; if not, add --lengths" in done.stderr
+    assert "4 cameras (view0, view1, again0, again1), lengths in mm -> out/s.toml" in done.stderr
+    session = load_session(tmp_path / "out" / "s.toml")
+    assert session.body.name == "marks"
+    again = run("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
+    assert again.returncode == 2
+    assert "is there already" in again.stderr
+
+
+def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> None:
+    """Three cameras, 0.3 m apart, whose chain was copied without its unit."""
+    chain = texts.kalibr()
+    chain += chain[chain.index("cam1:") :].replace("cam1:", "cam2:")
+    (tmp_path / "chain.yaml").write_text(chain, encoding="utf-8")
+    output = tmp_path / "s.toml"
+    output.write_text(
+        session_text(gather([tmp_path / "chain.yaml"], "m", None), output), encoding="utf-8"
+    )
+    session = load_session(output)
+    text = output.read_text(encoding="utf-8").replace('unit = "m"', 'unit = "mm"')
+    lines = text.replace("[0.06, 0.0, 0.0]", "[60, 0, 0]").replace("[0.0, 0.1, 0.0]", "[0, 90, 0]")
+    for setup in session.sensors:
+        source = f'# source = "{setup.name}/*.png"'
+        lines = lines.replace(source, f'source = "{setup.name}.csv"')
+        (tmp_path / f"{setup.name}.csv").write_text("frame,u,v\n0,9,9\n", encoding="utf-8")
+    output.write_text(lines, encoding="utf-8")
+    done = run("check", "s.toml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "'cam0' and 'cam1' stand 0.32 mm apart" in done.stdout
+    assert "are translations in mm?" in done.stdout
+
+
+def test_an_unknown_unit_of_two_files_names_both(tmp_path: Path) -> None:
+    files = texts.stereo_storage(tmp_path, "yml")
+    assert len(files) == 2
+    (warning, *_) = gather(files, "mm", None).warnings
+    assert warning.startswith(f"translations of {files[0].name} and {files[1].name} are taken")
+
+
+def test_where_cameras_stand_without_their_matrices_is_told(tmp_path: Path) -> None:
+    (where,) = [f for f in texts.stereo_storage(tmp_path, "yml") if "M1" not in f.read_text()]
+    with pytest.raises(SessionError, match=r"holds R and T, .* no camera matrix; allowed: beside"):
+        gather([where], "mm", None)
+
+
+def test_an_image_is_called_one_and_bodies_are_among_what_is_allowed(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((4, 4), np.uint8))
+    with pytest.raises(SessionError, match=r"a.png: found an image; allowed: a text file"):
+        gather([tmp_path / "a.png"], "mm", None)
+    (tmp_path / "n.yml").write_text("a: 1\n", encoding="utf-8")
+    with pytest.raises(SessionError, match=r"COLMAP's .*; or a body: .csv, .rom, .vsk, .obj"):
+        gather([tmp_path / "n.yml"], "mm", None)

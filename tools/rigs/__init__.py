@@ -1,0 +1,1 @@
+"""Rigs with faults, for `tools/real_errors.py`."""
