@@ -56,6 +56,12 @@ class Adjusted:
     weighted: tuple[tuple[Pairs, Floats, Floats], ...]
     inflation: float
 
+    @property
+    def certainty(self) -> float:
+        """Share of the weight of pairs of which each is the nearest that the other has."""
+        nearest = sum(float(weight @ pairs.nearest) for pairs, _, weight in self.weighted)
+        return nearest / max(sum(float(weight.sum()) for _, _, weight in self.weighted), 1e-9)
+
 
 def first_blurs(
     bundle: Bundle, rig: Rig, poses: Floats, sigmas: Floats, rules: CalibrationRules
