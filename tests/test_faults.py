@@ -74,6 +74,12 @@ def test_what_is_given_wrong_all_along_is_told_by_what_is_seen(
     assert any(said in line for line in found.said), found.said
 
 
+def test_a_camera_that_is_a_frame_late_is_told_from_one_that_is_bumped(tmp_path: Path) -> None:
+    found = outcome(FAULTS["one frame late"], tmp_path / "recording", stop=8)
+    assert found.wrong == 0
+    assert found.is_named, found.said
+
+
 def test_a_body_that_is_one_per_cent_too_small_is_named_by_what_it_is_met_off(
     tmp_path: Path,
 ) -> None:

@@ -136,6 +136,38 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
     assert 0.5 < np.mean(errors[20:]) < 2.0
 
 
+def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> None:
+    blind = replace(ALONE, fields=replace(ALONE.fields, deviation=0.0))
+    made = {name: np.array(shift) for name, shift in (("0", [0.8, -0.5]), ("1", [-0.6, 0.7]))}
+    errors: dict[NoiseModel, list[float]] = {ALONE: [], blind: []}
+    for model, found in errors.items():
+        rng, residuals = np.random.default_rng(9), Residuals()
+        for _ in range(60):
+            sensors = []
+            for name in made:
+                one = sensor(name, rng, np.zeros((12, 2)))
+                shift = np.broadcast_to(rng.normal(0, 1, (2, 6)), (12, 2, 6))
+                sensors.append(replace(one, J=shift + 0.3 * one.J))
+            noise = [made[one.name] + rng.normal(0, 0.1, (12, 2)) for one in sensors]
+            left, off = fitted(sensors, noise)
+            known = noise_of(left, FREE, residuals, model)
+            residuals = known.remembered
+            found.append(float(off @ np.linalg.solve(known.covariance, off) / 6))
+    # one degree of freedom in six is as large as it is; the others are noise
+    assert np.mean(errors[ALONE][20:]) < 2.0
+    assert np.mean(errors[blind][20:]) > 2 * np.mean(errors[ALONE][20:])
+
+
+def test_sensors_that_were_seen_together_before_are_remembered_apart() -> None:
+    rng, residuals = np.random.default_rng(4), Residuals()
+    for names in ("01", "0", "01", "1", "01"):
+        found = [sensor(name, rng, rng.normal(0, 0.1, (8, 2))) for name in names]
+        residuals = noise_of(found, FREE, residuals, MODEL).remembered
+    kept = {one.names: len(one.vector) for one in residuals.lasting}
+    # an offset and a slant of each: 2 + 4 sizes
+    assert kept == {("0", "1"): 12, ("0",): 6, ("1",): 6}
+
+
 def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
     rng = np.random.default_rng(6)
     residuals, errors, plain = Residuals(), [], []

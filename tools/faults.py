@@ -211,7 +211,9 @@ FAULTS: dict[str, Fault] = {
         redrawn("right", range(10, 15), lambda a: 0 * a + 255), "'right' .*no feature.* 10 to 14"
     ),
     "torn for 5 frames": Fault(torn("right", range(10, 15)), "'right' .*"),
-    "one frame late": Fault(instead("right", range(1, 40), lambda k: k - 1), "'right'"),
+    "one frame late": Fault(
+        instead("right", range(1, 40), lambda k: k - 1), "'right' is a frame late"
+    ),
     "bumped by 0.5° from frame 20": Fault(
         bumped("right", range(20, 40), 0.5), "from frame 20 on.*bumped"
     ),

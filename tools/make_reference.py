@@ -36,6 +36,7 @@ from mixpose.session.schema import (
 )
 from mixpose.session.schema_common import ExtractTable, Placement, Table
 from mixpose.session.schema_sensors import (
+    CalibrationErrorTable,
     CalibrationTable,
     CameraTable,
     LaterationTable,
@@ -60,6 +61,7 @@ SECTIONS: list[tuple[str, type[Table], tuple[type[Table], ...]]] = [
     ("`[[sensor]]`: where a camera stands", PlacedTable, (SensorTable,)),
     ('`[[sensor]]` with `model = "pinhole"` or `"fisheye"`', CameraTable, (PlacedTable,)),
     ("`calibration = { ... }`", CalibrationTable, ()),
+    ("`calibration_error = { ... }`", CalibrationErrorTable, ()),
     ('`[[sensor]]` with `model = "parallel"`', ParallelTable, (PlacedTable,)),
     ('`[[sensor]]` with `model = "lateration"`', LaterationTable, (SensorTable,)),
 ]

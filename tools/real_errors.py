@@ -27,11 +27,12 @@ from rigs.cases import CASES, Case
 from scipy.optimize import least_squares
 
 import mixpose
-from mixpose.objective import View
+from mixpose.body import Body
+from mixpose.objective import View, project_body
 from mixpose.poses.consistency import normalised_error_squared
 from mixpose.poses.jsonl import read_poses
 from mixpose.records import Estimate, FrameSet, PointPattern
-from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
+from mixpose.rigid import perturb, rotation_angle_deg, twist_between
 from mixpose.simulation import simulate
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -90,8 +91,8 @@ def _recorded(case: Case, seed: int, folder: Path) -> Path:
 def _compared(folder: Path, case: Case) -> Figures:
     session = mixpose.load_session(folder / "session.toml")
     truth = {one.frame: one.T_world_object for one in read_poses(folder / "truth.jsonl").poses}
-    # the oracle does not know of moments and sizes
-    oracle = case.against is None and session.body.shape == "point"
+    # the oracle does not know of moments
+    oracle = case.against is None and not any(one.readout or one.delay for one in session.sensors)
     rows: list[tuple[float, ...]] = []
     count = phantoms = 0
 
@@ -108,7 +109,7 @@ def _compared(folder: Path, case: Case) -> Figures:
         total, dimensions = normalised_error_squared(twist_between(T_true, T), estimate.covariance)
         known = (np.nan, np.nan)
         if oracle:
-            known = _errors(robust_least_squares(views, session.body.means, T_true), T_true)
+            known = _errors(robust_least_squares(views, session.body, T_true), T_true)
         rows.append((*_errors(T, T_true), *known, total or np.inf, dimensions))
 
     for _ in mixpose.run(session, watch=watch):
@@ -133,24 +134,25 @@ def _errors(T: Floats, T_true: Floats) -> tuple[float, float]:
     return float(rotation_angle_deg(T, T_true)), shift
 
 
-def robust_least_squares(views: Sequence[View], points: Floats, T_true: Floats) -> Floats:
+def robust_least_squares(views: Sequence[View], body: Body, T_true: Floats) -> Floats:
     """The pose (4, 4) by robust least squares, where it is known which detection is whose."""
     pairs = []
     for view in views:
         pattern = view.observation.pattern
         assert isinstance(pattern, PointPattern)
-        y, seen = view.sensor.project(transform(T_true, points))
+        projection = project_body((view.sensor,), body)
+        at = projection.project(T_true[None])
         if not len(pattern.points):
             continue
-        apart = np.linalg.norm(pattern.points - y[:, None], axis=2)
+        apart = np.linalg.norm(pattern.points - at.y[0, 0, :, None], axis=2)
         nearest = apart.argmin(axis=1)
-        mine = seen & (apart.min(axis=1) < KNOWN_PX)
-        mine &= apart[:, nearest].argmin(axis=0) == np.arange(len(y))
-        pairs.append((view.sensor, points[mine], pattern.points[nearest[mine]]))
+        mine = at.seen[0, 0] & (apart.min(axis=1) < KNOWN_PX)
+        mine &= apart[:, nearest].argmin(axis=0) == np.arange(len(mine))
+        pairs.append((projection, mine, pattern.points[nearest[mine]]))
 
     def residuals(twist: Floats) -> Floats:
         T = perturb(T_true, twist * np.repeat([1.0, 0.01], 3))
-        return np.concatenate([(s.project(transform(T, p))[0] - y).ravel() for s, p, y in pairs])
+        return np.concatenate([(p.project(T[None]).y[0, 0, i] - y).ravel() for p, i, y in pairs])
 
     found = least_squares(residuals, np.zeros(6), loss="soft_l1", f_scale=SCALE_PX, xtol=1e-12)
     return perturb(T_true, found.x * np.repeat([1.0, 0.01], 3))

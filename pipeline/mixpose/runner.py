@@ -29,6 +29,7 @@ from mixpose.records import (
 )
 from mixpose.scene import Member, Outcome, Scene
 from mixpose.selection import ALL_FRAMES, Selection
+from mixpose.sensors import doubted
 from mixpose.threads import one_blas_thread
 from mixpose.tracking import (
     UNKNOWN_S,
@@ -336,6 +337,7 @@ def _view(
 ) -> View:
     """What a sensor observed, and when."""
     told = 0.0 if setup.delay == "estimate" else setup.delay
+    error = setup.calibration_error
     if (setup.delay or setup.readout) and frame_set.time_s is None:
         key = "delay" if setup.delay else "readout"
         raise SessionError(
@@ -349,6 +351,7 @@ def _view(
         _delay(frame_set, frame) + told,
         setup.readout,
         UNKNOWN_S if setup.delay == "estimate" else None,
+        doubts=doubted(setup.sensor, error) if error else (),
     )
 
 

@@ -104,7 +104,7 @@ SWITCHES = (
     Switch("noise: no memory", ruled("judgement.noise", memory=0.0)),
     Switch("noise: no outdone", ruled("judgement.noise", known=NEVER)),
     Switch("noise: no typical", ruled("judgement.noise.errors", typical_degrees=1e-3)),
-    Switch("noise: nothing lasts", ruled("judgement.noise", lasting=0.0, slanted=0.0)),
+    Switch("noise: nothing lasts", ruled("judgement.noise", lasting=0.0)),
     Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("blurs always", ruled("fit", near=NEVER)),

@@ -53,9 +53,23 @@ _FIELDS = (
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "np.tensordot(shares.variances * factors, parts, 1)",
-        "shares.variances[0] * factors[0] * parts[0]",
+        "np.tensordot(shares.variances * factors, frame.parts, 1)",
+        "shares.variances[0] * factors[0] * frame.parts[0]",
         "a camera that was turned after its calibration leaves the pose as sure as before",
+    ),
+    Mutant(
+        "judgement-what-lasts-is-forgotten",
+        "judgement/lasting.py",
+        "if one.names == self.names and len(one.vector) == len(self.vector):",
+        "if one.names != self.names:",
+        "what is off by the same in every frame never shows",
+    ),
+    Mutant(
+        "judgement-calibrations-are-exact",
+        "judgement/noise.py",
+        "inner += frame.by_calibration @ frame.by_calibration.T",
+        "inner += 0",
+        "a stated error of the focal length leaves the distance as sure as before",
     ),
     Mutant(
         "judgement-markers-off-are-noise",

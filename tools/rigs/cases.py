@@ -113,7 +113,8 @@ def _web_cam(k: int) -> list[str]:
 _TABLES = Case(TABLE, source=".csv")
 _MOVING = Case(FAST, source=".csv")
 _BALLS = ('shape = "sphere"', "radius = 6.0")
-_FACING = (-1.2, 0.0, 0.4)  # a plate that all cameras see
+# as large as what `changes.bad_lens` does
+_LENS = "calibration_error = { focal = 0.0003, principal_point = 0.35 }"
 
 CASES = {
     # what independent noise makes
@@ -173,6 +174,22 @@ CASES = {
         _TABLES, cameras=1, points=_tuples(BOARD), change=changes.bad_lens
     ),
     "bad lens, board": replace(_TABLES, points=_tuples(BOARD), change=changes.bad_lens),
+    "turned camera, stated": replace(
+        _TABLES,
+        change=changes.turned,
+        told=_told("calibration_error = { rotation_deg = 0.06 }"),
+    ),
+    "bad lens, stated": replace(_TABLES, change=changes.bad_lens, told=_told(_LENS)),
+    "bad lens, one camera, stated": replace(
+        _TABLES,
+        cameras=1,
+        points=_tuples(BOARD),
+        change=changes.bad_lens,
+        told=_told(_LENS),
+    ),
+    "bad lens, board, stated": replace(
+        _TABLES, points=_tuples(BOARD), change=changes.bad_lens, told=_told(_LENS)
+    ),
     "bad body": replace(_TABLES, change=changes.bad_body),
     # everything at once
     "two web cams, everything": Case(

@@ -25,6 +25,7 @@ CAUSES = (
 """Why sensors may contradict each other."""
 
 _TRIED = 2  # frames
+_FIRST = 40  # frames among which they are: to get far into a video takes as long as to read it
 
 
 def geometry_warnings(
@@ -76,7 +77,7 @@ def _is_seen(session: Session, surveys: Mapping[str, Survey]) -> bool:
 def _shared(sources: Mapping[str, Source], surveys: Mapping[str, Survey]) -> Iterator[FrameSet]:
     """A few frames in which every sensor sees something."""
     seen = [{*each.numbers} - {*each.empty} for each in surveys.values()]
-    numbers = sorted(set.intersection(*seen))
+    numbers = sorted(set.intersection(*seen))[:_FIRST]
     for number in numbers[:: max(len(numbers) // _TRIED, 1)][:_TRIED]:
         frames = {}
         for name, source in sources.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,6 +24,7 @@ from mixpose.session import SensorSetup, Session
 Views: TypeAlias = Sequence[View]
 
 PATIENCE_S = 20.0  # of processor time, for all trials together
+_TRIED = 2  # frames that a change must explain
 _OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
 
 
@@ -44,9 +45,14 @@ def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | 
     session : Session
         Of one body.
     frames : sequence of (int, sequence of View)
-        Frames, by number, that are not explained as they are.
+        Frames, by number, that are not explained as they are; three in a row tell of a sensor that
+        is one late.
     """
     began = time.process_time()
+    late = _late(session, frames)
+    if late is not None:
+        return late
+    frames = frames[:_TRIED]
     for trial in _trials(session, frames):
         if time.process_time() - began > PATIENCE_S:
             return None
@@ -55,6 +61,30 @@ def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | 
         if frames and all(_explains(changed, n, trial.views(views)) for n, views in frames):
             return trial.meaning
     return None
+
+
+def _late(session: Session, frames: Sequence[tuple[int, Views]]) -> str | None:
+    """The sensor whose frames belong to those before, in words."""
+    numbers = [number for number, _ in frames[: _TRIED + 1]]
+    in_a_row = len(numbers) > _TRIED and len({*np.diff(numbers).tolist()}) == 1
+    if not in_a_row:
+        return None
+    anywhere = replace(session, start=None)
+    for setup in session.sensors:
+        given = [
+            _with_next(now, after, setup.name)
+            for (_, now), (_, after) in pairwise(frames[: _TRIED + 1])
+        ]
+        if all(_explains(anywhere, n, views) for n, views in zip(numbers, given)):
+            return (
+                f"{setup.name!r} is a frame late: with each of its frames given to the one before"
+            )
+    return None
+
+
+def _with_next(views: Views, after: Views, name: str) -> Views:
+    """The views of a frame, that of one sensor from the frame after."""
+    return [view for view in views if view.name != name] + [v for v in after if v.name == name]
 
 
 def _explains(session: Session, number: int, views: Views) -> bool:

@@ -69,7 +69,7 @@ RunOutput = Annotated[
 ]
 RunFormat = Annotated[
     Format | None,
-    typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; or jsonl."),
+    typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .bop.csv; jsonl without."),
 ]
 Sources = Annotated[
     list[str] | None,

@@ -29,7 +29,7 @@ _SURE = 100.0  # squared offset in its own noise from which that is no chance
 _FAR = 10.0  # times what is usual for a sensor: its features are met far off
 _AT_LEAST = 0.2  # of sigma, for that
 _USUAL = 100  # frames by which it is told what is usual
-_KEPT = 2  # frames that are tried with other sessions
+_KEPT = 3  # frames that are tried with other sessions
 _SHOWN = 3  # stretches that are named
 _PIXELS = 37  # of an image every so many are compared first
 

@@ -20,6 +20,8 @@ from mixpose.density import (
 )
 from mixpose.objective import MatchedObjective
 from mixpose.records import PointPattern
+from mixpose.rigid import transform
+from mixpose.sensors import by_calibration
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -59,6 +61,9 @@ class Association:
         Number of observed features.
     detections : (n,) int
         The observed features by which they were met; -1 for none.
+    by_calibration : (n, m, K) float64
+        By how much each is elsewhere where the sensor's calibration is off by a standard deviation
+        in one of K things.
     merged : int
         Features that were detected as one with another.
     surplus : float
@@ -81,6 +86,7 @@ class Association:
     merged: int = 0
     surplus: float = 0.0
     detections: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    by_calibration: Floats | None = None
 
     @cached_property
     def met(self) -> float:
@@ -145,7 +151,8 @@ def associate(
         The objective at the pose.
     """
     at, sampled, over = objective.match(T_world_object[None])
-    node_weights = objective.projection.body.nodes.weights
+    nodes = objective.projection.body.nodes
+    node_weights, world = nodes.weights, transform(T_world_object, nodes.points)
     found, value = [], 0.0
     for k, view in enumerate(objective.views):
         m, observation = int(objective.projection.dimensions[k]), view.observation
@@ -185,6 +192,9 @@ def associate(
                 detections=detections,
                 merged=merged,
                 surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
+                by_calibration=by_calibration(view.doubts, world[features])
+                if view.doubts
+                else None,
             )
         )
     return found, value

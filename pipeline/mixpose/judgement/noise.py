@@ -35,6 +35,7 @@ from scipy.special import chdtri, fdtri
 from mixpose.constants import constant
 from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled
 from mixpose.judgement.association import Association
+from mixpose.judgement.lasting import Lasting, LastingRules
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -49,6 +50,7 @@ class NoiseModel:
     """What is believed of detection noise before residuals are seen, and for how long."""
 
     errors: ErrorRules = ErrorRules()
+    fields: LastingRules = LastingRules()
     smallest: float = constant(1e-3, "of σ_ε: float32 densities do not resolve residuals below")
     by_chance: float = constant(
         0.999, "frames whose residuals are larger than so many by chance stand on their own"
@@ -62,16 +64,11 @@ class NoiseModel:
     )
     lasting: float = constant(
         0.18,
-        "of the noise: an offset that all features of a sensor have in common, before it is seen "
-        "(a chessboard, web cams and action cameras: 0.6-5)",
+        "of the noise: an offset that all features of a sensor have in common, or what turns, "
+        "scales and shears them, before it is seen (half and twice of it do as well)",
     )
     lasting_fields: float = constant(
         3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
-    )
-    slanted: float = constant(
-        0.7,
-        "of `lasting`: what turns, scales and shears (a chessboard 0.65, web cams and action "
-        "cameras 0.25-0.4)",
     )
 
     def enlargement(self, directions: int, degrees: float) -> float:
@@ -111,10 +108,14 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True)
 class Residuals:
-    """What is remembered of residuals: each sensor's noise in σ_ε, and what fields have of it."""
+    """What is remembered of residuals: each sensor's noise in σ_ε, and what fields have of it.
+
+    Some fields change from frame to frame, as `moments` know; some last.
+    """
 
     noise: Mapping[str, Noise] = field(default_factory=dict)
     moments: Moments = Moments()
+    lasting: tuple[Lasting, ...] = ()
 
     @property
     def total(self) -> Noise:
@@ -169,15 +170,24 @@ def noise_of(
     degrees = float(sums[1].sum())
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
     variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
-    own, parts = _moments(associations, offsets, variances, free, model)
-    moments = before.moments.joined(own, model.memory)
-    shares = _shares(moments, own, float(np.mean([one.met for one in associations])), model)
+    frame = _moments(associations, offsets, variances, free, model)
+    moments = before.moments.joined(frame.moments, model.memory)
+    met = float(np.mean([one.met for one in associations]))
+    shares = _shares(moments, frame.moments, met, model)
+    lasting = frame.lasting.after(before.lasting, model.fields)
     # fields last: a further frame shows no more of them
     factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
     covariance = np.zeros((6, 6))
-    covariance[np.ix_(free, free)] = np.tensordot(shares.variances * factors, parts, 1)
+    inner = np.tensordot(shares.variances * factors, frame.parts, 1)
+    inner += frame.by_calibration @ frame.by_calibration.T
+    fields = lasting.moments(model.fields)
+    if fields is not None:
+        inner += frame.by_fields @ fields @ frame.by_fields.T
+    covariance[np.ix_(free, free)] = inner
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
-    return FrameNoise(seen.variances, covariance, Residuals({**before.noise, **noise}, moments))
+    kept = lasting.kept(before.lasting, model.fields)
+    remembered = Residuals({**before.noise, **noise}, moments, kept)
+    return FrameNoise(seen.variances, covariance, remembered)
 
 
 def joined_offsets(associations: Sequence[Association]) -> Offsets:
@@ -215,7 +225,7 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     of_markers = model.lasting_fields * own.expected[3, 3] + _LEAST
     believed = np.array([_LEAST, weights[1], weights[1], of_markers])
     expected = moments.expected + np.diag(believed)
-    size = np.array([1.0, model.lasting**2, (model.slanted * model.lasting) ** 2, 0.0])
+    size = np.array([1.0, model.lasting**2, model.lasting**2, 0.0])
     seen = moments.seen + believed * size
     scale = 1 / np.maximum(expected.diagonal(), _LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
@@ -225,21 +235,41 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
 
 
+class _Frame(NamedTuple):
+    """What one frame shows.
+
+    Attributes
+    ----------
+    moments : Moments
+    parts : (4, k, k) float64
+        Covariances that unit variances of each kind make.
+    lasting : Lasting
+        What it says of fields that last.
+    by_fields : (k, q) float64
+        How these move the pose.
+    by_calibration : (k, K) float64
+        How calibrations do that are off by a standard deviation in one thing each.
+    """
+
+    moments: Moments
+    parts: Floats
+    lasting: Lasting
+    by_fields: Floats
+    by_calibration: Floats
+
+
 def _moments(
     associations: Sequence[Association],
     offsets: Offsets,
     variances: Floats,
     free: NDArray[np.bool_],
     model: NoiseModel,
-) -> tuple[Moments, Floats]:
-    """Of one frame, and the covariances (4, k, k) that unit variances of each kind make.
-
-    Detections that are farther off than the extraction errs are left out.
-    """
+) -> _Frame:
+    """Of one frame.  Detections that are farther off than the extraction errs are left out."""
     count = int(free.sum())
     clear = offsets.squared <= model.errors.outlying**2 * variances[offsets.sensor]
     ends = np.cumsum(np.bincount(offsets.sensor, minlength=len(associations)))[:-1]
-    parts, blocks, shifts = [], [], []
+    parts, blocks, shifts, doubts = [], [], [], []
     for one, inlying, variance in zip(associations, np.split(clear, ends), variances.tolist()):
         shares = np.where(inlying, one.shares, 0.0)
         scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
@@ -247,6 +277,9 @@ def _moments(
         parts.append((scale * rows).reshape(-1, count + 1))
         blocks.append(_fields(one.places, shares))
         shifts.append((scale * one.J[..., :3]).reshape(-1, 3))
+        if one.by_calibration is not None:
+            rows = (scale * one.by_calibration).reshape(parts[-1].shape[0], -1)
+            doubts.append(parts[-1][:, :count].T @ rows)
     weighted, shift = np.concatenate(parts), np.concatenate(shifts)
     shift /= max(float(np.sqrt((shift**2).sum() / max(shift.size, 1))), _LEAST)
     J, r = weighted[:, :count], weighted[:, count]
@@ -254,18 +287,27 @@ def _moments(
     inverse = _inverse(J.T @ J)
     drawn = [inverse @ (J.T @ one) for one in P]
     left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
+    rest, split = np.hstack(left), P[0].shape[1]
+    information, vector = rest.T @ rest, rest.T @ r
     K, once = np.zeros((3, 3)), np.zeros(3)
-    K[:2, :2] = [[float(((a.T @ b) ** 2).sum()) for b in left] for a in P]
-    once[:2] = [float((a * b).sum()) for a, b in zip(P, left, strict=True)]
+    kinds = [slice(split), slice(split, None)]
+    K[:2, :2] = [[float((information[a, b] ** 2).sum()) for b in kinds] for a in kinds]
+    once[:2] = [float(np.trace(information[a, a])) for a in kinds]
     of_markers = _of_markers(associations, shift, J, r, left, inverse)
     K[2], once[2] = of_markers.K, of_markers.once
     K[:2, 2] = K[2, :2]
     degrees = float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count
     squares = [float(r @ r), *(float(((one.T @ r) ** 2).sum()) for one in P)]
     squares.append(of_markers.squares)
+    roots = np.sqrt(variances)
+    sizes = np.concatenate([np.repeat(roots, [f[k].shape[1] for f in blocks]) for k in (0, 1)])
+    names = tuple(one.name for one in associations)
+    lasting = Lasting(names, information / np.outer(sizes, sizes), vector / sizes)
     expected = np.block([[np.array([[degrees]]), once[None]], [once[:, None], K]])
     own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
-    return own, np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
+    by_kind = np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
+    by_calibration = inverse @ np.hstack([np.zeros((count, 0)), *doubts])
+    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes, by_calibration)
 
 
 class _OfMarkers(NamedTuple):

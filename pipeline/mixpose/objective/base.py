@@ -38,6 +38,8 @@ class View:
         Standard deviation of a delay that is estimated; None where it is told.
     estimated : float
         Of the delay, what was estimated.
+    doubts : tuple of Sensor
+        Where its calibration is not exact: the sensor as it stands still, and as it might be.
     """
 
     name: str
@@ -47,6 +49,7 @@ class View:
     readout: float = 0.0
     unsure: float | None = None
     estimated: float = 0.0
+    doubts: tuple[Sensor, ...] = ()
 
 
 class Quadratic(NamedTuple):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from mixpose.sensors.base import OUTSIDE, Sensor
 from mixpose.sensors.batch import SensorBatch
+from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted
 from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
@@ -25,6 +26,7 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
 __all__ = [
     "OUTSIDE",
     "SENSOR_MODELS",
+    "CalibrationError",
     "FisheyeCamera",
     "Motion",
     "ParallelBeam",
@@ -34,6 +36,8 @@ __all__ = [
     "RollingSensor",
     "Sensor",
     "SensorBatch",
+    "by_calibration",
+    "doubted",
     "facing",
     "in_motion",
     "moments",

@@ -70,6 +70,39 @@ class CalibrationTable(Table):
     """
 
 
+class CalibrationErrorTable(Table):
+    """How far off a calibration may be, as standard deviations. Poses stay as they are; their
+    covariances know of it, to first order. `mixpose calibrate` prints such numbers; where a rig was
+    bumped or a lens refocused, they are yours to guess (`docs/sensors-in-time.md`).
+    """
+
+    focal: Annotated[Number, Field(ge=0, le=0.5, description="a share, from 0 to 0.5")] = 0.0
+    """Of the focal length, as a share of it; with parallel beams of `pixel_size`.
+
+    Example: `focal = 0.001`
+    """
+    principal_point: Annotated[Number, Field(ge=0, description="px, at least 0")] = 0.0
+    """Of the principal point along each axis, in px.
+
+    Example: `principal_point = 0.5`
+    """
+    rotation_deg: Annotated[Number, Field(ge=0, le=45, description="degrees, from 0 to 45")] = 0.0
+    """Of the orientation about each axis.
+
+    Example: `rotation_deg = 0.05`
+    """
+    position: Annotated[Number, Field(ge=0, description="a length, at least 0")] = 0.0
+    """Of where the sensor stands along each axis, in `unit`.
+
+    Example: `position = 0.5`
+    """
+    range_bias: Annotated[Number, Field(ge=0, description="a length, at least 0")] = 0.0
+    """Of `range_bias`, with `model = "lateration"`.
+
+    Example: `range_bias = 0.02`
+    """
+
+
 class SensorTable(Table):
     """What every `[[sensor]]` has, whatever its `model`."""
 
@@ -109,6 +142,15 @@ class SensorTable(Table):
     delay is known (`docs/sensors-in-time.md`).
 
     Example: `delay = 0.006`
+    """
+    calibration_error: Annotated[
+        CalibrationErrorTable | None,
+        Field(description="a table like { rotation_deg = 0.05 }"),
+    ] = None
+    """How far off the calibration may be: standard deviations that covariances are to know of. Left
+    out: what residuals show of it.
+
+    Example: `calibration_error = { focal = 0.001, principal_point = 0.5, rotation_deg = 0.05 }`
     """
     extract: Annotated[ExtractTable | None, Field(description="a table [sensor.extract]")] = None
     """Keys of `[extract]` that differ for this sensor.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,14 @@ import numpy as np
 from mixpose.errors import SessionError
 from mixpose.extraction import ExtractOptions, check_options
 from mixpose.rigid import Floats, from_parts
-from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.sensors import (
+    CalibrationError,
+    FisheyeCamera,
+    ParallelBeam,
+    PinholeCamera,
+    RangeSensor,
+    Sensor,
+)
 from mixpose.session.calibration import CalibratedCamera, read_calibration
 from mixpose.session.intrinsics import MATRIX_FORM, Intrinsics, camera_matrix, distortion
 from mixpose.session.messages import BadKeyError, under
@@ -147,7 +155,23 @@ def _build_sensor(
         delay=table.delay,
         readout=getattr(table, "readout", 0.0),
         exposure=getattr(table, "exposure", 0.0),
+        calibration_error=_calibration_error(table),
     )
+
+
+def _calibration_error(table: AnySensorTable) -> CalibrationError | None:
+    """What may be off, of things that such a sensor has."""
+    if table.calibration_error is None:
+        return None
+    error = CalibrationError(**table.calibration_error.model_dump())
+    is_range = isinstance(table, LaterationTable)
+    for key in ("focal", "principal_point", "rotation_deg") if is_range else ("range_bias",):
+        if getattr(error, key):
+            allowed = "position, range_bias" if is_range else "all but range_bias"
+            raise BadKeyError(
+                f'stands with model = "{table.model}"; allowed: {allowed}', "calibration_error", key
+            )
+    return error if any(astuple(error)) else None
 
 
 def _camera(table: CameraTable, folder: Path, unit: Unit) -> PinholeCamera | FisheyeCamera:

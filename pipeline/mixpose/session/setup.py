@@ -11,7 +11,7 @@ from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
 from mixpose.records import label_of
 from mixpose.rigid import Floats
-from mixpose.sensors import Sensor
+from mixpose.sensors import CalibrationError, Sensor
 
 Unit: TypeAlias = Literal["m", "cm", "mm", "um"]
 
@@ -97,6 +97,8 @@ class SensorSetup:
         Seconds by which frames are taken later than their times say; to be estimated.
     readout, exposure : float
         Seconds from a camera's first row to its last, and for which a row collects light.
+    calibration_error : CalibrationError or None
+        How far off the geometry may be; None: exact.
     """
 
     name: str
@@ -112,6 +114,7 @@ class SensorSetup:
     delay: float | Literal["estimate"] = 0.0
     readout: float = 0.0
     exposure: float = 0.0
+    calibration_error: CalibrationError | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,83 @@
+"""Errors that last: fields by which the features of a sensor are off in all frames alike.
+
+A camera that was turned after its calibration, a wrong focal length or lens move the features of a
+sensor by much the same field in every frame.  Of it a pose takes most for its own; what is left
+shows a little of it in each frame, which adds up.  With the fields of all sensors as columns P, of
+sizes γ in σ_ε, and R what a pose leaves of errors, the residuals r of a frame have the information
+PᵀWRP about γ, and the vector PᵀWr.  With their sums A and v over the frames so far, slowly fading,
+and γ normal with the deviation d before,
+
+    S = (A + 1/d²)⁻¹,      γ̂ = S v.
+
+Where vᵀγ̂ is larger than chance makes it, something lasts: the second moment of γ is then γ̂γ̂ᵀ + S,
+and the covariance of a pose has what that moves it by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from mixpose.constants import constant
+
+Floats: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LastingRules:
+    """What is believed of errors that last."""
+
+    deviation: float = constant(
+        0.25, "σ_ε: of fields that last, once some are seen: 0.4 px, a camera turned by 0.02°"
+    )
+    memory: float = constant(0.99, "per frame, of what was seen before: 100 frames count")
+    by_chance: float = constant(0.999, "frames that show as little where nothing lasts")
+    rigs: int = constant(4, "sets of sensors that are told apart, the last ones that were seen")
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """What the frames so far say of fields that last.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Sensors that took part in these frames.
+    information : (q, q) float64
+        About the fields of all of them, per σ_ε².
+    vector : (q,) float64
+        Per σ_ε.
+    """
+
+    names: tuple[str, ...]
+    information: Floats
+    vector: Floats
+
+    def after(self, before: Sequence[Lasting], rules: LastingRules) -> Lasting:
+        """What a frame says, with what the same sensors showed before it."""
+        for one in before:
+            if one.names == self.names and len(one.vector) == len(self.vector):
+                information = rules.memory * one.information + self.information
+                return Lasting(self.names, information, rules.memory * one.vector + self.vector)
+        return self
+
+    def kept(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
+        """With what was seen by others."""
+        others = [one for one in before if one.names != self.names]
+        return (self, *others[: rules.rigs - 1])
+
+    def moments(self, rules: LastingRules) -> Floats | None:
+        """Second moments (q, q) of the fields in σ_ε²; None where there may be none."""
+        if not rules.deviation:
+            return None
+        S = np.linalg.inv(self.information + np.eye(len(self.vector)) / rules.deviation**2)
+        sizes = S @ self.vector
+        degrees = float((S * self.information).sum())
+        if self.vector @ sizes <= chdtri(max(degrees, 1.0), 1 - rules.by_chance):
+            return None
+        return np.asarray(S + np.outer(sizes, sizes))

@@ -1,0 +1,86 @@
+"""Sensors as they might be, where their calibration is not exact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.rigid import Floats, inverse, perturb
+from mixpose.sensors.base import Sensor
+from mixpose.sensors.fisheye import FisheyeCamera
+from mixpose.sensors.lateration import RangeSensor
+from mixpose.sensors.parallel import ParallelBeam
+from mixpose.sensors.pinhole import PinholeCamera
+
+
+@dataclass(frozen=True)
+class CalibrationError:
+    """Standard deviations of what a calibration says of a sensor.
+
+    Attributes
+    ----------
+    focal : float
+        Of the focal length, as a share of it; of the pixel size, with parallel beams.
+    principal_point : float
+        Along each axis, px.
+    rotation_deg : float
+        Of the orientation, about each axis.
+    position : float
+        Along each axis, length units.
+    range_bias : float
+        Length units.
+    """
+
+    focal: float = 0.0
+    principal_point: float = 0.0
+    rotation_deg: float = 0.0
+    position: float = 0.0
+    range_bias: float = 0.0
+
+
+def doubted(sensor: Sensor, error: CalibrationError) -> tuple[Sensor, ...]:
+    """A sensor, and the same one off by a standard deviation in one thing each."""
+    if isinstance(sensor, RangeSensor):
+        moves = [_moved(np.eye(4), k, error.position) for k in range(3)]
+        biased = replace(sensor, range_bias=sensor.range_bias + error.range_bias)
+        others: list[Sensor] = [biased] if error.range_bias else []
+        return (sensor, *others, *(sensor.moved(one) for one in moves if error.position))
+    others = []
+    if isinstance(sensor, PinholeCamera | FisheyeCamera):
+        for u, v, by in ((0, 2, error.principal_point), (1, 2, error.principal_point)):
+            K = sensor.camera_matrix.copy()
+            K[u, v] += by
+            others += [replace(sensor, camera_matrix=K)] if by else []
+        K = sensor.camera_matrix.copy()
+        K[:2, :2] *= 1 + error.focal
+        others += [replace(sensor, camera_matrix=K)] if error.focal else []
+    if isinstance(sensor, ParallelBeam):
+        for axis in np.eye(2) if error.principal_point else ():
+            point = sensor.principal_point + error.principal_point * axis
+            others.append(replace(sensor, principal_point=point))
+        size = sensor.pixel_size / (1 + error.focal)
+        others += [replace(sensor, pixel_size=size)] if error.focal else []
+    T = np.asarray(getattr(sensor, "T_sensor_world", np.eye(4)))
+    turns = [_moved(T, k, np.radians(error.rotation_deg)) for k in (3, 4, 5)]
+    moves = [_moved(T, k, error.position) for k in range(3)]
+    others += [sensor.moved(one) for one in turns if error.rotation_deg]
+    return (sensor, *others, *(sensor.moved(one) for one in moves if error.position))
+
+
+def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
+    """A motion (4, 4) of the world that is one of the sensor along or about an axis of its own."""
+    twist = np.zeros(6)
+    twist[direction] = by
+    return np.asarray(inverse(T_sensor_world) @ perturb(np.eye(4), twist) @ T_sensor_world)
+
+
+def by_calibration(doubts: tuple[Sensor, ...], points_world: Floats) -> Floats:
+    """By how much points (n, 3) are elsewhere (n, m, K) in K sensors as they might be."""
+    first, *others = doubts
+    y, seen = first.project(points_world)
+    away = np.zeros((*y.shape, len(others)))
+    for k, one in enumerate(others):
+        other, also = one.project(points_world)
+        away[..., k] = np.where((seen & also)[..., None], other - y, 0.0)
+    return away
