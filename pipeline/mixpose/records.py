@@ -198,7 +198,7 @@ class Estimate:
         How late sensors are beyond what the session says, as far as the frames so far show it; no
         part of the pose line.
     doubt : str
-        Why a frame is ambiguous whose pose has no rival; no part of it either.
+        Why a frame is ambiguous, other than for its rivals; no part of it either.
     offsets : mapping of str to Offsets
         By sensor, of the best pose.
     """

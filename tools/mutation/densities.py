@@ -100,11 +100,18 @@ _ERRORS = (
         "a frame that is not like those before it is looked at too narrowly",
     ),
     Mutant(
-        "density-errors-from-above-only",
+        "density-errors-outweigh-a-sensor-without-finer-densities",
         "density/extraction_error.py",
-        "return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))",
-        "return seen",
-        "where half of the spots are merged all offsets are noise",
+        "np.maximum(variances, (finest / rules.blur) ** 2)",
+        "variances.copy()",
+        "profiles count for nothing beside precise spots",
+    ),
+    Mutant(
+        "density-known-blurs-each-sensor-for-itself",
+        "density/extraction_error.py",
+        "rules.typical_degrees), offsets, rules)",
+        "rules.typical_degrees), offsets, ErrorRules(shared=0.0))",
+        "the last blur leaves all to the most precise sensor",
     ),
     Mutant(
         "density-errors-each-sensor-for-itself",

@@ -159,8 +159,8 @@ _SAMPLED = (
     Mutant(
         "objective-gradient-without-the-other-sensors",
         "objective/paper.py",
-        "gradient += rest @ part.by_pose",
-        "gradient += part.by_pose.sum(axis=0)",
+        '"s,sm,smk->k", others, g',
+        '"s,sm,smk->k", np.ones(count), g',
         "steps of formula (4) go by sensors one by one",
     ),
 )

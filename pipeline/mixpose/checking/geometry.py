@@ -43,7 +43,10 @@ def geometry_warnings(
     surveys : mapping of str to Survey
         What their frames hold.
     """
-    streams = any(isinstance(each, Video) and each.size is None for each in sources.values())
+    streams = any(
+        each.kind == "live" or (isinstance(each, Video) and each.size is None)
+        for each in sources.values()
+    )
     if len(sources) < 2 or len(session.labels) > 1 or streams:
         return []
     frames, doubt = [], None

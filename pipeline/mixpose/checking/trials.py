@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from mixpose.body import Body, PointFeature
+from mixpose.fit import free_mask
 from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import Floats, inverse
@@ -57,10 +58,15 @@ def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | 
         if time.process_time() - began > PATIENCE_S:
             return None
         body = session.body if trial.points is None else _of(session.body, trial.points)
-        changed = replace(session, body=body, start=None)
+        changed = replace(_anywhere(session), body=body)
         if frames and all(_explains(changed, n, trial.views(views)) for n, views in frames):
             return trial.meaning
     return None
+
+
+def _anywhere(session: Session) -> Session:
+    """The session without a start, where none is needed: it may be what is wrong."""
+    return replace(session, start=None) if free_mask(session.estimator).all() else session
 
 
 def _late(session: Session, frames: Sequence[tuple[int, Views]]) -> str | None:
@@ -69,7 +75,7 @@ def _late(session: Session, frames: Sequence[tuple[int, Views]]) -> str | None:
     in_a_row = len(numbers) > _TRIED and len({*np.diff(numbers).tolist()}) == 1
     if not in_a_row:
         return None
-    anywhere = replace(session, start=None)
+    anywhere = _anywhere(session)
     for setup in session.sensors:
         given = [
             _with_next(now, after, setup.name)
@@ -175,7 +181,7 @@ def _alone(session: Session, number: int, view: View) -> Floats | None:
     """T_world_object (4, 4) that one camera finds by itself."""
     if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
         return None
-    tracker, track = begin(replace(session, start=None))
+    tracker, track = begin(_anywhere(session))
     with np.errstate(all="ignore"):
         _, estimate = tracker.advance(track, number, None, [view])
     return estimate.T_world_object

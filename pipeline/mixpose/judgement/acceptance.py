@@ -98,7 +98,7 @@ class Verdict:
     kept : list of (Judged, float)
         Poses worth telling with their beliefs, best first.
     doubt : str
-        Why a frame is ambiguous whose pose has no rival.
+        Why a frame is ambiguous, other than for its rivals.
     """
 
     status: Status
@@ -208,18 +208,15 @@ def _alike(
 ) -> bool:
     T_a = a.T_world_object
     T_b = nearest_alike(b.T_world_object, body, T_a)
+    # one peak, of which one of the two is not the top: as in depth, seen by one camera
+    away = twist_between(T_a, T_b)[free]
+    both = (a.covariance + b.covariance)[np.ix_(free, free)]
+    inside = bool(away @ np.linalg.solve(both, away) < rules.same_peak)
     if a.spread is not None:
-        # one peak of the likelihood, drawn to different priors
-        away = twist_between(T_a, T_b)[free]
-        widest = (a.covariance + b.covariance)[np.ix_(free, free)]
-        return bool(away @ np.linalg.solve(widest, away) < rules.same_peak)
+        return inside  # of the likelihood, drawn to different priors
     turned = float(rotation_angle_deg(T_a, T_b))
     centre = np.append(body.means.mean(axis=0), 1.0)
     apart = float(np.linalg.norm((T_a - T_b) @ centre))
     if apart < rules.same_distance * body.radius and turned < rules.same_rotation_deg:
         return True
-    # one peak, of which one of the two is not the top: as in depth, seen by one camera
-    away = twist_between(T_a, T_b)[free]
-    both = (a.covariance + b.covariance)[np.ix_(free, free)]
-    inside = away @ np.linalg.solve(both, away) < rules.same_peak
-    return bool(inside and turned < rules.same_peak_deg)
+    return inside and turned < rules.same_peak_deg

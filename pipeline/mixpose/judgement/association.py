@@ -119,6 +119,13 @@ class Association:
         return float(self.shares @ self.squared)
 
     @property
+    def rows(self) -> Floats:
+        """Jacobian and offsets side by side (nm, 7) in σ, by the root of how far each was met."""
+        roots = np.sqrt(self.shares)[:, None, None] / self.sigma
+        rows = roots * np.concatenate([self.J, self.offsets[..., None]], axis=2)
+        return np.asarray(rows.reshape(-1, 7))
+
+    @property
     def rms(self) -> float | None:
         """Root mean square of the offsets of the met features, sensor units; None without any."""
         if self.met == 0:

@@ -88,9 +88,7 @@ def is_far_off(
 
 def _left_alone(one: Association) -> tuple[float, int]:
     """Squared offsets in σ² that a sensor's best own pose leaves, and what that pose takes up."""
-    weights = np.repeat(np.sqrt(one.shares) / one.sigma, one.J.shape[1])
-    J = one.J.reshape(-1, 6) * weights[:, None]
-    offsets = one.offsets.reshape(-1) * weights
+    J, offsets = one.rows[:, :6], one.rows[:, 6]
     scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
     taken, _, rank, _ = np.linalg.lstsq(J / scale, offsets, rcond=1e-6)
     return float(((offsets - J / scale @ taken) ** 2).sum()), int(rank)

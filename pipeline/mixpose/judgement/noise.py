@@ -391,8 +391,5 @@ def _inverse(information: Floats) -> Floats:
 
 def information_of(associations: Sequence[Association], variances: Floats) -> Floats:
     """Σ_l Σ_i J_iᵀ J_i / s_l² (6, 6) over the met features, for noise (L,) in σ_ε²."""
-    information = np.zeros((6, 6))
-    for one, variance in zip(associations, variances.tolist(), strict=True):
-        weighted = (one.J * (one.shares / (variance * one.sigma**2))[:, None, None]).reshape(-1, 6)
-        information += weighted.T @ one.J.reshape(-1, 6)
-    return information
+    rows = [one.rows[:, :6] / s for one, s in zip(associations, np.sqrt(variances).tolist())]
+    return np.asarray(np.concatenate(rows).T @ np.concatenate(rows))

@@ -12,7 +12,6 @@ its density, as if its feature were a Gaussian of the level's σ.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -40,16 +39,6 @@ REACH = 4.0
 """Margin of a window around the predicted samples, in standard deviations of a feature."""
 
 _SAMPLES_AT_ONCE = 2**18  # of all poses of a batch: bounds its memory to a few MB per sensor
-
-
-@dataclass(frozen=True)
-class _Sampled:
-    """Densities of all samples in one sensor: values (S,) and pulls by the pose (S, 6)."""
-
-    values: Floats
-    by_pose: Floats
-    J: Floats
-    sigma: float
 
 
 class _SampledObjective:
@@ -88,6 +77,11 @@ class _SampledObjective:
         return np.concatenate([np.zeros(0), *values]).reshape(T_world_object.shape[:-2])
 
     def _values(self, poses: Floats) -> Floats:
+        """Values (k,) at poses (k, 4, 4)."""
+        raise AssertionError("an objective says how sensors combine")
+
+    def _factors(self, densities: Floats) -> list[Floats]:
+        """What each sensor's density of a sample is multiplied by, (S,) each, of those (L, S)."""
         raise AssertionError("an objective says how sensors combine")
 
     @cached_property
@@ -114,18 +108,25 @@ class _SampledObjective:
         sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
         return np.asarray(sums[:, 0] / size)
 
-    def _linearised(self, T_world_object: Floats) -> list[_Sampled]:
+    def linearise(self, T_world_object: Floats) -> Quadratic:
+        """Value, gradient and mean-shift curvature at one pose (4, 4)."""
         points = transform(T_world_object, self.points)
         if self.offsets is not None:
             points += self.offsets
-        result = []
+        arms, count = self.points @ T_world_object[:3, :3].T, len(points)
+        looked_up, jacobians = [], []
         for term in self.terms:
             y, by_world, _ = term.sensor.linearise(points)
-            J = pose_jacobian(by_world, self.points @ T_world_object[:3, :3].T)
-            g = term.density.sample(y).astype(np.float64)
-            by_pose = np.einsum("sm,smk->sk", g[:, 1:], J)
-            result.append(_Sampled(g[:, 0], by_pose, J, term.density.sigma))
-        return result
+            looked_up.append(term.density.sample(y).astype(np.float64))
+            jacobians.append(pose_jacobian(by_world, arms))
+        factors = self._factors(np.array([g[:, 0] for g in looked_up]))
+        gradient, curvature = np.zeros(6), np.zeros((6, 6))
+        for term, g, J, others in zip(self.terms, looked_up, jacobians, factors, strict=True):
+            gradient += np.einsum("s,sm,smk->k", others, g[:, 1:], J) / count
+            pull = others * g[:, 0] / (count * term.density.sigma**2)
+            curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
+        value = float((factors[0] * looked_up[0][:, 0]).mean())
+        return Quadratic(value, gradient, curvature)
 
 
 class PaperObjective(_SampledObjective):
@@ -137,18 +138,8 @@ class PaperObjective(_SampledObjective):
             product *= g
         return self._means(product, len(poses))
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient and mean-shift curvature at one pose (4, 4)."""
-        parts = self._linearised(T_world_object)
-        product = np.prod([part.values for part in parts], axis=0)
-        gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for k, part in enumerate(parts):
-            others = [other.values for j, other in enumerate(parts) if j != k]
-            rest = np.prod(others, axis=0) if others else np.ones_like(part.values)
-            gradient += rest @ part.by_pose
-            curvature += _pull(product, part)
-        count = len(product)
-        return Quadratic(float(product.mean()), gradient / count, curvature / count)
+    def _factors(self, densities: Floats) -> list[Floats]:
+        return [np.prod(np.delete(densities, k, axis=0), axis=0) for k in range(len(densities))]
 
 
 class IndependentObjective(_SampledObjective):
@@ -158,23 +149,10 @@ class IndependentObjective(_SampledObjective):
         means = [self._means(g, len(poses)) for g in self._densities(poses)]
         return np.asarray(np.prod(means, axis=0))
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient and mean-shift curvature at one pose (4, 4)."""
-        parts = self._linearised(T_world_object)
-        means = np.array([part.values.mean() for part in parts])
-        gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for k, part in enumerate(parts):
-            rest = float(np.prod(np.delete(means, k)))
-            gradient += rest * part.by_pose.mean(axis=0)
-            curvature += rest * _pull(part.values, part) / len(part.values)
-        return Quadratic(float(np.prod(means)), gradient, curvature)
-
-
-def _pull(weights: Floats, part: _Sampled) -> Floats:
-    """Σ_s w_s J_sᵀ J_s / σ²."""
-    weighted = part.J * weights[:, None, None]
-    size = part.J.shape[-1]
-    return np.asarray(weighted.reshape(-1, size).T @ part.J.reshape(-1, size) / part.sigma**2)
+    def _factors(self, densities: Floats) -> list[Floats]:
+        means = densities.mean(axis=1)
+        ones = np.ones(densities.shape[1])
+        return [np.prod(np.delete(means, k)) * ones for k in range(len(means))]
 
 
 def sampled_terms(

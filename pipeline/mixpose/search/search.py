@@ -202,16 +202,11 @@ class _Run:
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
+        budget, count = self._budget, len(self._detections)
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
-        return self._refined(self._quick_descent, guesses, plan)
-
-    def _refined(
-        self, descent: Descent, poses: Floats, plan: Sequence[tuple[float, int]]
-    ) -> Floats:
-        count, most = len(self._detections), self._budget.survivors
-        stages = [Stage((factor,) * count, steps, most) for factor, steps in plan]
-        return descent.refine(poses, stages) if len(poses) else poses
+        plan = budget.descent_plan if self._by_evidence else budget.wide_plan
+        stages = [Stage((factor,) * count, steps, budget.survivors) for factor, steps in plan]
+        return self._quick_descent.refine(guesses, stages) if len(guesses) else guesses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""

@@ -44,13 +44,7 @@ class TriangulatedPoints:
 
     def select(self, chosen: Indices | NDArray[np.bool_]) -> TriangulatedPoints:
         """Some of the points."""
-        return TriangulatedPoints(
-            self.points[chosen],
-            self.tolerance[chosen],
-            self.gap[chosen],
-            self.sensors[chosen],
-            self.rays[chosen],
-        )
+        return TriangulatedPoints(*(each[chosen] for each in vars(self).values()))
 
 
 def triangulate(
@@ -74,13 +68,8 @@ def triangulate(
     ]
     pairs = np.zeros((0, 2), dtype=np.intp)
     found.append(TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), np.zeros(0), pairs, pairs))
-    return TriangulatedPoints(
-        np.concatenate([each.points for each in found]),
-        np.concatenate([each.tolerance for each in found]),
-        np.concatenate([each.gap for each in found]),
-        np.concatenate([each.sensors for each in found]),
-        np.concatenate([each.rays for each in found]),
-    )
+    columns = zip(*(vars(each).values() for each in found), strict=True)
+    return TriangulatedPoints(*map(np.concatenate, columns))
 
 
 def _between(

@@ -17,7 +17,7 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert
+from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert, is_sure
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
@@ -138,9 +138,13 @@ class Tracker:
         best = verdict.best
         if best is None:
             return verdict
-        if verdict.status != "ok":
-            aside = any(is_a_step(self.body, best, one) for one, _ in verdict.kept)
-            return replace(verdict, doubt=ASIDE) if aside else verdict
+        if verdict.status != "ok" and any(
+            is_a_step(self.body, best, one) for one, _ in verdict.kept
+        ):
+            return replace(verdict, doubt=ASIDE)
+        # a sure pose that has rivals may have them for a reason that can be told
+        if not is_sure(best, self.free, self.rules.acceptance):
+            return verdict
         if is_reflection(data, best):
             return replace(verdict, status="ambiguous", doubt=MIRRORED)
         track, noise = data.track, self.rules.judgement.noise

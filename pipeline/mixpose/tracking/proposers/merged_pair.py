@@ -9,16 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.judgement import Association, Judged
 from mixpose.rigid import perturb
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _STEPS = 2  # of least squares: the second starts within 0.01 σ_ε of the first's end
 
@@ -33,7 +29,9 @@ def merged_pair(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iter
     for _ in range(_STEPS):
         if not any(one.merged for one in associations):
             break
-        step = _least_squares(associations, data.free)
+        rows = np.concatenate([one.rows for one in associations])
+        step = np.zeros(6)
+        step[data.free] = np.linalg.lstsq(rows[:, :6][:, data.free], rows[:, 6], rcond=None)[0]
         start = Start(perturb(at.T_world_object, step))
         at = likelihood.judge(likelihood.fit(start), start)
         associations = at.associations
@@ -64,15 +62,3 @@ def _paired(one: Association, reach: float) -> Association:
     offsets[pair] = (away[i, k] + one.offsets[pair[1]]) / 2
     J[pair] = one.J[pair].mean(axis=0)
     return replace(one, shares=shares, offsets=offsets, J=J, merged=1)
-
-
-def _least_squares(associations: Sequence[Association], free: NDArray[np.bool_]) -> Floats:
-    """The step (6,) to where the features were met, merged ones in their middle."""
-    rows = [(np.sqrt(one.shares) / one.sigma)[:, None] for one in associations]
-    J = np.concatenate(
-        [(r[..., None] * m.J).reshape(-1, 6) for r, m in zip(rows, associations, strict=True)]
-    )
-    offsets = [(r * one.offsets).ravel() for r, one in zip(rows, associations, strict=True)]
-    step = np.zeros(len(free))
-    step[free] = np.linalg.lstsq(J[:, free], np.concatenate(offsets), rcond=None)[0]
-    return step
