@@ -25,14 +25,17 @@ from simulated_rigs import (
     task_of,
 )
 
-from mixpose.calibration import CalibrationRules, Rig, calibrate
+from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.checking import displacements
 from mixpose.calibration.choice import held_back
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import interpolate, neighbours
+from mixpose.calibration.matching import clock_of, match
 from mixpose.calibration.rig import blocks_of
 from mixpose.calibration.saved import Saved
+from mixpose.calibration.telling import doubts_of
+from mixpose.errors import RecordingError
 from mixpose.rigid import (
     inverse,
     perturb,
@@ -99,6 +102,42 @@ def test_three_range_sensors_30_mm_off_are_found_in_the_papers_gauge() -> None:
     assert np.abs(np.array(in_gauge(places)) - in_gauge(PLACES)).max() < 0.5
     assert np.array_equal(places[0], (PLACES + off)[0])
     assert len(found.gauge) == 3
+
+
+def test_ranges_of_no_body_are_refused() -> None:
+    rng = np.random.default_rng(8)
+    sensors = [RangeSensor(p) for p in PLACES]
+    frames = tuple(
+        replace(frame, points={k: rng.uniform(880, 1120, (6, 1)) for k in range(3)})
+        for frame in recording(sensors, 6, 0.1)
+    )
+    free = dict.fromkeys(range(3), ("position",))
+    known = {frame.number: motion(0.0) for frame in frames}
+    task = task_of(sensors, frames, 1.0, free=free, known=known)
+    with pytest.raises(RecordingError, match="as if by chance"):
+        calibrate(task)
+
+
+def test_a_residual_that_rises_in_frames_held_back_is_told() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 12, 0.05)
+    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    assert found.certainty > 0.98  # features are 1 px apart at least, detections good to 0.05 px
+    assert doubts_of(found, "mm") == []
+    rising = replace(found, residuals={1: Residual(9.0, 0.05, 9.0, 0.08)}, certainty=0.6)
+    assert [text[:8] for text in doubts_of(rising, "mm")] == ["40 % of ", "s1: the "]
+
+
+@pytest.mark.parametrize("blur", [0.5, 3.0])
+def test_of_pairs_that_compete_only_mutual_neighbours_are_nearest(blur: float) -> None:
+    sensor = RangeSensor(np.array([0.0, 0.0, -1000.0]))
+    rig = Rig.of(("s0",), [sensor], BODY)
+    rig = replace(rig, points=np.array([[0, 0, 0], [0, 0, 2.0], [0, 0, 3.5]]))
+    frame = SeenFrame(0, None, {0: np.array([[1000.1], [1003.4]])}, {})
+    near = neighbours([None], 2.5)
+    pairs = match(rig, np.eye(4)[None], [frame], clock_of([frame], near, 1), 0, blur, 0.02)
+    found = zip(pairs.feature[pairs.nearest], pairs.detection[pairs.nearest], strict=True)
+    assert [(int(i), int(d)) for i, d in found] == [(0, 0), (2, 1)]
 
 
 def test_range_biases_come_from_known_poses() -> None:

@@ -56,6 +56,12 @@ class Adjusted:
     weighted: tuple[tuple[Pairs, Floats, Floats], ...]
     inflation: float
 
+    @property
+    def certainty(self) -> float:
+        """Share of the weight of pairs of which each is the nearest that the other has."""
+        nearest = sum(float(weight @ pairs.nearest) for pairs, _, weight in self.weighted)
+        return nearest / max(sum(float(weight.sum()) for _, _, weight in self.weighted), 1e-9)
+
 
 def first_blurs(
     bundle: Bundle, rig: Rig, poses: Floats, sigmas: Floats, rules: CalibrationRules
@@ -107,10 +113,12 @@ def adjust(
         learnt = (
             noise if noise is not None else _noise(bundle, rig, poses, blur, sigmas, rules, 1.0)
         )
-        last = rules.blur * learnt
+        # features that crowd look like noise at a wide blur, which must not widen it further
+        last = np.minimum(rules.blur * learnt, _widest_alike(rig, blur, sigmas))
         if (blur <= last / rules.narrowing).all():
             break
         blur = np.maximum(blur * rules.narrowing, last)
+    learnt = last / rules.blur
     if noise is not None:
         return _ended(bundle, rig, poses, gauge_of, noise, lambda *_: noise, rules)
 
@@ -124,6 +132,12 @@ def adjust(
     return _ended(bundle, found.rig, found.poses, gauge_of, found.noise, own, rules)
 
 
+def _widest_alike(rig: Rig, blur: Floats, sigmas: Floats) -> Floats:
+    """Of each sensor (L,) the widest blur, by σ_ε, of sensors of its kind."""
+    units = np.array([eye.unit for eye in rig.sensors])
+    return np.array([sigma * (blur / sigmas)[units == u].max() for sigma, u in zip(sigmas, units)])
+
+
 def _ended(
     bundle: Bundle,
     rig: Rig,
@@ -134,10 +148,11 @@ def _ended(
     rules: CalibrationRules,
 ) -> Adjusted:
     """The last steps, at the noise that is learnt."""
+    most = rules.unlike * noise
     for _ in range(rules.last_steps):
         weighted, _ = _weighted(bundle, rig, poses, rules.blur * noise, noise, rules, last=True)
         rig, poses, size = _climbed(bundle, rig, poses, gauge_of, weighted)
-        before, noise = noise, learnt(rig, poses, rules.blur * noise)
+        before, noise = noise, np.minimum(learnt(rig, poses, rules.blur * noise), most)
         if size < rules.converged and np.allclose(before, noise, rtol=1e-3):
             break
     return _finished(bundle, rig, poses, gauge_of, noise, rules)
@@ -211,6 +226,7 @@ def _noise(
     no noise at all.
     """
     weighted, alone = _weighted(bundle, rig, poses, blur, np.ones(len(blur)), rules)
+    alone = [w * one[1].nearest for one, w in zip(weighted, alone)]
     count = np.array([eye.dimension * float(w.sum()) for eye, w in zip(rig.sensors, alone)])
     spent = np.array(
         [float(w @ (one[2].residual ** 2).sum(axis=1)) for one, w in zip(weighted, alone)]

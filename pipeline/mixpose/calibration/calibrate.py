@@ -16,6 +16,7 @@ from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import neighbours
 from mixpose.calibration.latecomers import placed
+from mixpose.calibration.linking import mean_motion
 from mixpose.calibration.matching import clock_of
 from mixpose.calibration.residuals import met_share, residuals_of, sights_of
 from mixpose.calibration.result import Calibration, Residual
@@ -25,6 +26,7 @@ from mixpose.calibration.start import Start, searched, start_from_cameras, start
 from mixpose.calibration.task import Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
+from mixpose.rigid import from_parts, inverse
 
 
 def calibrate(
@@ -60,6 +62,14 @@ def calibrate(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
             "check` finds its features"
         )
+    off = best[1].noise / task.sigmas
+    if (off >= rules.failed).any():
+        name = task.rig.names[int(np.argmax(off))]
+        raise RecordingError(
+            f"calibrate: sensor {name!r}: found residuals of {off.max():.3g} times extract.sigma, "
+            "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
+            "to where they are, or a larger extract.sigma where detections err by that much"
+        )
     return best[1]
 
 
@@ -76,16 +86,16 @@ def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> Calibrat
 def _best(
     task: Task, starts: Iterable[Start], rules: CalibrationRules, progress: Progress
 ) -> tuple[int, Calibration] | None:
-    """Number and calibration of the first start that is not wrong, else of the least wrong."""
-    best: tuple[float, int, Calibration] | None = None
+    """Number and calibration of the first start that tells features apart, else of the best."""
+    best: tuple[tuple[bool, float], int, Calibration] | None = None
     for number, start in enumerate(starts):
         if not len(start.poses):
             continue
         one = _Run(task, start, rules, progress).result()
-        off = float((one.noise / task.sigmas).max())
-        if best is None or off < best[0]:
-            best = (off, number, one)
-        if off < rules.failed:
+        worth = (bool((one.noise < rules.failed * task.sigmas).all()), one.certainty)
+        if best is None or worth > best[0]:
+            best = (worth, number, one)
+        if worth >= (True, rules.certain):
             break
     return None if best is None else best[1:]
 
@@ -100,6 +110,12 @@ class _Part:
     def only(self, mask: NDArray[np.bool_]) -> _Part:
         kept = np.flatnonzero(mask)
         return _Part(tuple(self.frames[k] for k in kept), self.poses[kept])
+
+    def carried(self, before: Floats, after: Floats) -> _Part:
+        """Poses moved as those of other frames were on average: the rig carries them along."""
+        centre = from_parts(np.eye(3), before[:, :3, 3].mean(axis=0))
+        motions = inverse(centre) @ after @ inverse(before) @ centre
+        return replace(self, poses=centre @ mean_motion(motions) @ inverse(centre) @ self.poses)
 
     def joined(self, other: _Part) -> _Part:
         frames = self.frames + other.frames
@@ -144,6 +160,7 @@ class _Run:
         self._progress("adjusting all sensors together", 0, 4)
         adjusted = self._adjusted(training, self._start.rig, None)
         good = met_share(adjusted, training.frames, task) > rules.least_met
+        held = everything.only(mask).carried(training.poses, adjusted.poses)
         bad = [f.number for f, ok in zip(training.frames, good, strict=True) if not ok]
         if bad and good.any():
             training = _Part(training.frames, adjusted.poses).only(good)
@@ -151,7 +168,6 @@ class _Run:
             adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
         self._place_latecomers(training, adjusted)
         self._progress("looking at the frames held back", 2, 4)
-        held = everything.only(mask)
         held_fit = None
         if len(held.poses):
             held_fit = self._posed(held, adjusted.rig)
@@ -282,6 +298,7 @@ class _Run:
             residuals=residuals,
             noise=adjusted.noise,
             inflation=adjusted.inflation,
+            certainty=adjusted.certainty,
             sights=sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.poses, strict=True)),
             frames=part.frames,

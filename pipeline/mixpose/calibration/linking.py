@@ -75,7 +75,7 @@ def agreed(
     for _ in range(3):
         inside, distance = _inside(T, votes, away, rules)
         chosen = _nearest_of_each(frame, distance, inside)
-        T = _mean(votes[chosen])
+        T = mean_motion(votes[chosen])
     return Link(T, len(chosen))
 
 
@@ -98,7 +98,8 @@ def _nearest_of_each(frame: Ints, distance: Floats, inside: Mask) -> Ints:
     return np.asarray(order[first])
 
 
-def _mean(votes: Floats) -> Floats:
+def mean_motion(votes: Floats) -> Floats:
+    """Mean rotation and median shift of motions (V, 4, 4)."""
     rotation = Rotation.from_matrix(votes[:, :3, :3]).mean().as_matrix()
     return from_parts(rotation, np.median(votes[:, :3, 3], axis=0))
 

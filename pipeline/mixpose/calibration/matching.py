@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ class Pairs:
         Detected place.
     share : (n,) float64
         1 where nothing competes.
+    nearest : (n,) bool
+        Whether each of the two is the nearest that the other has.
     """
 
     frame: Ints
@@ -42,6 +45,7 @@ class Pairs:
     detection: Ints
     y: Floats
     share: Floats
+    nearest: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,29 +122,31 @@ def match(
     y, visible = eye.project(world)
     visible = visible & facing(eye, at, world, rig.normals)
     reach = 2 * blur * np.sqrt(-np.log(faintest))
-    parts: list[tuple[Ints, Ints, Ints, Floats, Floats]] = []
+    parts: list[tuple[NDArray[Any], ...]] = []
     for k, frame in enumerate(frames):
         points = frame.points.get(sensor)
         if points is None or not len(points) or not visible[k].any():
             continue
         features = np.flatnonzero(visible[k])
-        i, j, weight = _near(y[k, features], points, blur, reach)
-        rivals = np.maximum(
-            np.bincount(i, weight, len(features))[i], np.bincount(j, weight, len(points))[j]
-        )
-        parts.append((np.full(len(i), k), features[i], j, points[j], weight / rivals))
+        i, j, share, nearest = _near(y[k, features], points, blur, reach)
+        parts.append((np.full(len(i), k), features[i], j, points[j], share, nearest))
     if not parts:
         none = np.zeros(0, dtype=np.intp)
-        return Pairs(none, none, none, np.zeros((0, eye.dimension)), np.zeros(0))
+        return Pairs(none, none, none, np.zeros((0, eye.dimension)), np.zeros(0), none > 0)
     return Pairs(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def _near(y: Floats, points: Floats, blur: float, reach: float) -> tuple[Ints, Ints, Floats]:
-    """Pairs within reach, as indices of features and detections, with their kernel."""
+def _near(
+    y: Floats, points: Floats, blur: float, reach: float
+) -> tuple[Ints, Ints, Floats, NDArray[np.bool_]]:
+    """Pairs within reach: features, detections, shares, and whether they are nearest."""
     away = y[:, None, :] - points[None, :, :]
     squared = (away * away).sum(axis=2)
-    i, j = np.nonzero(squared < reach * reach)
-    return i, j, np.exp(-squared[i, j] / (4 * blur * blur))
+    kernel = np.exp(-squared / (4 * blur * blur)) * (squared < reach * reach)
+    rivals = np.maximum(kernel.sum(axis=1)[:, None], kernel.sum(axis=0))
+    least = (squared == squared.min(axis=1)[:, None]) & (squared == squared.min(axis=0))
+    i, j = np.nonzero(kernel)
+    return i, j, kernel[i, j] / rivals[i, j], least[i, j]
 
 
 def nearest_distance(

@@ -77,6 +77,9 @@ class Calibration:
     residuals : mapping of int to Residual
     noise : (L,) float64
     inflation : float
+    certainty : float
+        Share of the weight of pairs of which each is the nearest that the other has: near 1, or
+        detections cannot be told apart.
     sights : mapping of int to Sights
     poses : mapping of int to (4, 4) float64
         By frame number.
@@ -99,6 +102,7 @@ class Calibration:
     residuals: Mapping[int, Residual]
     noise: Floats
     inflation: float
+    certainty: float
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]
     frames: tuple[SeenFrame, ...]

@@ -68,7 +68,18 @@ class CalibrationRules:
         10, "frames by which that blur is chosen where each is searched by itself: 0.7 s each"
     )
     failed: float = constant(
-        1.9, "σ_ε by which residuals err at least where the start was wrong: they may err by 2"
+        1.9, "σ_ε that residuals err by where nothing was found: they may err by 2"
+    )
+    certain: float = constant(
+        0.8,
+        "of the weight of pairs is between nearest ones where features are told apart: right rigs "
+        "of simulated range sensors have 0.98 and more, wrong ones 0.4, ranges that do not tell "
+        "tags apart 0.5",
+    )
+    rising: float = constant(
+        1.5,
+        "times the residual of the other frames that that of frames held back may be: six or more "
+        "frames held back vary by 0.2",
     )
     believed: float = constant(0.3, "of the frames: with fewer, doubtful poses are a start too")
     explained: float = constant(

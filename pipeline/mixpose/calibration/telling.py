@@ -35,9 +35,30 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
             f"{'spread':<10}frames differ {np.sqrt(found.inflation):.2g} times as much as errors "
             "of single detections would let them (motion, body or lens); deviations include it"
         )
+    lines += [f"{'doubt':<10}{text}" for text in doubts_of(found, unit)]
     for direction in found.refused:
         lines.append(f"{'refused':<10}not determined: {direction}")
     return lines
+
+
+def doubts_of(found: Calibration, unit: str) -> list[str]:
+    """What tells that the calibration may not be right, though it was found."""
+    rules, told = CalibrationRules(), []
+    if found.certainty < rules.certain:
+        told.append(
+            f"{100 * (1 - found.certainty):.0f} % of the matches could as well be others': "
+            "detections do not tell features apart, so that the deviations hold only if the start "
+            "was right"
+        )
+    for sensor, each in found.residuals.items():
+        if each.held_after > rules.rising * each.after:
+            of = "px" if found.after.sensors[sensor].unit == "px" else unit
+            told.append(
+                f"{found.after.names[sensor]}: the residual rises from {each.after:.3g} to "
+                f"{each.held_after:.3g} {of} in the frames held back: the others are too few or "
+                "too alike; record more"
+            )
+    return told
 
 
 def _frames_line(found: Calibration) -> str:

@@ -19,7 +19,7 @@ from mixpose.calibration.recorded import read_frames, require_points
 from mixpose.calibration.saved import MARK as SAVED_MARK
 from mixpose.calibration.saved import Saved
 from mixpose.calibration.task import Progress
-from mixpose.calibration.telling import check_lines, lines_of
+from mixpose.calibration.telling import check_lines, doubts_of, lines_of
 from mixpose.calibration.world import check_world, in_world, with_length
 from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
@@ -95,7 +95,7 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
             _write(request.report, page, "--report")
     told = (check_lines if output is None else lines_of)(found, session.unit)
     sys.stdout.write("\n".join(told) + "\n")
-    _warn(found)
+    _warn(found, session.unit)
     if output is not None:
         say(f"calibrated from {len(found.used)} frames -> {output}")
 
@@ -223,13 +223,15 @@ def _key_of(session: Session, task: Task) -> str:
     return digest.hexdigest()
 
 
-def _warn(found: Calibration) -> None:
+def _warn(found: Calibration, unit: str) -> None:
     names = found.after.names
     for sensor in found.unlinked:
         warn(
             f"sensor {names[sensor]!r} shares no view of the body with the others and stays as it "
             "was: record the body where both see it"
         )
+    for doubt in doubts_of(found, unit):
+        warn(doubt)
     for direction in found.refused:
         warn(f"not determined, stays as it was: {direction}")
     if found.bad:
