@@ -45,7 +45,7 @@ def believed(
     body = objective.projection.body
     points = body.nodes.points
     T = most_probable(objective, T_world_object, prior)
-    T_unlike, noises = with_amplitudes(objective, T, prior, rules.unlike)
+    T_unlike, noises = with_amplitudes(objective, T, prior, rules.unlike, rules.believed)
     if not objective.projection.project(T[None]).seen.all() or len(points) != len(body):
         return T_unlike, False
     densities = [
@@ -70,7 +70,8 @@ def believed(
         return T_freed, True
     # what is left at features is no noise of cells: in a body that does not fit it is as large
     T = most_probable(objective, T, prior, ratio)
-    return with_amplitudes(objective, T, prior, rules.unlike, ratio)[0], False
+    found = with_amplitudes(objective, T, prior, rules.unlike, rules.believed, ratio)
+    return found[0], False
 
 
 def _sampled(objective: MatchedObjective, sensor: int, y: Floats) -> Floats:

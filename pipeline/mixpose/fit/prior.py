@@ -17,6 +17,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from mixpose.objective import AmplitudesObjective, MatchedObjective, Quadratic, View
 from mixpose.objective.matched import FINE_STEPS, value_error
@@ -26,6 +27,7 @@ from mixpose.rigid import perturb, twist_between
 Floats: TypeAlias = NDArray[np.float64]
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
+_DRAWN = 1e-6  # of the energy: a part in a thousand of heights, which drawing may be off by
 _ROUNDS = 3  # of noise and pose by turns: the noise holds to a part in a hundred
 _ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
 _VALUE_ERROR = value_error(FINE_STEPS)
@@ -167,6 +169,7 @@ def with_amplitudes(
     T_world_object: Floats,
     prior: NormalPrior,
     spread: float,
+    believed: float,
     misfit: float = 1.0,
 ) -> tuple[Floats, Floats]:
     """The most probable pose (4, 4) near another where features are not equally bright.
@@ -180,23 +183,31 @@ def with_amplitudes(
     prior : NormalPrior
     spread : float
         Of their amplitudes, relative.
+    believed : float
+        Probability up to which what unlike amplitudes explain more is taken for noise.
     misfit : float
         As `likelihood_at` has it.
 
     Returns
     -------
     (4, 4) array
+        The same pose where they are equally bright.
     (L,) array
         Variance of a cell's noise times the size of a cell, per sensor.
     """
-    T, noise = T_world_object, likelihood_at(objective, T_world_object).noise
+    T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
+    noise = equal
+    cells = np.array([view.observation.cells for view in objective.views])
+    smallest = _DRAWN * objective.energies[:, 0] / cells
     for _ in range(_ROUNDS):
         unlike = AmplitudesObjective(objective, noise, spread)
-        left = unlike.unexplained(T)
-        noise = np.maximum(left, 1e-9 * objective.energies[:, 0]) / [
-            view.observation.cells for view in objective.views
-        ]
+        noise = np.maximum(unlike.unexplained(T) / cells, smallest)
         T = _climbed(AmplitudesObjective(objective, misfit * noise, spread), prior, T, _NATS).state
+    # twice the logarithm of the ratio of likelihoods, each with its own noise
+    gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
+    freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
+    if gain < float(chdtri(freedom, 1 - believed)):
+        return T_world_object, equal
     return T, noise
 
 
