@@ -100,18 +100,11 @@ _ERRORS = (
         "a frame that is not like those before it is looked at too narrowly",
     ),
     Mutant(
-        "density-errors-outweigh-a-sensor-without-finer-densities",
+        "density-errors-from-above-only",
         "density/extraction_error.py",
-        "np.maximum(variances, (finest / rules.blur) ** 2)",
-        "variances.copy()",
-        "profiles count for nothing beside precise spots",
-    ),
-    Mutant(
-        "density-known-blurs-each-sensor-for-itself",
-        "density/extraction_error.py",
-        "rules.typical_degrees), offsets, rules)",
-        "rules.typical_degrees), offsets, ErrorRules(shared=0.0))",
-        "the last blur leaves all to the most precise sensor",
+        "return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))",
+        "return seen",
+        "where half of the spots are merged all offsets are noise",
     ),
     Mutant(
         "density-errors-each-sensor-for-itself",
@@ -227,7 +220,7 @@ _MET = (
     Mutant(
         "density-neighbours-pull-taken-for-misfit",
         "density/features_met.py",
-        "pull = sampled[:, 1:] - amplitude * predicted_gradient",
+        "pull = sampled[:, 1:] - predicted_gradient",
         "pull = sampled[:, 1:]",
         "features of grey values that overlap seem to be off where they fit",
     ),

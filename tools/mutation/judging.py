@@ -36,8 +36,8 @@ _NOISE = (
     Mutant(
         "judgement-information-in-sigmas",
         "judgement/noise.py",
-        "one.rows[:, :6] / s",
-        "one.rows[:, :6] * np.sqrt(one.sigma) / s",
+        "one.shares / (variance * one.sigma**2)",
+        "one.shares / (variance * one.sigma)",
         "covariances depend on the unit of a sensor",
     ),
     Mutant(

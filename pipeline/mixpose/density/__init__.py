@@ -11,6 +11,7 @@ from mixpose.density.extraction_error import (
     Seen,
     errors_seen,
     known_blurs,
+    log_likelihood,
     pooled,
 )
 from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
@@ -35,6 +36,7 @@ __all__ = [
     "errors_seen",
     "features_met",
     "known_blurs",
+    "log_likelihood",
     "matched_atlas",
     "peak",
     "pooled",

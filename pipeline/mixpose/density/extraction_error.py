@@ -7,8 +7,9 @@ as out.  Offsets weighted so have the variance q with 1/q = 1/s² + 1/2σ²: bot
 
     σ = 1.5 s,      s² = q / (1 − q / 2σ²)
 
-follow from one another, from the session's σ_ε down to where they agree.  Lengths are in σ_ε of
-their sensor.
+follow from one another, from the session's σ_ε down to where they agree.  Where many offsets are
+not noise, as those of merged spots, they agree at a wide blur, too; so they are also sought from
+what is known upwards, and the likelier noise counts.  Lengths are in σ_ε of their sensor.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
 _NOTHING = 1e-12
+_ALIKE = 1.2  # blurs that differ by less are the same
+_ROUNDS = 4  # from a known noise upwards
 _LEAST_DEGREES = 0.5  # of freedom: fewer are none, but for shares that do not add up to whole ones
 
 
@@ -46,6 +49,9 @@ class ErrorRules:
         9.0,
         "σ_ε around features within which detections count: at σ_ε they are drawn to 6, and the "
         "pose moves by less than the rest",
+    )
+    astray: float = constant(
+        0.1, "chance that an offset within `met` is no noise: a spot cut, merged or another's"
     )
     met: float = constant(
         3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
@@ -141,28 +147,28 @@ def errors_seen(
     while True:
         seen = _seen_at(blurs, offsets, free, known, rules)
         if all((seen.blurs > 0.9 * blurs).tolist()):
-            return seen
+            break
         blurs = np.minimum(seen.blurs, blurs)
+    blurs = known_blurs(offsets.finest, known, rules)
+    if all((seen.blurs <= _ALIKE * blurs).tolist()):
+        return seen
+    for _ in range(_ROUNDS):
+        narrow = _seen_at(blurs, offsets, free, known, rules)
+        if (narrow.blurs <= _ALIKE * blurs).all():
+            break
+        blurs = narrow.blurs
+    return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))
 
 
-def known_blurs(offsets: Offsets, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
+def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
     """Blurs (L,) by what was known of the noise before a frame; arguments as of `errors_seen`."""
-    return _blurs(pooled(known, rules, rules.typical_degrees), offsets, rules)
-
-
-def _blurs(variances: Floats, offsets: Offsets, rules: ErrorRules) -> Floats:
-    """Blurs (L,) that go by the noise, and by that of all sensors together."""
-    _, shares, sensor, dimensions, finest = offsets
-    # a sensor that cannot be drawn so finely weighs as if it were less precise
-    wide = np.maximum(variances, (finest / rules.blur) ** 2)
-    each = dimensions * np.bincount(sensor, shares, len(dimensions)) + _NOTHING
-    wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
-    return np.clip(rules.blur * np.sqrt(wide), finest, 1.0)
+    variances = pooled(known, rules, rules.typical_degrees)
+    return np.clip(rules.blur * np.sqrt(variances), finest, 1.0)
 
 
 def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, shares, sensor, dimensions, _ = offsets
+    squared, shares, sensor, dimensions, finest = offsets
     weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])
     totals = np.bincount(sensor, weights, len(dimensions)).tolist()
     sums = np.bincount(sensor, weights * squared, len(dimensions)).tolist()
@@ -180,7 +186,32 @@ def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: E
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
-    return Seen(own, variances, _blurs(wide, offsets, rules))
+    each = dimensions * totals + _NOTHING
+    wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
+    return Seen(own, variances, np.minimum(np.maximum(rules.blur * np.sqrt(wide), finest), 1.0))
+
+
+def log_likelihood(
+    blurs: Floats, offsets: Offsets, free: int, rules: ErrorRules = ErrorRules()
+) -> float:
+    """Of offsets, normal ones and some that are anywhere, less that of none being noise.
+
+    What a pose is free to fit is paid for.
+
+    Parameters
+    ----------
+    blurs : (L,) array
+        That go by the noise; the others as of `errors_seen`.
+    """
+    m = offsets.dimensions[offsets.sensor]
+    variances = (blurs[offsets.sensor] / rules.blur) ** 2
+    peaks = (2 * np.pi * variances) ** (-0.5 * m)
+    anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
+    odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * offsets.squared / variances)
+    believed = m * offsets.shares * odds / (1 + odds)
+    logs = np.log(2 * np.pi * variances)
+    price = 0.5 * free * float(believed @ logs) / max(float(believed.sum()), _NOTHING)
+    return float(offsets.shares @ np.log1p(odds)) + price
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs, log_likelihood
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -223,20 +223,28 @@ def _to_the_noise(
     known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in objective.views])
     blurs, count = np.ones(len(sigmas)), int(free.sum())
+    likeliest, best = -np.inf, ascent
     while True:
         met = _met(objective, ascent, sigmas, beside, errors)
         seen = errors_seen(met.offsets, count, known, errors)
         # offsets of a bent pose hide how small the noise is
-        least = known_blurs(met.offsets, known, errors)
+        least = known_blurs(met.offsets.finest, known, errors)
         variances = np.minimum(seen.variances, (least / errors.blur) ** 2)
         end = np.minimum(np.minimum(seen.blurs, least), blurs)
-        if met.is_noise(variances, errors) or (end > rules.narrower * blurs).all():
+        narrower = np.maximum(end, blurs / rules.schedule.ratio)
+        is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
+        if best is ascent and is_end:
             return ascent
         # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
         alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-        if alike and met.moved(free, blurs, end, variances) < rules.moved**2:
+        if best is ascent and alike and met.moved(free, blurs, end, variances) < rules.moved**2:
             return ascent
-        blurs = end
+        likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
+        if likelihood > likeliest:
+            likeliest, best = likelihood, ascent
+        if is_end:
+            return best
+        blurs = narrower
         # a fine grid has to hold no more than what was detected around the features
         near = [
             replace(view, observation=view.observation.around(places, errors.reach))

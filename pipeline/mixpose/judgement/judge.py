@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -63,6 +63,8 @@ class Judged:
         Where the pose came from.
     value : float
         Of what was climbed, at the pose.
+    lasting : (6, 6) float64
+        Of the covariance, what lasts from frame to frame.
     """
 
     T_world_object: Floats
@@ -77,6 +79,7 @@ class Judged:
     spread: Floats | None = None
     proposer: str = ""
     value: float = 0.0
+    lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 def judge(
@@ -129,6 +132,7 @@ def judge(
         coverage=sum(one.coverage for one in found) / count,
         measurements=sum(one.measurements for one in found),
         covariance=noise.covariance,
+        lasting=noise.lasting,
         log_evidence=evidence,
         residuals=noise.remembered,
         associations=tuple(found),

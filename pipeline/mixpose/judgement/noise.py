@@ -136,12 +136,15 @@ class FrameNoise:
         Of each sensor, in σ_ε²; the typical one counts, too.
     covariance : (6, 6) float64
         Zero where the pose is not free.
+    lasting : (6, 6) float64
+        Of it, what lasts from frame to frame and leaves velocities alone.
     remembered : Residuals
         For the next frame.
     """
 
     variances: Floats
     covariance: Floats
+    lasting: Floats
     remembered: Residuals
 
 
@@ -177,17 +180,18 @@ def noise_of(
     lasting = frame.lasting.after(before.lasting, model.fields)
     # fields last: a further frame shows no more of them
     factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
-    covariance = np.zeros((6, 6))
+    covariance, steady = np.zeros((6, 6)), np.zeros((6, 6))
     inner = np.tensordot(shares.variances * factors, frame.parts, 1)
     inner += frame.by_calibration @ frame.by_calibration.T
     fields = lasting.moments(model.fields)
     if fields is not None:
-        inner += frame.by_fields @ fields @ frame.by_fields.T
+        steady[np.ix_(free, free)] = frame.by_fields @ fields @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
+    covariance += steady
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
     kept = lasting.kept(before.lasting, model.fields)
     remembered = Residuals({**before.noise, **noise}, moments, kept)
-    return FrameNoise(seen.variances, covariance, remembered)
+    return FrameNoise(seen.variances, covariance, steady, remembered)
 
 
 def joined_offsets(associations: Sequence[Association]) -> Offsets:
@@ -391,5 +395,8 @@ def _inverse(information: Floats) -> Floats:
 
 def information_of(associations: Sequence[Association], variances: Floats) -> Floats:
     """Σ_l Σ_i J_iᵀ J_i / s_l² (6, 6) over the met features, for noise (L,) in σ_ε²."""
-    rows = [one.rows[:, :6] / s for one, s in zip(associations, np.sqrt(variances).tolist())]
-    return np.asarray(np.concatenate(rows).T @ np.concatenate(rows))
+    information = np.zeros((6, 6))
+    for one, variance in zip(associations, variances.tolist(), strict=True):
+        weighted = (one.J * (one.shares / (variance * one.sigma**2))[:, None, None]).reshape(-1, 6)
+        information += weighted.T @ one.J.reshape(-1, 6)
+    return information

@@ -252,7 +252,9 @@ class Tracker:
                 # what may be mere clutter counts as little in the next frame
                 weight * float(expit(one.log_evidence)),
                 one.spread if self.options.fuse else None,
-                np.sqrt(np.diagonal(one.covariance)) if is_timed(data.views) else None,
+                np.sqrt(np.diagonal(one.covariance - one.lasting))
+                if is_timed(data.views)
+                else None,
             )
             for one, weight in verdict.kept
         ]
