@@ -53,6 +53,10 @@ class Frame(NamedTuple):
         How these move the pose.
     by_calibration : (k, K) float64
         How calibrations do that are off by a standard deviation in one thing each.
+    rest : (R, 1 + q) float64
+        Weighted residuals, and what a pose leaves of the fields that may last.
+    fields : list of (R, n) float64
+        Those that change, of each kind.
     """
 
     moments: Moments
@@ -60,6 +64,15 @@ class Frame(NamedTuple):
     lasting: Lasting
     by_fields: Floats
     by_calibration: Floats
+    rest: Floats
+    fields: list[Floats]
+
+    def without(self, sizes: Floats) -> Moments:
+        """Moments of what is left where fields of sizes (q,) are taken off."""
+        left = self.rest[:, 0] - self.rest[:, 1:] @ sizes
+        seen = [float(left @ left), *(float(((P.T @ left) ** 2).sum()) for P in self.fields)]
+        expected = self.moments.expected
+        return Moments(np.array([*seen, self.moments.seen[3]]) * expected.any(), expected)
 
 
 def frames_of(
@@ -122,6 +135,8 @@ def frames_of(
             Lasting(names, information[k], vector[k] / sizes[k]),
             drawn[k] / sizes[k],
             doubts[k],
+            np.hstack([r[k], left[k] / sizes[k]]),
+            [one[k] for one in P],
         )
         for k in range(frames)
     ]

@@ -205,19 +205,20 @@ def _frame_noise(
     free: NDArray[np.bool_],
     model: NoiseModel,
 ) -> FrameNoise:
-    moments = before.moments.joined(frame.moments, model.memory)
-    met = float(np.mean([one.met for one in associations]))
-    shares = _shares(moments, frame.moments, met, model)
     lasting = frame.lasting.after(before.lasting, model.fields)
+    sizes = lasting.sizes(model.fields)
+    own = frame.moments if sizes is None else frame.without(sizes.mean)
+    moments = before.moments.joined(own, model.memory)
+    met = float(np.mean([one.met for one in associations]))
+    shares = _shares(moments, own, met, model)
     # fields last: a further frame shows no more of them
     degrees = np.array([level.degrees, *shares.degrees])
     factors = model.enlargement(int(free.sum()), degrees)
     covariance, steady = np.zeros((6, 6)), np.zeros((6, 6))
     inner = np.tensordot(shares.variances * factors, frame.parts, 1)
     inner += frame.by_calibration @ frame.by_calibration.T
-    fields = lasting.moments(model.fields)
-    if fields is not None:
-        steady[np.ix_(free, free)] = frame.by_fields @ fields @ frame.by_fields.T
+    if sizes is not None:
+        steady[np.ix_(free, free)] = frame.by_fields @ sizes.moments @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
     covariance += steady
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
