@@ -174,18 +174,19 @@ def noise_of(
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
     variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
     frame = _moments(associations, offsets, variances, free, model)
-    moments = before.moments.joined(frame.moments, model.memory)
-    met = float(np.mean([one.met for one in associations]))
-    shares = _shares(moments, frame.moments, met, model)
     lasting = frame.lasting.after(before.lasting, model.fields)
+    sizes = lasting.sizes(model.fields)
+    own = frame.moments if sizes is None else frame.without(sizes.mean)
+    moments = before.moments.joined(own, model.memory)
+    met = float(np.mean([one.met for one in associations]))
+    shares = _shares(moments, own, met, model)
     # fields last: a further frame shows no more of them
     factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
     covariance, steady = np.zeros((6, 6)), np.zeros((6, 6))
     inner = np.tensordot(shares.variances * factors, frame.parts, 1)
     inner += frame.by_calibration @ frame.by_calibration.T
-    fields = lasting.moments(model.fields)
-    if fields is not None:
-        steady[np.ix_(free, free)] = frame.by_fields @ fields @ frame.by_fields.T
+    if sizes is not None:
+        steady[np.ix_(free, free)] = frame.by_fields @ sizes.moments @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
     covariance += steady
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
@@ -253,6 +254,10 @@ class _Frame(NamedTuple):
         How these move the pose.
     by_calibration : (k, K) float64
         How calibrations do that are off by a standard deviation in one thing each.
+    rest : (K, 1 + q) float64
+        Weighted residuals, and what a pose leaves of the fields that may last.
+    fields : list of (K, n) float64
+        Those that change, of each kind.
     """
 
     moments: Moments
@@ -260,6 +265,15 @@ class _Frame(NamedTuple):
     lasting: Lasting
     by_fields: Floats
     by_calibration: Floats
+    rest: Floats
+    fields: list[Floats]
+
+    def without(self, sizes: Floats) -> Moments:
+        """Moments of what is left where fields of sizes (q,) are taken off."""
+        left = self.rest[:, 0] - self.rest[:, 1:] @ sizes
+        seen = [float(left @ left), *(float(((P.T @ left) ** 2).sum()) for P in self.fields)]
+        expected = self.moments.expected
+        return Moments(np.array([*seen, self.moments.seen[3]]) * expected.any(), expected)
 
 
 def _moments(
@@ -311,7 +325,8 @@ def _moments(
     own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
     by_kind = np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
     by_calibration = inverse @ np.hstack([np.zeros((count, 0)), *doubts])
-    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes, by_calibration)
+    rest = np.column_stack([r, rest / sizes])
+    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes, by_calibration, rest, P)
 
 
 class _OfMarkers(NamedTuple):

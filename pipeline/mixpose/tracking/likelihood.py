@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Noise, errors_seen
-from mixpose.fit import EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
+from mixpose.fit import Climbed, EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
 from mixpose.judgement import (
     Association,
     Judged,
@@ -257,9 +257,13 @@ class FrameData:
 
 @dataclass(frozen=True, eq=False)
 class MatchedLikelihood:
-    """Matched densities of all sensors."""
+    """Matched densities of all sensors.
+
+    `climbed` has the fits so far, by the sensors that were left out.
+    """
 
     data: FrameData
+    climbed: dict[frozenset[str], list[Climbed]] = field(default_factory=dict)
 
     @property
     def knows_detections(self) -> bool:
@@ -271,7 +275,8 @@ class MatchedLikelihood:
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
-        begun = None
+        climbed = self.climbed.setdefault(frozenset(start.left_out), [])
+        timed, begun = is_timed(data.views), None
         if data.begun and data.predictions and start.prediction is data.predictions[0]:
             begun = data.begun.ascent
 
@@ -285,13 +290,14 @@ class MatchedLikelihood:
                 seen.samples,
                 finest=seen.finest,
                 begun=begun,
+                climbed=None if timed else climbed,
                 noise=seen.noise,
                 beside=beside,
                 errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )
 
-        if is_timed(data.views):
+        if timed:
             return fit_in_motion(data, start.T_world_object, climb)
         return climb(data, start.T_world_object)
 
