@@ -8,7 +8,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import EstimatorOptions, ScheduleRules, blur_schedule, fit_near
+from mixpose.fit import Climbed, EstimatorOptions, ScheduleRules, blur_schedule, fit_near
 from mixpose.fit.prior import Likelihood, NormalPrior, likelihood_at, most_probable
 from mixpose.objective import View, matched_objective
 from mixpose.records import GridPattern
@@ -69,6 +69,28 @@ def test_a_start_twenty_pixels_off_is_corrected(pinhole_cameras: list[PinholeCam
     fit = fit_near(views, EIGHT, start, u, EstimatorOptions(), EIGHT.means[:, None])
     twist = np.abs(twist_between(TRUTH, fit.T_world_object))
     assert (twist < interpolation_bound(views, EIGHT, TRUTH, ALL_FREE)).all()
+
+
+def test_a_start_that_leads_where_another_did_is_given_the_very_same_fit(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views, climbed = detect(pinhole_cameras, EIGHT, TRUTH), list[Climbed]()
+    far = perturb(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0]))  # at another maximum
+    first, again, elsewhere = (
+        fit_near(
+            views,
+            EIGHT,
+            start,
+            np.repeat([6, 0.05], 3),
+            EstimatorOptions(),
+            EIGHT.means[:, None],
+            climbed=climbed,
+        )
+        for start in (random_start(1), random_start(2), far)
+    )
+    assert again is first
+    assert elsewhere is not first
+    assert np.linalg.norm(twist_between(TRUTH, elsewhere.T_world_object)) > 0.1
 
 
 DOT = Body("dot", (PointFeature(np.zeros(3)),))

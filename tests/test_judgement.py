@@ -9,7 +9,7 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import expected_covariance, judge
+from mixpose.judgement import Case, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
 from mixpose.sensors import PinholeCamera
 
@@ -32,10 +32,31 @@ def test_expected_covariance_is_infinite_where_the_data_leave_a_direction_open(
 
 def test_judgement_tells_hidden_from_met(pinhole_cameras: list[PinholeCamera]) -> None:
     views = detect(pinhole_cameras, EIGHT, TRUTH, hidden=2, false=2)
-    judged = judge(matched_objective(views, EIGHT, [1.5, 1.5]), TRUTH, ALL_FREE)
+    judged = judge(Case(matched_objective(views, EIGHT, [1.5, 1.5]), TRUTH), ALL_FREE)
     assert judged.measurements == pytest.approx(24, abs=0.4)
     assert judged.coverage == pytest.approx(6 / 8, abs=0.02)
     for report in judged.sensors.values():
         # six of eight features met, six of eight detections explained: (6/8)²
         assert report.explained == pytest.approx((6 / 8) ** 2, abs=0.02)
         assert report.rms == pytest.approx(0.0, abs=0.05)
+
+
+def test_bodies_judged_at_once_are_worth_what_each_is_alone(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # one of eight features, one of five; some hidden from all cameras, some from one
+    five = Body("five", EIGHT.features[:5])
+    cases = [
+        Case(matched_objective(views, body, [1.5, 1.5]), TRUTH)
+        for body, views in (
+            (EIGHT, detect(pinhole_cameras, EIGHT, TRUTH, hidden=2, noise=0.3, seed=1)),
+            (five, detect(pinhole_cameras, five, TRUTH, hidden=1, noise=0.2, seed=2)),
+        )
+    ]
+    for together, case in zip(judge_together(cases, ALL_FREE), cases, strict=True):
+        alone = judge(case, ALL_FREE)
+        assert together.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
+        np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
+        assert together.residuals.noise == alone.residuals.noise
+        for a, b in zip(together.residuals.lasting, alone.residuals.lasting, strict=True):
+            np.testing.assert_allclose(a.information, b.information, rtol=1e-6, atol=1e-9)

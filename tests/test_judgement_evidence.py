@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mixpose.judgement import Association, DetectionModel, Prior
 from mixpose.judgement.evidence import log_evidence
 from mixpose.judgement.noise import information_of
+from mixpose.judgement.stacked import Stacked
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +39,16 @@ SIX = Association(
 )
 
 
+def odds_at(
+    found: list[Association], information: Floats, prior: Prior, size: float, model: DetectionModel
+) -> float:
+    """Of one pose."""
+    variances, sizes = np.full((1, len(found)), S2), np.array([size])
+    stacked = Stacked.of([found])
+    odds = log_evidence(stacked, information[None] / S2, variances, FREE, [prior], sizes, model)
+    return float(odds[0])
+
+
 def evidence(
     one: Association,
     *,
@@ -46,7 +57,7 @@ def evidence(
     detection: DetectionModel = BY_VOLUME,
 ) -> float:
     prior = Prior(log_density, np.ones(6))
-    return log_evidence([one], information / S2, np.array([S2]), FREE, prior, 1.0, detection)
+    return odds_at([one], information, prior, 1.0, detection)
 
 
 def test_the_odds_by_volume_are_those_of_the_formula() -> None:
@@ -116,7 +127,7 @@ def two_cameras_at_right_angles() -> list[Association]:
 def odds_by_volume(found: list[Association], *, in_space: bool = True) -> float:
     detection = DetectionModel(by_count=False, in_space=in_space)
     prior = Prior(0.0, np.ones(6))
-    return log_evidence(found, KNOWN / S2, np.full(len(found), S2), FREE, prior, 200.0, detection)
+    return odds_at(found, KNOWN, prior, 200.0, detection)
 
 
 def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it() -> None:
@@ -168,5 +179,6 @@ def test_information_is_that_of_least_squares() -> None:
     shares = np.array([1.0, 1.0, 0.5, 1.0, 0.0, 1.0])
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))
     np.testing.assert_allclose(
-        information_of([replace(SIX, shares=shares)], np.array([S2])), expected / S2
+        information_of(Stacked.of([[replace(SIX, shares=shares)]]), np.array([[S2]]))[0],
+        expected / S2,
     )

@@ -8,7 +8,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import Prior, judge
+from mixpose.judgement import Case, Prior, judge
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search.budget import PeakOptions
@@ -51,7 +51,7 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
         )
         objective = matched_objective(views, EIGHT, [1.5] * len(views))
         for pose, log_odds in zip(poses, found, strict=True):
-            judged = judge(objective, pose, ALL_FREE, prior=never)
+            judged = judge(Case(objective, pose, prior=never), ALL_FREE)
             # the search takes one noise for all sensors, the judgement one for each: a nat at most
             assert log_odds == pytest.approx(judged.log_evidence, abs=1.0)
 

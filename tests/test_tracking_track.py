@@ -10,7 +10,7 @@ from scipy.stats import t as student
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import AcceptanceRules, DetectionModel, Residuals, flat_prior, judge
+from mixpose.judgement import AcceptanceRules, Case, DetectionModel, Residuals, flat_prior, judge
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.search import SearchState
@@ -110,7 +110,7 @@ def test_one_detection_where_a_feature_is_predicted_is_no_pose(
     views = [view_of("0", pinhole_cameras[0], y[:1])]
     predictions = [Prediction(TRUTH, NARROW, 1.0)]
     prior = prior_of(TRUTH, predictions, EIGHT, ALL_FREE, 0, RULES, MODEL)
-    judged = judge(matched_objective(views, EIGHT, [1.5]), TRUTH, ALL_FREE, prior=prior)
+    judged = judge(Case(matched_objective(views, EIGHT, [1.5]), TRUTH, prior=prior), ALL_FREE)
     # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
     assert judged.log_evidence < 7 * np.log(0.25) + 10
     assert judged.log_evidence < AcceptanceRules().possible

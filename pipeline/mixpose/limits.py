@@ -9,6 +9,9 @@ from __future__ import annotations
 MOST_PIXELS = 2**26
 """Of an image: 67 million, more than usual sensors have; up to 20 bytes each are used."""
 
+MOST_IMAGE_BYTES = 2**29
+"""Of an image file: eight for each of as many pixels."""
+
 MOST_FEATURES = 2000
 """Of a body, pieces of segments included: their pairs are compared."""
 
@@ -28,7 +31,7 @@ MOST_UNSORTED_ROWS = 1_000_000
 """Of a table whose rows are not in the order of frames: it is read whole."""
 
 MOST_BYTES = 4_000_000
-"""Of a session file, a calibration or a table of markers."""
+"""Of a session file, a list of sessions, a calibration, a table of markers or a line of poses."""
 
 MOST_YAML_CHARACTERS = 500_000
 """Of a calibration in YAML, whose reader is slow: this much takes seconds."""

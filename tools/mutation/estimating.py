@@ -29,6 +29,13 @@ _NEAR = (
         "descents begin where everything is one blob",
     ),
     Mutant(
+        "fit-all-starts-lead-to-one",
+        "fit/near.py",
+        "curvature @ away) < rules.same",
+        "curvature @ away) * 0 < rules.same",
+        "rivals are taken for the pose that was found first",
+    ),
+    Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
         "if here.value >= rules.near * len(views):",

@@ -8,8 +8,8 @@ _NOISE = (
     Mutant(
         "judgement-few-residuals-are-as-good-as-many",
         "judgement/noise.py",
-        "return float(directions * tail / chdtri(directions, 1 - self.confidence))",
-        "return 1.0",
+        "return np.asarray(directions * tail / chdtri(directions, 1 - self.confidence))",
+        "return np.ones(np.shape(degrees))",
         "covariances of few features are too small",
     ),
     Mutant(
@@ -29,15 +29,15 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "offsets, count = joined_offsets(associations), int(free.sum())",
-        "offsets, count = joined_offsets(associations), 0",
+        "_level(associations, int(free.sum()), known, model)",
+        "_level(associations, 0, known, model)",
         "noise seems smaller than it is",
     ),
     Mutant(
         "judgement-information-in-sigmas",
-        "judgement/noise.py",
-        "one.shares / (variance * one.sigma**2)",
-        "one.shares / (variance * one.sigma)",
+        "judgement/stacked.py",
+        "= one.J / one.sigma",
+        "= one.J",
         "covariances depend on the unit of a sensor",
     ),
     Mutant(
@@ -73,23 +73,23 @@ _FIELDS = (
     ),
     Mutant(
         "judgement-markers-off-are-noise",
-        "judgement/noise.py",
-        "    squares.append(of_markers.squares)",
-        "    squares.append(0.0)",
+        "judgement/moments.py",
+        "(r * r).sum(axis=(1, 2)), markers.squares",
+        "(r * r).sum(axis=(1, 2)), 0.0",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
-        "judgement/noise.py",
-        "left = [one - J @ each for one, each in zip(P, drawn, strict=True)]",
-        "left = [one for one, each in zip(P, drawn, strict=True)]",
+        "judgement/moments.py",
+        "left = fields - J @ drawn",
+        "left = fields",
         "offsets that a pose takes for its own are thought to be small",
     ),
     Mutant(
         "judgement-outliers-in-the-covariance",
-        "judgement/noise.py",
-        "shares = np.where(inlying, one.shares, 0.0)",
-        "shares = one.shares",
+        "judgement/moments.py",
+        "shares = np.where(clear, found.shares, 0.0)",
+        "shares = found.shares",
         "a cut spot makes a frame unsure",
     ),
 )
@@ -112,8 +112,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-out-of-view-is-free",
         "judgement/evidence.py",
-        "unseen = sum(one.unseen for one in associations) * detection.log_unseen",
-        "unseen = 0.0",
+        'found.gathered("unseen").sum(axis=1) * detection.log_unseen',
+        "0.0",
         "a pose gains by moving features out of the picture",
     ),
     Mutant(
@@ -140,14 +140,14 @@ _EVIDENCE = (
     Mutant(
         "judgement-volume-of-the-other-sign",
         "judgement/evidence.py",
-        "len(inner) * math.log(2 * math.pi) - _log_det(inner))",
-        "len(inner) * math.log(2 * math.pi) + _log_det(inner))",
+        "math.log(2 * math.pi) - _log_det(inner))",
+        "math.log(2 * math.pi) + _log_det(inner))",
         "poses that are known well count as known badly",
     ),
     Mutant(
         "judgement-prediction-does-not-count",
         "judgement/evidence.py",
-        " + laplace + prior.log_density",
+        " + laplace + log_densities",
         " + laplace",
         "a pose far from its prediction is as good as one near it",
     ),

@@ -43,8 +43,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-left-out-for-free",
         "tracking/likelihood.py",
-        "unmet=others,",
-        "unmet=(),",
+        "data.track.residuals, prior, others)",
+        "data.track.residuals, prior, ())",
         "leaving a sensor out makes a pose better",
         (_STARTS,),
     ),

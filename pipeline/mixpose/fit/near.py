@@ -35,7 +35,7 @@ from mixpose.objective import (
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend, ascend_together
-from mixpose.rigid import perturb
+from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -66,6 +66,9 @@ class FitRules:
         "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
         "on average; below, it descends through the blurs",
     )
+    same: float = constant(
+        1e-5, "share of the value by which ascents that ended at one place differ: 0.003 σ_ε"
+    )
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,20 @@ class Fit:
     motion: Motion | None = None
 
 
+@dataclass(frozen=True)
+class Climbed:
+    """A fit, and the ascent at σ_ε that it went on from."""
+
+    ascent: Ascent[Floats]
+    fit: Fit
+
+    def begins_at(self, other: Ascent[Floats], rules: FitRules) -> bool:
+        """Whether another ascent ended at the same place, so that it leads to the same fit."""
+        assert other.last is not None
+        away = twist_between(self.ascent.state, other.state)
+        return float(away @ other.last.curvature @ away) < rules.same * abs(other.value)
+
+
 def fit_near(
     views: Sequence[View],
     body: Body,
@@ -104,6 +121,7 @@ def fit_near(
     *,
     finest: MatchedObjective | None = None,
     begun: Ascent[Floats] | None = None,
+    climbed: list[Climbed] | None = None,
     noise: Sequence[Noise] | None = None,
     beside: float = 0.0,
     errors: ErrorRules = ErrorRules(),
@@ -126,6 +144,9 @@ def fit_near(
         At σ_ε, where it is at hand.
     begun : Ascent or None
         From the start, on that, where it is at hand.
+    climbed : list of Climbed or None
+        Fits to the same views and with the same noise; this one is added.  Where its ascent ends
+        at σ_ε where one of theirs did, theirs is returned, the very same.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
     beside : float
@@ -145,13 +166,21 @@ def fit_near(
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
+    at_sigma = ascent
+    if climbed is None or not finest or has_likelihood(views):
+        climbed = []
+    for one in climbed:
+        if one.begins_at(at_sigma, rules):
+            return one.fit
     if finest and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
         ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, NormalPrior(T_start, uncertainty, free), rules.misfit)
-    return Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
+    fit = Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
+    climbed.append(Climbed(at_sigma, fit))
+    return fit
 
 
 def fit_together(

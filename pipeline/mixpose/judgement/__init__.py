@@ -22,13 +22,22 @@ from mixpose.judgement.evidence import (
     paid_by_count,
 )
 from mixpose.judgement.expected_covariance import expected_covariance, invert_information
-from mixpose.judgement.judge import Judged, JudgementRules, beliefs, judge, nearest_alike
+from mixpose.judgement.judge import (
+    Case,
+    Judged,
+    JudgementRules,
+    beliefs,
+    judge,
+    judge_together,
+    nearest_alike,
+)
 from mixpose.judgement.noise import NoiseModel, Residuals, joined_offsets
 
 __all__ = [
     "APART",
     "AcceptanceRules",
     "Association",
+    "Case",
     "DetectionModel",
     "Judged",
     "JudgementRules",
@@ -51,6 +60,7 @@ __all__ = [
     "is_sure",
     "joined_offsets",
     "judge",
+    "judge_together",
     "nearest_alike",
     "odds_of",
     "paid_by_count",

@@ -42,7 +42,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.association import Association
+from mixpose.judgement.stacked import Stacked
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -116,7 +116,7 @@ class SensorMatches:
         How predicted places change as the feature moves in the world, σ_ε per length.
     crowd : (H,) float64
         Observed features per σ_ε^m.
-    count : float
+    count : (H,) float64
         Number of observed features.
     """
 
@@ -125,7 +125,7 @@ class SensorMatches:
     offsets: Floats
     by_world: Floats
     crowd: Floats
-    count: float
+    count: Floats
 
 
 class Odds(NamedTuple):
@@ -156,46 +156,46 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 
 
 def log_evidence(
-    associations: Sequence[Association],
+    found: Stacked,
     information: Floats,
     variances: Floats,
     free: NDArray[np.bool_],
-    prior: Prior,
-    size: float,
+    priors: Sequence[Prior],
+    sizes: Floats,
     detection: DetectionModel,
-) -> float:
-    """Logarithm of the odds for the body at a pose against mere clutter.
+) -> Floats:
+    """Logarithm of the odds (K,) for bodies at K poses against mere clutter.
 
     Parameters
     ----------
-    associations : sequence of Association
-        One per sensor that saw something.
-    information : (6, 6) array
-    variances : (L,) array
+    found : Stacked
+        Of all sensors that saw something.
+    information : (K, 6, 6) array
+    variances : (K, L) array
         Of the noise of each, in σ_ε².
     free : (6,) bool
-    prior : Prior
-    size : float
-        Of the body, length units.
+    priors : sequence of Prior
+    sizes : (K,) array
+        Of the bodies, length units.
     detection : DetectionModel
     """
-    if not any(one.met for one in associations):
-        return -np.inf
-    matches = _matches_of(associations, variances)
-    odds = odds_of(matches, np.ones(1), size, detection)
-    unseen = sum(one.unseen for one in associations) * detection.log_unseen
+    matches = _matches_of(found, variances)
+    odds = odds_of(matches, np.ones(len(variances)), sizes, detection)
+    unseen = found.gathered("unseen").sum(axis=1) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
-    inner = information[np.ix_(free, free)] + np.diag(1 / prior.spread[free] ** 2)
-    laplace = 0.5 * (len(inner) * math.log(2 * math.pi) - _log_det(inner))
-    by_volume = float(odds.gained[0] + odds.missed[0]) + laplace + prior.log_density
-    if not detection.by_count:
-        return by_volume
-    return max(by_volume, float(paid_by_count(odds, matches, free)[0]))
+    spreads = np.array([prior.spread for prior in priors])[:, free]
+    inner = information[:, free][..., free] + np.eye(spreads.shape[1]) / spreads[:, None] ** 2
+    laplace = 0.5 * (spreads.shape[1] * math.log(2 * math.pi) - _log_det(inner))
+    log_densities = np.array([prior.log_density for prior in priors])
+    evidence = odds.gained + odds.missed + laplace + log_densities
+    if detection.by_count:
+        evidence = np.maximum(evidence, paid_by_count(odds, matches, free))
+    return np.where(found.shares.any(axis=(1, 2)), evidence, -np.inf)
 
 
 def odds_of(
-    matches: Sequence[SensorMatches], variance: Floats, size: float, detection: DetectionModel
+    matches: Sequence[SensorMatches], variance: Floats, sizes: Floats, detection: DetectionModel
 ) -> Odds:
     """Odds of H poses against clutter, as if they had not been chosen to fit.
 
@@ -205,7 +205,7 @@ def odds_of(
         One per sensor.
     variance : (H,) array
         Of offsets, in σ_ε².
-    size : float
+    sizes : (H,) array
         Of the body, length units.
     detection : DetectionModel
     """
@@ -238,7 +238,7 @@ def odds_of(
     missed[covered] = np.maximum(missed, most)[covered]
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
-        space, share = _in_space(matches, near, together, variance, size)
+        space, share = _in_space(matches, near, together, variance, sizes[together[0]])
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -252,13 +252,13 @@ def _in_space(
     near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
     variance: Floats,
-    size: float,
+    sizes: Floats,
 ) -> tuple[Floats, Floats]:
     """What features met by several cameras say if clutter are points in space (K,), and shares.
 
     A clutter point lies where the cameras see it; only that it lies at the feature tells.
     """
-    A = np.tile(np.eye(3) / size**2, (len(chosen[0]), 1, 1))
+    A = np.eye(3) / sizes[:, None, None] ** 2
     b, share = np.zeros((len(A), 3)), np.zeros(len(A))
     log_rarity = np.full(len(A), -np.inf)
     for one, is_near in zip(matches, near, strict=True):
@@ -271,7 +271,7 @@ def _in_space(
         share = np.maximum(share, met * one.shares[chosen])
         # detections per area, of which each has a depth
         across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(1, 2)), 1e-300))
-        rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + math.log(size)
+        rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + np.log(sizes)
         log_rarity = np.maximum(log_rarity, np.where(met, rarity, -np.inf))
     away = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1)
     tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
@@ -289,7 +289,7 @@ def paid_by_count(odds: Odds, matches: Sequence[SensorMatches], free: NDArray[np
 def _log_choices(matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> Floats:
     """Logarithm (H,) of the number of ways to fix a pose by observed features."""
     expected = np.array([one.weights.sum(axis=1) for one in matches])
-    counts = np.array([[one.count] for one in matches])
+    counts = np.array([one.count for one in matches])
     pins = -(-int(free.sum()) // max(one.offsets.shape[2] for one in matches))
     observed = np.maximum((counts * (expected > 0)).sum(axis=0), pins)
     features = np.maximum(expected.max(axis=0), pins)
@@ -298,29 +298,29 @@ def _log_choices(matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> F
     return np.asarray(ways + assigned + math.log(2))
 
 
-def _matches_of(associations: Sequence[Association], variances: Floats) -> list[SensorMatches]:
-    """Associations of one pose, each feature in a column of its own.
+def _matches_of(found: Stacked, variances: Floats) -> list[SensorMatches]:
+    """Associations of K poses, whose noise stands in the place of σ_ε: their variance is 1."""
+    roots = np.sqrt(variances)
+    offsets = found.offsets / roots[..., None, None]
+    by_world = found.J[..., :3] / roots[..., None, None, None]
+    crowds, sigmas, counts = (found.gathered(name) for name in ("crowd", "sigma", "count"))
+    crowds = crowds * (roots * sigmas) ** found.dimensions
+    return [
+        SensorMatches(
+            found.weights[:, i],
+            found.shares[:, i],
+            offsets[:, i, :, :m],
+            by_world[:, i, :, :m],
+            crowds[:, i],
+            counts[:, i],
+        )
+        for i, m in enumerate(found.dimensions.tolist())
+    ]
 
-    Their noise stands in the place of σ_ε, so that their variance is 1.
-    """
-    columns = 1 + max(int(one.features.max(initial=0)) for one in associations)
-    found = []
-    units = np.sqrt(variances) * [one.sigma for one in associations]
-    for one, unit in zip(associations, units.tolist(), strict=True):
-        n, m = one.offsets.shape
-        weights, shares = np.zeros((2, 1, columns))
-        offsets, by_world = np.zeros((1, columns, m)), np.zeros((1, columns, m, 3))
-        weights[0, one.features] = one.expected / max(n, 1)
-        shares[0, one.features] = one.shares
-        offsets[0, one.features] = one.offsets / unit
-        by_world[0, one.features] = one.J[..., :3] / unit
-        crowd = np.array([one.crowd * unit**m])
-        found.append(SensorMatches(weights, shares, offsets, by_world, crowd, one.count))
-    return found
 
-
-def _log_det(A: Floats) -> float:
-    """Logarithm of the determinant of a positive definite matrix, however ill conditioned."""
-    scale = np.sqrt(A.diagonal())
-    values = np.linalg.eigvalsh(A / scale / scale[:, None])
-    return float(np.log(np.maximum(values, 1e-12)).sum() + 2 * np.log(scale).sum())
+def _log_det(A: Floats) -> Floats:
+    """Logarithms of the determinants of positive definite matrices, however ill conditioned."""
+    scale = np.sqrt(A.diagonal(axis1=1, axis2=2))
+    values = np.linalg.eigvalsh(A / scale[:, :, None] / scale[:, None])
+    logs = np.log(np.maximum(values, 1e-12)).sum(axis=1) + 2 * np.log(scale).sum(axis=1)
+    return np.asarray(logs)

@@ -15,11 +15,13 @@ from mixpose.density import AssociationRules
 from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.noise import (
+    FrameNoise,
     NoiseModel,
     Residuals,
     information_of,
-    noise_of,
+    noises_of,
 )
+from mixpose.judgement.stacked import Stacked
 from mixpose.objective import MatchedObjective
 from mixpose.records import SensorReport
 
@@ -82,51 +84,84 @@ class Judged:
     lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
-def judge(
-    objective: MatchedObjective,
-    T_world_object: Floats,
-    free: NDArray[np.bool_],
-    *,
-    before: Residuals = Residuals(),
-    prior: Prior | None = None,
-    unmet: Sequence[Association] = (),
-    rules: JudgementRules = JudgementRules(),
-) -> Judged:
-    """Judge a pose by the matched densities at the finest blur.
+@dataclass(frozen=True)
+class Case:
+    """A pose that is to be judged, and what was known before.
 
-    Parameters
+    Attributes
     ----------
     objective : MatchedObjective
         At σ_ε of every sensor.
-    T_world_object : (4, 4) array
-    free : (6,) bool
-        Directions that were estimated.
+    T_world_object : (4, 4) float64
     before : Residuals
         Of the frames before.
     prior : Prior or None
         What was known of the pose; None: nothing.
     unmet : sequence of Association
         Other sensors, which count as if they had met nothing.
+    """
+
+    objective: MatchedObjective
+    T_world_object: Floats
+    before: Residuals = Residuals()
+    prior: Prior | None = None
+    unmet: Sequence[Association] = ()
+
+
+def judge(case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()) -> Judged:
+    """Judge a pose by the matched densities at the finest blur.
+
+    Parameters
+    ----------
+    case : Case
+    free : (6,) bool
+        Directions that were estimated.
     rules : JudgementRules
     """
+    return judge_together([case], free, rules)[0]
+
+
+def judge_together(
+    cases: Sequence[Case], free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()
+) -> list[Judged]:
+    """Judge poses that the same sensors see, at once: as `judge` does each."""
     narrowest = rules.noise.errors.narrowest
-    found, value = associate(objective, T_world_object, rules.association, narrowest)
-    prior = prior or flat_prior(objective.projection.body, free, rules.detection)
-    noise = noise_of(found, free, before, rules.noise)
-    blind = [replace(one, shares=np.zeros(len(one.features))) for one in unmet]
-    variances = np.append(noise.variances, np.ones(len(blind)))
+    pairs = [
+        associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
+    ]
+    found = [associations for associations, _ in pairs]
+    stacked = Stacked.of(found)
+    noises = noises_of(stacked, free, [one.before for one in cases], rules.noise)
+    variances = np.array([noise.variances for noise in noises])
+    information = information_of(stacked, variances)
+    blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
+    if any(blind):
+        stacked = Stacked.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
+        variances = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
+    bodies = [one.objective.projection.body for one in cases]
     evidence = log_evidence(
-        [*found, *blind],
-        information_of(found, noise.variances),
+        stacked,
+        information,
         variances,
         free,
-        prior,
-        2 * objective.projection.body.radius,
+        [
+            one.prior or flat_prior(body, free, rules.detection)
+            for one, body in zip(cases, bodies, strict=True)
+        ],
+        np.array([2 * body.radius for body in bodies]),
         rules.detection,
     )
+    parts = zip(cases, pairs, noises, evidence.tolist(), strict=True)
+    return [_judged(*each) for each in parts]
+
+
+def _judged(
+    case: Case, associated: tuple[list[Association], float], noise: FrameNoise, evidence: float
+) -> Judged:
+    found, value = associated
     count = len(found)
     return Judged(
-        T_world_object=T_world_object,
+        T_world_object=case.T_world_object,
         sensors={one.name: SensorReport(True, one.explained, one.rms) for one in found},
         score=sum(math.sqrt(one.explained) for one in found) / count,
         coverage=sum(one.coverage for one in found) / count,

@@ -10,14 +10,15 @@ and γ normal with the deviation d before,
     S = (A + 1/d²)⁻¹,      γ̂ = S v.
 
 Where vᵀγ̂ is larger than chance makes it, something lasts: the second moment of γ is then γ̂γ̂ᵀ + S,
-and the covariance of a pose has what that moves it by.
+and the covariance of a pose has what that moves it by.  What changes from frame to frame is then
+sought in r − RPγ̂.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,18 @@ class LastingRules:
     memory: float = constant(0.99, "per frame, of what was seen before: 100 frames count")
     by_chance: float = constant(0.999, "frames that show as little where nothing lasts")
     rigs: int = constant(4, "sets of sensors that are told apart, the last ones that were seen")
+
+
+class Sizes(NamedTuple):
+    """Sizes γ̂ (q,) of fields in σ_ε, and their covariance S (q, q)."""
+
+    mean: Floats
+    covariance: Floats
+
+    @property
+    def moments(self) -> Floats:
+        """Second moments (q, q) in σ_ε²."""
+        return np.asarray(self.covariance + np.outer(self.mean, self.mean))
 
 
 @dataclass(frozen=True)
@@ -71,8 +84,8 @@ class Lasting:
         others = [one for one in before if one.names != self.names]
         return (self, *others[: rules.rigs - 1])
 
-    def moments(self, rules: LastingRules) -> Floats | None:
-        """Second moments (q, q) of the fields in σ_ε²; None where there may be none."""
+    def sizes(self, rules: LastingRules) -> Sizes | None:
+        """How large the fields are; None where there may be none."""
         if not rules.deviation:
             return None
         S = np.linalg.inv(self.information + np.eye(len(self.vector)) / rules.deviation**2)
@@ -80,4 +93,4 @@ class Lasting:
         degrees = float((S * self.information).sum())
         if self.vector @ sizes <= chdtri(max(degrees, 1.0), 1 - rules.by_chance):
             return None
-        return np.asarray(S + np.outer(sizes, sizes))
+        return Sizes(sizes, np.asarray(S))

@@ -36,13 +36,12 @@ from mixpose.constants import constant
 from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled
 from mixpose.judgement.association import Association
 from mixpose.judgement.lasting import Lasting, LastingRules
+from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
+from mixpose.judgement.stacked import Stacked
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_LEAST = 1e-6  # degrees of freedom: less is as good as none
 _LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
-_MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
-_LEAST_EIGENVALUE = 1e-14  # of an information matrix of diagonal 1: float64 tells no less from none
 
 
 @dataclass(frozen=True)
@@ -71,39 +70,20 @@ class NoiseModel:
         3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
     )
 
-    def enlargement(self, directions: int, degrees: float) -> float:
-        """Factor that makes the Gaussian ellipsoid as large as that of the F distribution.
+    def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
+        """Factors that make the Gaussian ellipsoid as large as that of the F distribution.
 
         Parameters
         ----------
         directions : int
             Of the pose that are free.
-        degrees : float
-            Of freedom, from which the variance was estimated.
+        degrees : (n,) array or float
+            Of freedom, from which the variances were estimated.
         """
         if directions == 0 or self.confidence == 0:
-            return 1.0
-        tail = fdtri(directions, max(degrees, 1.0), self.confidence)
-        return float(directions * tail / chdtri(directions, 1 - self.confidence))
-
-
-class Moments(NamedTuple):
-    """Sums over frames, from which the variances of independent errors and of fields follow.
-
-    Attributes
-    ----------
-    seen : (4,) float64
-        rᵀWr and |P_kᵀWr|².
-    expected : (4, 4) float64
-        Of these, by unit variances of each kind.
-    """
-
-    seen: Floats = np.zeros(4)
-    expected: Floats = np.zeros((4, 4))
-
-    def joined(self, other: Moments, memory: float) -> Moments:
-        """Add those of another frame."""
-        return Moments(memory * self.seen + other.seen, memory * self.expected + other.expected)
+            return np.ones(np.shape(degrees))
+        tail = fdtri(directions, np.maximum(degrees, 1.0), self.confidence)
+        return np.asarray(directions * tail / chdtri(directions, 1 - self.confidence))
 
 
 @dataclass(frozen=True)
@@ -159,7 +139,48 @@ def noise_of(
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    offsets, count = joined_offsets(associations), int(free.sum())
+    return noises_of(Stacked.of([associations]), free, [before], model)[0]
+
+
+def noises_of(
+    found: Stacked, free: NDArray[np.bool_], before: Sequence[Residuals], model: NoiseModel
+) -> list[FrameNoise]:
+    """The same of K frames at once."""
+    levels = [
+        _level(associations, int(free.sum()), known, model)
+        for associations, known in zip(found.each, before, strict=True)
+    ]
+    variances = np.array([one.scale for one in levels])
+    frames = frames_of(found, variances, free, model.errors.outlying)
+    parts = zip(found.each, levels, frames, before, strict=True)
+    return [_frame_noise(*each, free, model) for each in parts]
+
+
+class _Level(NamedTuple):
+    """How large residuals are, sensor by sensor.
+
+    Attributes
+    ----------
+    seen : (L,) float64
+        Variances as offsets show them.
+    scale : (L,) float64
+        The same, drawn to that of all sensors, which residuals are measured in.
+    told : (2, L) float64
+        Squares and degrees of freedom that are remembered.
+    degrees : float
+        Of freedom, of all that was seen.
+    """
+
+    seen: Floats
+    scale: Floats
+    told: Floats
+    degrees: float
+
+
+def _level(
+    associations: Sequence[Association], count: int, before: Residuals, model: NoiseModel
+) -> _Level:
+    offsets = joined_offsets(associations)
     last = [before.noise.get(one.name, Noise()) for one in associations]
     past = np.array([(one.squares, one.degrees) for one in last]).T
     sums = model.memory * past
@@ -173,25 +194,37 @@ def noise_of(
     degrees = float(sums[1].sum())
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
     variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
-    frame = _moments(associations, offsets, variances, free, model)
-    moments = before.moments.joined(frame.moments, model.memory)
-    met = float(np.mean([one.met for one in associations]))
-    shares = _shares(moments, frame.moments, met, model)
+    return _Level(seen.variances, variances, told, degrees)
+
+
+def _frame_noise(
+    associations: Sequence[Association],
+    level: _Level,
+    frame: Frame,
+    before: Residuals,
+    free: NDArray[np.bool_],
+    model: NoiseModel,
+) -> FrameNoise:
     lasting = frame.lasting.after(before.lasting, model.fields)
+    sizes = lasting.sizes(model.fields)
+    own = frame.moments if sizes is None else frame.without(sizes.mean)
+    moments = before.moments.joined(own, model.memory)
+    met = float(np.mean([one.met for one in associations]))
+    shares = _shares(moments, own, met, model)
     # fields last: a further frame shows no more of them
-    factors = [model.enlargement(count, one) for one in (degrees, *shares.degrees)]
+    degrees = np.array([level.degrees, *shares.degrees])
+    factors = model.enlargement(int(free.sum()), degrees)
     covariance, steady = np.zeros((6, 6)), np.zeros((6, 6))
     inner = np.tensordot(shares.variances * factors, frame.parts, 1)
     inner += frame.by_calibration @ frame.by_calibration.T
-    fields = lasting.moments(model.fields)
-    if fields is not None:
-        steady[np.ix_(free, free)] = frame.by_fields @ fields @ frame.by_fields.T
+    if sizes is not None:
+        steady[np.ix_(free, free)] = frame.by_fields @ sizes.moments @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
     covariance += steady
-    noise = {one.name: Noise(*pair) for one, pair in zip(associations, told.T.tolist())}
+    noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
     kept = lasting.kept(before.lasting, model.fields)
     remembered = Residuals({**before.noise, **noise}, moments, kept)
-    return FrameNoise(seen.variances, covariance, steady, remembered)
+    return FrameNoise(level.seen, covariance, steady, remembered)
 
 
 def joined_offsets(associations: Sequence[Association]) -> Offsets:
@@ -226,177 +259,21 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     """What moments say; each sensor meets so many features, of a frame that has its own moments."""
     weights = model.lasting_fields * np.array([met, met**2])
     # markers are where they are said to be, as surely as so many frames tell
-    of_markers = model.lasting_fields * own.expected[3, 3] + _LEAST
-    believed = np.array([_LEAST, weights[1], weights[1], of_markers])
+    of_markers = model.lasting_fields * own.expected[3, 3] + LEAST
+    believed = np.array([LEAST, weights[1], weights[1], of_markers])
     expected = moments.expected + np.diag(believed)
     size = np.array([1.0, model.lasting**2, model.lasting**2, 0.0])
     seen = moments.seen + believed * size
-    scale = 1 / np.maximum(expected.diagonal(), _LEAST)
+    scale = 1 / np.maximum(expected.diagonal(), LEAST)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
     variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
-    taken = np.array([weights[0], weights[0], model.lasting_fields * own.expected[0, 3] + _LEAST])
+    taken = np.array([weights[0], weights[0], model.lasting_fields * own.expected[0, 3] + LEAST])
     once, squared = own.expected[0, 1:] + taken, own.expected.diagonal()[1:] + believed[1:]
-    return _Shares(variances, once**2 / np.maximum(squared, _LEAST))
+    return _Shares(variances, once**2 / np.maximum(squared, LEAST))
 
 
-class _Frame(NamedTuple):
-    """What one frame shows.
-
-    Attributes
-    ----------
-    moments : Moments
-    parts : (4, k, k) float64
-        Covariances that unit variances of each kind make.
-    lasting : Lasting
-        What it says of fields that last.
-    by_fields : (k, q) float64
-        How these move the pose.
-    by_calibration : (k, K) float64
-        How calibrations do that are off by a standard deviation in one thing each.
-    """
-
-    moments: Moments
-    parts: Floats
-    lasting: Lasting
-    by_fields: Floats
-    by_calibration: Floats
-
-
-def _moments(
-    associations: Sequence[Association],
-    offsets: Offsets,
-    variances: Floats,
-    free: NDArray[np.bool_],
-    model: NoiseModel,
-) -> _Frame:
-    """Of one frame.  Detections that are farther off than the extraction errs are left out."""
-    count = int(free.sum())
-    clear = offsets.squared <= model.errors.outlying**2 * variances[offsets.sensor]
-    ends = np.cumsum(np.bincount(offsets.sensor, minlength=len(associations)))[:-1]
-    parts, blocks, shifts, doubts = [], [], [], []
-    for one, inlying, variance in zip(associations, np.split(clear, ends), variances.tolist()):
-        shares = np.where(inlying, one.shares, 0.0)
-        scale = np.sqrt(shares / variance)[:, None, None] / one.sigma
-        rows = np.concatenate([one.J[..., free], one.offsets[..., None]], axis=2)
-        parts.append((scale * rows).reshape(-1, count + 1))
-        blocks.append(_fields(one.places, shares))
-        shifts.append((scale * one.J[..., :3]).reshape(-1, 3))
-        if one.by_calibration is not None:
-            rows = (scale * one.by_calibration).reshape(parts[-1].shape[0], -1)
-            doubts.append(parts[-1][:, :count].T @ rows)
-    weighted, shift = np.concatenate(parts), np.concatenate(shifts)
-    shift /= max(float(np.sqrt((shift**2).sum() / max(shift.size, 1))), _LEAST)
-    J, r = weighted[:, :count], weighted[:, count]
-    P = [_side_by_side(kind) for kind in zip(*blocks)]
-    inverse = _inverse(J.T @ J)
-    drawn = [inverse @ (J.T @ one) for one in P]
-    left = [one - J @ each for one, each in zip(P, drawn, strict=True)]
-    rest, split = np.hstack(left), P[0].shape[1]
-    information, vector = rest.T @ rest, rest.T @ r
-    K, once = np.zeros((3, 3)), np.zeros(3)
-    kinds = [slice(split), slice(split, None)]
-    K[:2, :2] = [[float((information[a, b] ** 2).sum()) for b in kinds] for a in kinds]
-    once[:2] = [float(np.trace(information[a, a])) for a in kinds]
-    of_markers = _of_markers(associations, shift, J, r, left, inverse)
-    K[2], once[2] = of_markers.K, of_markers.once
-    K[:2, 2] = K[2, :2]
-    degrees = float(offsets.dimensions[offsets.sensor] @ (clear * offsets.shares)) - count
-    squares = [float(r @ r), *(float(((one.T @ r) ** 2).sum()) for one in P)]
-    squares.append(of_markers.squares)
-    roots = np.sqrt(variances)
-    sizes = np.concatenate([np.repeat(roots, [f[k].shape[1] for f in blocks]) for k in (0, 1)])
-    names = tuple(one.name for one in associations)
-    lasting = Lasting(names, information / np.outer(sizes, sizes), vector / sizes)
-    expected = np.block([[np.array([[degrees]]), once[None]], [once[:, None], K]])
-    own = Moments(np.array(squares), expected) if degrees > 0 else Moments()
-    by_kind = np.array([inverse, *(one @ one.T for one in drawn), of_markers.part])
-    by_calibration = inverse @ np.hstack([np.zeros((count, 0)), *doubts])
-    return _Frame(own, by_kind, lasting, np.hstack(drawn) / sizes, by_calibration)
-
-
-class _OfMarkers(NamedTuple):
-    """K_3k (3,), tr K_33, |P_3ᵀWr|², and the covariance that a unit variance makes."""
-
-    K: Floats
-    once: float
-    squares: float
-    part: Floats
-
-
-def _of_markers(
-    associations: Sequence[Association],
-    shift: Floats,
-    J: Floats,
-    r: Floats,
-    left: Sequence[Floats],
-    inverse: Floats,
-) -> _OfMarkers:
-    """Moments of what markers are off by, of which P_3 has three columns each: one by one.
-
-    `shift` (K, 3) is how features move with the body, in units in which their images move by the
-    noise; a row for each coordinate of each sensor.
-    """
-    marker = np.concatenate([np.repeat(one.features, one.J.shape[1]) for one in associations])
-    order = np.argsort(marker, kind="stable")
-    starts = np.flatnonzero(np.diff(marker[order], prepend=-1))
-    columns = np.hstack([J, r[:, None], shift, *left])[order]
-    own = np.add.reduceat(shift[order][:, :, None] * columns[:, None], starts, axis=0)
-    widths = np.cumsum([J.shape[1], 1, 3, left[0].shape[1]])
-    by_pose, by_rest, by_shift, *by_fields = np.split(own, widths, axis=2)
-    taken, flat = by_pose @ inverse, by_pose.reshape(-1, J.shape[1])
-    drawn = inverse @ flat.T
-    spread = drawn @ flat
-    within = by_shift - 2 * taken @ by_pose.swapaxes(1, 2)
-    K = float((within * by_shift).sum()) + float((spread * spread.T).sum())
-    return _OfMarkers(
-        np.array([*(float((one**2).sum()) for one in by_fields), K]),
-        float(np.trace(by_shift.sum(axis=0)) - (taken * by_pose).sum()),
-        float((by_rest**2).sum()),
-        drawn @ drawn.T,  # not less than nothing where a direction is hardly determined
-    )
-
-
-def _side_by_side(fields: Sequence[Floats]) -> Floats:
-    """Fields of each sensor as columns of their own."""
-    P = np.zeros(np.sum([one.shape for one in fields], axis=0))
-    row = column = 0
-    for one in fields:
-        below, beside = row + one.shape[0], column + one.shape[1]
-        P[row:below, column:beside] = one
-        row, column = below, beside
-    return P
-
-
-def _fields(places: Floats, shares: Floats) -> tuple[Floats, Floats]:
-    """What all features (n, m) of a sensor have in common, with their shares.
-
-    Offsets (nm, m), and what turns, scales and shears (nm, m²).
-    """
-    n, m = places.shape
-    total = max(float(shares.sum()), _LEAST)
-    away = places - shares @ places / total
-    size = float(np.sqrt((shares @ (away * away)).sum() / (m * total)))
-    roots, axes = np.sqrt(shares)[:, None, None, None], np.eye(m)
-    slants = roots * away[:, None, :, None] / max(size, _LEAST) * axes[:, None]
-    return (roots[..., 0] * axes).reshape(n * m, m), slants.reshape(n * m, m * m)
-
-
-def _inverse(information: Floats) -> Floats:
-    """Inverse of an information matrix.
-
-    Directions that the data leave open get the variance that their information says: large, and
-    at most what float64 can invert.
-    """
-    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), _MIN_INFORMATION))
-    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
-    inverse = (vectors / np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T * scale * scale[:, None]
-    return np.asarray((inverse + inverse.T) / 2)
-
-
-def information_of(associations: Sequence[Association], variances: Floats) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (6, 6) over the met features, for noise (L,) in σ_ε²."""
-    information = np.zeros((6, 6))
-    for one, variance in zip(associations, variances.tolist(), strict=True):
-        weighted = (one.J * (one.shares / (variance * one.sigma**2))[:, None, None]).reshape(-1, 6)
-        information += weighted.T @ one.J.reshape(-1, 6)
-    return information
+def information_of(found: Stacked, variances: Floats) -> Floats:
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε²."""
+    weights = (found.shares / variances[..., None])[..., None, None]
+    J = found.J.reshape(len(variances), -1, 6)
+    return np.asarray((weights * found.J).reshape(J.shape).swapaxes(1, 2) @ J)

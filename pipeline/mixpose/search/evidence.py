@@ -53,7 +53,7 @@ def evidence(
     degrees = _ERRORS.typical_degrees
     variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
-    odds = odds_of(matches, variance, 2 * body.radius, _DETECTION)
+    odds = odds_of(matches, variance, np.full(len(poses), 2 * body.radius), _DETECTION)
     unseen = np.count_nonzero(at.faced & ~at.seen, axis=(0, 2)) * _DETECTION.log_unseen
     return paid_by_count(odds, matches, free) + unseen, met
 
@@ -81,4 +81,5 @@ def _matches_of(
     lower[empty], upper[empty] = 0.0, 0.0
     weights, by_world = visible.astype(np.float64), J[..., :m, :3] / sigma
     crowd = crowding(points, lower, upper, _ASSOCIATION.min_region * sigma) * sigma**m
-    return SensorMatches(weights, shares, offsets, by_world, crowd, float(len(points)))
+    count = np.full(len(y), float(len(points)))
+    return SensorMatches(weights, shares, offsets, by_world, crowd, count)

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Noise, errors_seen
-from mixpose.fit import EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
+from mixpose.fit import Climbed, EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
 from mixpose.judgement import (
     Association,
+    Case,
     Judged,
     Prior,
     associate,
@@ -99,10 +100,24 @@ class SearchLog:
 
 
 class Begun(NamedTuple):
-    """The matched objective at σ_ε, and the ascent on it; None if it leads nowhere."""
+    """What is known of the fit from the first prediction.
+
+    Attributes
+    ----------
+    objective : MatchedObjective
+        At σ_ε.
+    ascent : Ascent or None
+        On it; None if it leads nowhere.
+    fit : Fit or None
+        That it led to, where it was climbed with others'.
+    judged : Judged or None
+        The pose of that fit.
+    """
 
     objective: MatchedObjective
-    ascent: Ascent[Floats] | None
+    ascent: Ascent[Floats] | None = None
+    fit: Fit | None = None
+    judged: Judged | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +272,13 @@ class FrameData:
 
 @dataclass(frozen=True, eq=False)
 class MatchedLikelihood:
-    """Matched densities of all sensors."""
+    """Matched densities of all sensors.
+
+    `climbed` has the fits so far, by the sensors that were left out.
+    """
 
     data: FrameData
+    climbed: dict[frozenset[str], list[Climbed]] = field(default_factory=dict)
 
     @property
     def knows_detections(self) -> bool:
@@ -271,9 +290,12 @@ class MatchedLikelihood:
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
-        begun = None
+        climbed = self.climbed.setdefault(frozenset(start.left_out), [])
+        timed, begun = is_timed(data.views), None
         if data.begun and data.predictions and start.prediction is data.predictions[0]:
             begun = data.begun.ascent
+            if data.begun.fit is not None:
+                return data.begun.fit
 
         def climb(seen: FrameData, T_start: Floats, beside: float = 0.0) -> Fit:
             return fit_near(
@@ -285,37 +307,35 @@ class MatchedLikelihood:
                 seen.samples,
                 finest=seen.finest,
                 begun=begun,
+                climbed=None if timed else climbed,
                 noise=seen.noise,
                 beside=beside,
                 errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )
 
-        if is_timed(data.views):
+        if timed:
             return fit_in_motion(data, start.T_world_object, climb)
         return climb(data, start.T_world_object)
 
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
+        begun = self.data.begun
+        if begun is not None and fit is begun.fit and begun.judged is not None:
+            return begun.judged
         data = self.data.without(start.left_out)
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         motion = fit.motion
         if is_timed(data.views):
             motion = motion or data.motion(T)
             data = data.in_motion(motion)
-        rules, others = data.rules.judgement, []
+        others: list[Association] = []
         if start.left_out:
-            found, _ = associate(self.data.finest, T, rules.association)
+            found, _ = associate(self.data.finest, T, data.rules.judgement.association)
             others = [one for one in found if one.name in start.left_out]
-        judged = judge(
-            data.finest,
-            T,
-            data.free,
-            before=data.track.residuals,
-            prior=data.prior(T if start.T_moved is None else start.T_moved),
-            unmet=others,
-            rules=rules,
-        )
+        prior = data.prior(T if start.T_moved is None else start.T_moved)
+        case = Case(data.finest, T, data.track.residuals, prior, others)
+        judged = judge(case, data.free, data.rules.judgement)
         reports = {
             one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
             for one in others
@@ -352,7 +372,7 @@ class AssociationLikelihood:
     def judge(self, fit: Fit, start: Start) -> Judged:
         """Judge a pose by the sum over all associations."""
         data, T = self.data, fit.T_world_object
-        judged = judge(data.finest, T, data.free, rules=data.rules.judgement)
+        judged = judge(Case(data.finest, T), data.free, data.rules.judgement)
         anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
         return judge_ranges(
             judged,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, free_mask
+from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert, is_sure
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
@@ -165,15 +165,22 @@ class Tracker:
         if not data.views:
             return ranked
         likelihood = likelihood_of(data)
+        fits: list[Fit] = []
 
-        def consider(start: Start, name: str) -> Judged:
-            judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=name)
+        def consider(start: Start, name: str) -> Judged | None:
+            fit = likelihood.fit(start)
+            if any(fit is one for one in fits):
+                return None  # judged before
+            fits.append(fit)
+            judged = replace(likelihood.judge(fit, start), proposer=name)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)
             return judged
 
         for propose in self.proposers[:1] if quickly else self.proposers:
             for start in propose(data, ranked):
                 judged = consider(start, propose.__name__)
+                if judged is None:
+                    continue
                 for refine in self.refinements:
                     for better in refine(data, likelihood, judged):
                         consider(better, refine.__name__)
