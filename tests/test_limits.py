@@ -20,7 +20,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.cli.several import sessions_of
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import ALL_NUMBERS, SourceSpec, open_source, read_image
-from mixpose.limits import MOST_BYTES, MOST_DETECTIONS, MOST_FEATURES, MOST_PIXELS
+from mixpose.limits import MOST_BYTES, MOST_DETECTIONS, MOST_FEATURES, MOST_OPENED, MOST_PIXELS
 from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.runner import run
 from mixpose.session import load_session
@@ -108,6 +108,21 @@ def test_lists_that_are_nested_without_end_are_told(tmp_path: Path) -> None:
     path.write_text(lines, encoding="utf-8")
     with pytest.raises(SessionError, match="nested too deeply"):
         load_session(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "%YAML:1.0\n---\nM1: " + 50_000 * "[" + 50_000 * "]",
+        "%YAML:1.0\n---\nM1: " + 50_000 * "{a: " + 50_000 * "}",
+        "%YAML:1.0\n---\nM1:\n  " + 50_000 * "- " + "1\n",
+        "<?xml version='1.0'?><opencv_storage>" + 50_000 * "<a>" + 50_000 * "</a>",
+    ],
+    ids=["lists", "maps", "dashes", "tags"],
+)
+def test_lists_within_lists_do_not_end_the_process_in_opencv(text: str, tmp_path: Path) -> None:
+    allowed = f"opening brackets, tags or dashes; allowed: {MOST_OPENED}"
+    assert allowed in calibrated(tmp_path, text)
 
 
 def hole(path: Path) -> Path:

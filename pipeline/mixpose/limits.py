@@ -36,5 +36,9 @@ MOST_BYTES = 4_000_000
 MOST_YAML_CHARACTERS = 500_000
 """Of a calibration in YAML, whose reader is slow: this much takes seconds."""
 
+MOST_OPENED = 10_000
+"""Brackets, tags or dashes that open a list in a calibration for OpenCV: its reader calls itself
+for each that is within another, and some 30,000 end the process."""
+
 MOST_YAML_NODES = 100_000
 """Of a YAML file once its aliases are written out."""
