@@ -162,6 +162,8 @@ class _Run:
         return [Candidate(self._poses[k], float(self._ranks[k])) for k in kept]
 
     def _keep(self, poses: Floats) -> None:
+        if not len(poses):
+            return
         ranks, met = self._judged(poses)
         self._poses = np.concatenate([self._poses, poses])
         self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
