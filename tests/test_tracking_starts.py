@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from detections import EIGHT, TRUTH, detect
+from detections import EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
@@ -24,7 +24,13 @@ from mixpose.judgement import (
 )
 from mixpose.objective import View
 from mixpose.records import SensorReport
-from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg, twist_between
+from mixpose.rigid import (
+    from_rotation_vector,
+    perturb,
+    rotation_angle_deg,
+    transform,
+    twist_between,
+)
 from mixpose.search import SearchBudget, SearchReport, SearchState
 from mixpose.search.result import SearchResult
 from mixpose.sensors import PinholeCamera
@@ -303,3 +309,27 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
     alone = likelihood_of(two).judge(fit, Start(TRUTH))
     assert left_out.sensors["2"].used is False
     assert left_out.measurements == pytest.approx(alone.measurements)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_what_one_of_two_cameras_sees_again_and_again_is_not_surer_for_it(
+    pinhole_cameras: list[PinholeCamera], cameras: int
+) -> None:
+    # five markers of eight, as another body may show them: one frame is not sure of them
+    tracker = Tracker.create(EIGHT, EstimatorOptions())
+    track, statuses = tracker.begin(), []
+    for frame in range(4):
+        T = perturb(TRUTH, frame * np.array([1.0, 0.5, 0.0, 0.0, 0.0, 0.01]))
+        points = pinhole_cameras[0].project(transform(T, EIGHT.means[:5]))[0]
+        rng = np.random.default_rng(frame)
+        points += 0.2 * rng.standard_normal(points.shape)
+        false = rng.uniform(points.min(axis=0) - 40, points.max(axis=0) + 40, (2, 2))
+        views = [
+            view_of("left", pinhole_cameras[0], np.concatenate([points, false])),
+            view_of("right", pinhole_cameras[1], np.zeros((0, 2))),
+        ]
+        track, estimate = tracker.advance(track, frame, 0.04 * frame, views[:cameras])
+        statuses.append(estimate.status)
+    # a camera alone has nothing else to go by
+    assert statuses[0] == "ambiguous"
+    assert set(statuses[1:]) == {"ok" if cameras == 1 else "ambiguous"}

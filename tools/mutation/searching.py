@@ -41,6 +41,14 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
+        "tracking-what-is-seen-again-is-surer",
+        "tracking/recognition.py",
+        "judged.log_evidence - max(gained, 0.0) <=",
+        "judged.log_evidence <=",
+        "another body that looks alike to one camera is ok after a frame or two",
+        (_STARTS,),
+    ),
+    Mutant(
         "tracking-left-out-for-free",
         "tracking/likelihood.py",
         "data.track.residuals, prior, others)",

@@ -1,7 +1,10 @@
-"""Whether a body was told from things that have three markers alike.
+"""Whether a body was told from things that have markers alike.
 
 Three markers in space are met by every thing that has three in the same places.  A body of more,
 alone in its session, is known once others of it are met, and stays so while it is followed.
+
+To one camera another thing may look like the body by chance.  As it moves as one, it does so for
+several frames, and what the track expects then tells nothing.
 """
 
 from __future__ import annotations
@@ -12,8 +15,26 @@ from mixpose.judgement import Judged, flat_prior
 from mixpose.tracking.likelihood import FrameData
 
 TRIANGLE = "three markers are met, which other things may have alike"
+ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
 
 _CORNERS = 3
+
+
+def is_alone(data: FrameData, judged: Judged, sensors: int) -> bool:
+    """Whether one of several sensors meets a body that no frame was sure of, as this one is not.
+
+    Parameters
+    ----------
+    data : FrameData
+    judged : Judged
+    sensors : int
+        With a frame, also those that saw nothing.
+    """
+    if sensors < 2 or data.track.believed or sum(one.met > 0 for one in judged.associations) != 1:
+        return False
+    anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
+    gained = data.prior(judged.T_world_object).log_density - anywhere.log_density
+    return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
 
 def is_known(data: FrameData, judged: Judged) -> bool:

@@ -24,7 +24,7 @@ from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.proposers.stepped_aside import ASIDE, is_a_step
-from mixpose.tracking.recognition import TRIANGLE, is_known
+from mixpose.tracking.recognition import ALONE, TRIANGLE, is_alone, is_known
 from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
@@ -124,8 +124,10 @@ class Tracker:
         data = self.data(track, frame, time_s, views)
         ranked = self.ranked(data)
         verdict = self.verdict(data, ranked)
-        if verdict.status == "ok" and verdict.best and not is_known(data, verdict.best):
-            verdict = replace(verdict, status="ambiguous", doubt=TRIANGLE)
+        if verdict.status == "ok" and (best := verdict.best):
+            alone = ALONE if is_alone(data, best, len(views)) else ""
+            if doubt := alone if is_known(data, best) else TRIANGLE:
+                verdict = replace(verdict, status="ambiguous", doubt=doubt)
         followed = self.followed(data, frame, time_s, verdict)
         estimate = self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
         if data.log.report:
