@@ -144,13 +144,13 @@ def test_a_note_that_finds_no_room_stops_no_run(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_under_a_file_that_appears_whole_is_told_with_its_name(tmp_path: Path) -> None:
-    path = tmp_path / "summary.json"
-    with (
-        pytest.raises(OSError, match=r"No space left on device: .*summary\.json"),
-        appearing_whole(path) as part,
-    ):
-        part.write_text("half", encoding="ascii")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write itself has it
+    def write() -> None:
+        with appearing_whole(tmp_path / "summary.json") as part:
+            part.write_text("half", encoding="ascii")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write itself has it
+
+    with pytest.raises(OSError, match=r"No space left on device: .*summary\.json"):
+        write()
     assert list(tmp_path.iterdir()) == []
 
 
