@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,11 @@ from mixpose.cli.request import RunRequest
 from mixpose.cli.several import names_of, run_sessions, sessions_of
 from mixpose.errors import SessionError
 from mixpose.selection import Selection
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+
+from cluster_trial import make_recordings
+from kills import without_latency
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 RANGES = SYNTHETIC / "range_profiles" / "session.toml"
@@ -68,6 +73,19 @@ def wait_until(condition: Callable[[], bool]) -> bool:
             return True
         time.sleep(0.02)
     return False
+
+
+def killed_parent(
+    sessions: list[Path], folder: Path, begin: Callable[[Iterable[bool]], bool] = all
+) -> list[Path]:
+    """What two sessions write, where the run is killed when both or any of them have begun."""
+    command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
+    process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.DEVNULL)
+    begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in names_of(sessions)]
+    assert wait_until(lambda: begin(p.exists() and p.stat().st_size > 3000 for p in begun))
+    process.kill()
+    process.wait()
+    return begun
 
 
 def status_of(folder: Path) -> dict[str, Any]:
@@ -174,15 +192,8 @@ def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes end otherwise there")
-def test_the_children_of_a_killed_parent_end_and_the_same_command_goes_on(tmp_path: Path) -> None:
-    sessions = long_sessions(tmp_path, "ab")
-    folder = tmp_path / "poses"
-    command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
-    process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.DEVNULL)
-    begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in "ab"]
-    assert wait_until(lambda: all(p.exists() and p.stat().st_size > 3000 for p in begun))
-    process.kill()
-    process.wait()
+def test_the_children_of_a_killed_parent_end(tmp_path: Path) -> None:
+    begun = killed_parent(long_sessions(tmp_path, "ab"), tmp_path / "poses")
     # whoever still writes holds the lock; when nobody does, the files stay as they are
     for path in begun:
         LineFile(path, afresh=False).close()
@@ -193,6 +204,23 @@ def test_the_children_of_a_killed_parent_end_and_the_same_command_goes_on(tmp_pa
     for path in begun:
         frames = [pose["frame"] for pose in poses_of(path)[1:]]
         assert frames == list(range(len(frames)))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes end otherwise there")
+def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_once(
+    tmp_path: Path,
+) -> None:
+    sessions, folder = make_recordings(tmp_path, 2, 100), tmp_path / "poses"
+    begun = killed_parent(sessions, folder, any)
+    assert any(path.exists() for path in begun)  # it was killed midway
+    again = mixpose("run", *sessions, "-o", folder, "--workers", "2")
+    assert again.returncode == 0, again.stderr
+    alone = tmp_path / "alone.jsonl"
+    for session in sessions:
+        assert mixpose("run", session, "-o", alone).returncode == 0
+        poses = folder / session.parent.name / "poses.jsonl"
+        assert len(poses_of(poses)) == 101  # with the header
+        assert without_latency(poses) == without_latency(alone)
 
 
 def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None:

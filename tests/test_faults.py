@@ -14,10 +14,11 @@ from mixpose.judgement import AcceptanceRules, Association, NoiseModel, Residual
 from mixpose.judgement.judge import Judged
 from mixpose.records import SensorReport
 from mixpose.rigid import Floats
+from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from faults import FAULTS, outcome
+from faults import FAULTS, Fault, outcome, rewritten
 
 RULES, MODEL = AcceptanceRules(), NoiseModel()
 QUIET = Noise(squares=0.01, degrees=100.0)  # offsets of 0.01 σ: far below what is put in below
@@ -45,6 +46,44 @@ def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and
     assert found.wrong == 0
     assert found.is_named, found.said
     assert found.right >= right
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "right"),
+    [
+        ("frames missing", 17, 17),
+        ("sensor drops out and returns", 31, 31),
+        ("frozen for 20 frames", 24, 10),
+        ("saturated for 5 frames", 16, 16),
+        ("black all along", 6, 6),
+        ("bumped by 3° from frame 20", 25, 20),
+        ("marker falls off", 31, 31),
+        ("marker measured 20 mm wrong", 12, 12),
+        ("another camera's calibration", 4, 0),
+    ],
+)
+def test_other_frames_stay_right_beside_a_fault(
+    name: str, frames: int, right: int, tmp_path: Path
+) -> None:
+    found = outcome(FAULTS[name], tmp_path / "recording", stop=frames)
+    assert found.wrong == 0
+    assert found.right >= right
+    assert found.is_named, found.said
+
+
+def test_a_marker_is_called_by_the_name_that_its_table_has(tmp_path: Path) -> None:
+    def named(folder: Path) -> None:
+        FAULTS["marker measured 20 mm wrong"].change(folder)
+        path = folder / "session.toml"
+        body = load_session(path).body
+        rows = [f"m{k},{x},{y},{z}" for k, (x, y, z) in enumerate(body.means.tolist())]
+        rows[3] = rows[3].replace("m3", "tip")
+        table = "\n".join(["name,x,y,z", *rows, ""])
+        (folder / "markers.csv").write_text(table, encoding="utf-8")
+        rewritten((r"^points = .*$", 'file = "markers.csv"'))(folder)
+
+    found = outcome(Fault(named, "^marker tip is met in none"), tmp_path / "recording", stop=12)
+    assert (found.right, found.is_named) == (12, True), found.said
 
 
 def test_a_recording_without_faults_gives_rise_to_no_remark(tmp_path: Path) -> None:

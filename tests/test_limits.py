@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -16,9 +17,11 @@ import pytest
 from session_lines import message_of, with_lines
 
 from mixpose.body import Body, PointFeature
-from mixpose.errors import RecordingError
+from mixpose.cli.several import sessions_of
+from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import ALL_NUMBERS, SourceSpec, open_source, read_image
-from mixpose.limits import MOST_DETECTIONS, MOST_FEATURES, MOST_PIXELS
+from mixpose.limits import MOST_BYTES, MOST_DETECTIONS, MOST_FEATURES, MOST_OPENED, MOST_PIXELS
+from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.runner import run
 from mixpose.session import load_session
 
@@ -92,10 +95,68 @@ def test_a_session_reads_through_no_device_pipe_or_folder(path: str, tmp_path: P
 
 
 def test_a_file_that_no_session_needs_is_not_read(tmp_path: Path) -> None:
-    with (tmp_path / "cam.yml").open("wb") as file:
-        file.truncate(10**12)  # a hole
+    hole(tmp_path / "cam.yml")
     message = message_of(tmp_path, with_lines(matrix='calibration = "cam.yml"'))
     assert "has 1000000000000 bytes; allowed: at most" in message
+
+
+def test_lists_that_are_nested_without_end_are_told(tmp_path: Path) -> None:
+    message = calibrated(tmp_path, "a: " + 5000 * "[" + 5000 * "]")
+    assert message.endswith("cam.yml: lists or tables in it are nested too deeply")
+    lines = with_lines(points="points = " + 5000 * "[" + 5000 * "]")
+    path = tmp_path / "session.toml"
+    path.write_text(lines, encoding="utf-8")
+    with pytest.raises(SessionError, match="nested too deeply"):
+        load_session(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "%YAML:1.0\n---\nM1: " + 50_000 * "[" + 50_000 * "]",
+        "%YAML:1.0\n---\nM1: " + 50_000 * "{a: " + 50_000 * "}",
+        "%YAML:1.0\n---\nM1:\n  " + 50_000 * "- " + "1\n",
+        "<?xml version='1.0'?><opencv_storage>" + 50_000 * "<a>" + 50_000 * "</a>",
+    ],
+    ids=["lists", "maps", "dashes", "tags"],
+)
+def test_lists_within_lists_do_not_end_the_process_in_opencv(text: str, tmp_path: Path) -> None:
+    allowed = f"opening brackets, tags or dashes; allowed: {MOST_OPENED}"
+    assert allowed in calibrated(tmp_path, text)
+
+
+def hole(path: Path) -> Path:
+    """A file of a terabyte that takes no place on the disk."""
+    with path.open("wb") as file:
+        file.truncate(10**12)
+    return path
+
+
+def test_an_image_file_that_no_image_needs_is_not_read(tmp_path: Path) -> None:
+    path = hole(tmp_path / "l0.png")
+    with pytest.raises(RecordingError, match="found 1000000000000 bytes; allowed: a file of at"):
+        read_image(path)
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without end")
+def test_an_image_is_read_through_no_device() -> None:
+    with pytest.raises(RecordingError, match="found no file; allowed: a file of at most"):
+        read_image(Path("/dev/zero"))
+
+
+@pytest.mark.parametrize("read", [read_poses, read_unfinished_poses])
+def test_poses_without_the_end_of_a_line_are_not_read_to_theirs(
+    read: Callable[[Path], object], tmp_path: Path
+) -> None:
+    paths = [hole(tmp_path / "poses.jsonl"), Path("/dev/zero")]
+    for path in filter(Path.exists, paths):
+        with pytest.raises(RecordingError, match=f":1: found more than {MOST_BYTES} bytes in a"):
+            read(path)
+
+
+def test_a_list_of_sessions_has_an_end(tmp_path: Path) -> None:
+    with pytest.raises(SessionError, match=f"found more than {MOST_BYTES} bytes"):
+        sessions_of([str(hole(tmp_path / "all.txt"))])
 
 
 def table(folder: Path, *lines: str) -> SourceSpec:

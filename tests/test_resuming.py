@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -38,8 +39,15 @@ def command(*arguments: str | Path) -> int:
     return int(ended.value.code or 0)
 
 
-@pytest.mark.parametrize("session", [BEAMS, RANGES], ids=["beams", "ranges"])
-def test_a_run_in_pieces_writes_the_bytes_of_a_run_at_once(session: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "name", ["parallel_beams", "range_profiles", "two_cameras", "several_bodies", "real_room"]
+)
+def test_a_run_in_pieces_writes_the_bytes_of_a_run_at_once(name: str, tmp_path: Path) -> None:
+    shutil.copytree(SYNTHETIC / name, tmp_path, dirs_exist_ok=True)
+    session = tmp_path / "session.toml"
+    for path in tmp_path.glob("*[0-9][0-9].[jp][pn]g"):
+        if int(path.stem[-2:]) >= 10:
+            path.unlink()
     whole, parts = tmp_path / "whole.jsonl", tmp_path / "parts.jsonl"
     assert command("run", session, "-o", whole) == 0
     assert command("run", session, "-o", parts, "--stop", "4") == 0

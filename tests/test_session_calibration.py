@@ -201,6 +201,22 @@ def test_each_camera_of_a_kalibr_chain(tmp_path: Path) -> None:
     assert left.resolution == right.resolution == (1280, 1024)
 
 
+@pytest.mark.parametrize(("unit", "baseline"), [("m", 0.1), ("mm", 100.0)])
+def test_a_kalibr_chain_says_in_metres_where_its_cameras_stand(
+    unit: str, baseline: float, tmp_path: Path
+) -> None:
+    (tmp_path / "chain.yaml").write_text(KALIBR, encoding="utf-8")
+    load(tmp_path, 'calibration = { file = "chain.yaml", camera = "cam1" }', "fisheye")
+    path = tmp_path / "session.toml"
+    text = path.read_text(encoding="utf-8").replace('unit = "m"', f'unit = "{unit}"')
+    path.write_text(text, encoding="utf-8")
+    (setup,) = load_session(path).sensors
+    assert isinstance(setup.sensor, FisheyeCamera)
+    expected = np.eye(4)
+    expected[0, 3] = baseline
+    np.testing.assert_allclose(setup.sensor.T_sensor_world, expected, rtol=1e-12)
+
+
 def test_the_only_camera_of_a_kalibr_chain_needs_no_name(tmp_path: Path) -> None:
     (tmp_path / "chain.yaml").write_text(KALIBR[: KALIBR.index("cam1")], encoding="utf-8")
     assert load(tmp_path, 'calibration = "chain.yaml"').resolution == (1280, 1024)

@@ -9,6 +9,9 @@ from __future__ import annotations
 MOST_PIXELS = 2**26
 """Of an image: 67 million, more than usual sensors have; up to 20 bytes each are used."""
 
+MOST_IMAGE_BYTES = 2**29
+"""Of an image file: eight for each of as many pixels."""
+
 MOST_FEATURES = 2000
 """Of a body, pieces of segments included: their pairs are compared."""
 
@@ -28,10 +31,14 @@ MOST_UNSORTED_ROWS = 1_000_000
 """Of a table whose rows are not in the order of frames: it is read whole."""
 
 MOST_BYTES = 4_000_000
-"""Of a session file, a calibration or a table of markers."""
+"""Of a session file, a list of sessions, a calibration, a table of markers or a line of poses."""
 
 MOST_YAML_CHARACTERS = 500_000
 """Of a calibration in YAML, whose reader is slow: this much takes seconds."""
+
+MOST_OPENED = 10_000
+"""Brackets, tags or dashes that open a list in a calibration for OpenCV: its reader calls itself
+for each that is within another, and some 30,000 end the process."""
 
 MOST_YAML_NODES = 100_000
 """Of a YAML file once its aliases are written out."""

@@ -8,6 +8,7 @@ TOKENS = [
     b"nan", b"inf", b"-inf", b"1e400", b"-1", b"0", b"99999999999999999999", b"1e308", b"5e-324",
     b"[" * 3000, b"{" * 3000, b"&a [*a, *a]", b"*a", b"\x00", b"\xff\xfe", b'"', b"'''", b"\n\n",
     b",", b"<!ENTITY", b"!!python/object:os.system", b"true", b"null", b"../../../dev/zero", b"\r",
+    b"[" * 60_000, b"{a: " * 60_000, b"- " * 60_000, b"<a>" * 60_000,  # deeper than any stack
     b"65535", b"2147483647", b"-2147483648", b"4294967296", b"%s%n", b"1" * 5000,
 ]  # fmt: skip
 

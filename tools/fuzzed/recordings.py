@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,6 +76,33 @@ def with_markers(name: str, content: str) -> Callable[[Path], None]:
         session(folder, CAMERA.format(source="t.csv"), f'file = "{name}"')
 
     return make
+
+
+def with_vicon(folder: Path) -> None:
+    parameters, targets = "", ""
+    for k, point in enumerate(BODY):
+        for axis, value in zip("xyz", point, strict=True):
+            parameters += f'<Parameter NAME="m{k}_{axis}" VALUE="{value}"/>\n'
+        words = " ".join(f"'m{k}_{axis}'" for axis in "xyz")
+        targets += (
+            f'<TargetLocalPointToWorldPoint MARKER="m{k}" POSITION="{words}" SEGMENT="body"/>\n'
+        )
+    with_markers(
+        "m.vsk",
+        f"<KinematicModel><Parameters>{parameters}</Parameters><TargetSet><Targets>{targets}"
+        "</Targets></TargetSet></KinematicModel>",
+    )(folder)
+
+
+def with_ndi(folder: Path) -> None:
+    with_markers("m.rom", "")(folder)
+    content = bytearray(752)
+    content[:4] = b"NDI\0"
+    numbers = [float(value) for point in BODY for value in point]
+    struct.pack_into("<I", content, 28, len(BODY))
+    struct.pack_into(f"<{len(numbers)}f", content, 72, *numbers)
+    struct.pack_into("<H", content, 4, sum(content[6:]) & 0xFFFF)
+    (folder / "m.rom").write_bytes(content)
 
 
 def with_calibration(name: str, content: str) -> Callable[[Path], None]:
@@ -170,6 +198,22 @@ distortion_coefficients:
   cols: 5
   data: [0.1, 0.01, 0, 0, 0]
 """
+OPENCV_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<camera_matrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+<data>300. 0. 160. 0. 300. 120. 0. 0. 1.</data></camera_matrix>
+<distortion_coefficients type_id="opencv-matrix"><rows>1</rows><cols>4</cols><dt>d</dt>
+<data>0.1 0.01 0. 0.</data></distortion_coefficients>
+</opencv_storage>
+"""
+TABLES = """[cam_0]
+name = "c"
+size = [320, 240]
+matrix = [[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]]
+distortions = [0.1, 0.01, 0.0, 0.0, 0.0]
+rotation = [0.0, 0.0, 0.0]
+translation = [0.0, 0.0, 0.0]
+"""
 MARKERS = (
     "name,x,y,z,sigma\na,0,0,0,.1\nb,100,0,0,.1\nc,0,120,0,.1\nd,-80,-60,90,.1\ne,60,70,20,0\n"
 )
@@ -183,6 +227,12 @@ KINDS: dict[str, Kind] = {
     "table": Kind(with_table, "t.csv"),
     "times": Kind(with_times, "times.csv"),
     "markers": Kind(with_markers("m.csv", MARKERS), "m.csv"),
+    "vicon": Kind(with_vicon, "m.vsk"),
+    "ndi": Kind(with_ndi, "m.rom"),
+    "xml": Kind(with_calibration("c.xml", OPENCV_XML), "c.xml"),
+    "import": Kind(
+        with_calibration("c.toml", TABLES), "c.toml", ("import", "c.toml", "-o", "s.toml")
+    ),
     "opencv": Kind(with_calibration("c.yml", OPENCV), "c.yml"),
     "kalibr": Kind(with_calibration("c.yaml", KALIBR), "c.yaml"),
     "ros": Kind(with_calibration("c.yaml", ROS), "c.yaml"),

@@ -251,6 +251,18 @@ def _noise(
     return found
 
 
+def moved_by_held(
+    bundle: Bundle, found: Adjusted, gauge_of: GaugeOf, rules: CalibrationRules
+) -> Floats:
+    """Standard deviations (G,) of the rig's parameters that come of errors of what is held."""
+    weighted, _ = _weighted(
+        bundle, found.rig, found.poses, rules.blur * found.noise, found.noise, rules, last=True
+    )
+    normal = normal_equations(bundle, len(found.poses), weighted, 0.0)
+    step = solved(bundle, normal, gauge_of(found.rig), len(found.poses))
+    return np.asarray(np.sqrt(np.diag(step.of_held)))
+
+
 def _finished(
     bundle: Bundle,
     rig: Rig,
@@ -263,13 +275,14 @@ def _finished(
     normal = normal_equations(bundle, len(poses), weighted, 0.0)
     step = solved(bundle, normal, gauge_of(rig), len(poses))
     dimension = float(np.mean([eye.dimension for eye in rig.sensors]))
-    covariance = step.covariance * _of_cauchy(dimension, rules.tail)
-    inflation = _inflation(bundle, weighted, covariance, len(poses))
+    scattered = step.covariance * _of_cauchy(dimension, rules.tail)
+    inflation = _inflation(bundle, weighted, scattered, len(poses))
+    covariance = scattered * inflation + step.of_held
     parts = tuple(
         (pairs, rows.residual, weight)
         for (_, pairs, rows, _), weight in zip(weighted, alone, strict=True)
     )
-    return Adjusted(rig, poses, noise, covariance * inflation, step.unknown, parts, inflation)
+    return Adjusted(rig, poses, noise, covariance, step.unknown, parts, inflation)
 
 
 def _of_cauchy(dimension: float, tail: float) -> float:

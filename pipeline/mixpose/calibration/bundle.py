@@ -7,7 +7,7 @@ and a dense system of G remains (Schur complement).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,6 +22,7 @@ from mixpose.calibration.rig import Block, Rig, by_parameters, moved
 from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats
 from mixpose.rigid import perturb
+from mixpose.sensors import CalibrationError, by_calibration, doubted
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,8 @@ class Bundle:
         World directions of the poses that are free; none where poses are known.
     undetermined : float
         Standard deviation by a parameter's size above which a direction stays as it is.
+    errors : mapping of int to CalibrationError
+        By sensor, how far what is held of it may be off.
     """
 
     frames: tuple[SeenFrame, ...]
@@ -45,6 +48,7 @@ class Bundle:
     blocks: tuple[Block, ...]
     pose_free: NDArray[np.bool_]
     undetermined: float
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -72,8 +76,10 @@ class Rows:
         By how much that pose follows its neighbours'.
     nodes : (n, 4) int
     by_rig : list of (Block, (n, m, k) float64)
-    features : (n, 3) or None
-        Columns of the body.
+    by_point : (n, m, 3) float64 or None
+        By the feature's coordinates, where the body is free.
+    by_held : (n, m, c) float64
+        By what is held, of a standard deviation each.
     known : (n,) bool
         Whether the moment of the sensor is known.
     """
@@ -84,6 +90,7 @@ class Rows:
     nodes: NDArray[np.intp]
     by_rig: list[tuple[Block, Floats]]
     by_point: Floats | None
+    by_held: Floats
     known: NDArray[np.bool_]
 
 
@@ -117,7 +124,10 @@ def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) 
     shares = between.shares if late else np.eye(1, 4).repeat(len(tau), axis=0)
     known = visible & (between.known | (np.abs(tau) < 1e-9))
     nodes = bundle.clock.near.nodes[pairs.frame]
-    return Rows(pairs.y - y, by_pose, shares, nodes, by_rig, by_point, known)
+    by_held = np.zeros((*y.shape, 0))
+    if sensor in bundle.errors:
+        by_held = by_calibration(doubted(eye, bundle.errors[sensor]), world)
+    return Rows(pairs.y - y, by_pose, shares, nodes, by_rig, by_point, by_held, known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +138,15 @@ class Normal:
     ----------
     S : (G, G) float64
         Information on the rig, the poses being unknown.
+    held : (G, C) float64
+        The same between the rig and what is held.
     b : (G,) float64
-    back : callable parts
+    pose_b, pose_solve, W
         What gives the poses' step from the rig's.
     """
 
     S: Floats
+    held: Floats
     b: Floats
     pose_b: Floats
     pose_solve: object = field(repr=False)
@@ -166,41 +179,45 @@ def normal_equations(
     """
     G, free = bundle.count, np.flatnonzero(bundle.pose_free)
     P = len(free) * poses
-    H_gg, b_g = np.zeros((G, G)), np.zeros(G)
+    edges = G + np.cumsum([0] + [each.by_held.shape[2] for _, _, each, _ in rows])
+    Q = int(edges[-1])  # parameters that are free and that are held
+    H_gg, b_g = np.zeros((Q, Q)), np.zeros(Q)
     pieces: list[sp.csr_matrix] = []
-    for _, pairs, each, weight in rows:
+    for (_, pairs, each, weight), start, stop in zip(rows, edges, edges[1:]):
         n, m = each.residual.shape
         root = np.sqrt(weight)
-        A = _rig_columns(bundle, pairs, each, G) * root[:, None, None]
+        A = _rig_columns(bundle, pairs, each, Q) * root[:, None, None]
+        A[:, :, start:stop] = each.by_held * root[:, None, None]
         r = each.residual * root[:, None]
         if P:
             B = _pose_columns(each, root, free, P)
-            flat = A.reshape(n * m, G)
+            flat = A.reshape(n * m, Q)
             pieces.append(sp.hstack([sp.csr_matrix(flat), B, sp.csr_matrix(r.reshape(-1, 1))]))
         else:
-            flat = A.reshape(n * m, G)
+            flat = A.reshape(n * m, Q)
             H_gg += flat.T @ flat
             b_g += flat.T @ r.ravel()
     if not P:
-        return Normal(H_gg, b_g, np.zeros(0), None, np.zeros((0, G)))
+        none = np.zeros((0, G))
+        return Normal(H_gg[:G, :G], H_gg[:G, G:], b_g[:G], np.zeros(0), None, none)
     J = sp.vstack(pieces).tocsc()
     H = (J.T @ J).tocsc()
-    H_pp = H[G : G + P, G : G + P].tocsc()
+    H_pp = H[Q : Q + P, Q : Q + P].tocsc()
     diagonal = H_pp.diagonal()
     floor = 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
     H_pp = H_pp + sp.diags(damping * diagonal + floor)
     factor = splu(H_pp.tocsc())
-    W = H[G : G + P, :G].toarray()
-    b_p = H[G : G + P, -1].toarray()[:, 0]
-    X = factor.solve(np.column_stack([W, b_p]))
-    S = H[:G, :G].toarray() - W.T @ X[:, :-1]
-    b = H[:G, -1].toarray()[:, 0] - W.T @ X[:, -1]
-    return Normal((S + S.T) / 2, b, b_p, factor, W)
+    W = H[Q : Q + P, :Q].toarray()
+    b_p = H[Q : Q + P, -1].toarray()[:, 0]
+    X = factor.solve(np.column_stack([W[:, :G], b_p]))
+    S = H[:Q, :G].toarray() - W.T @ X[:, :-1]
+    b = H[:G, -1].toarray()[:, 0] - W[:, :G].T @ X[:, -1]
+    return Normal((S[:G] + S[:G].T) / 2, S[G:].T, b, b_p, factor, W[:, :G])
 
 
-def _rig_columns(bundle: Bundle, pairs: Pairs, rows: Rows, G: int) -> Floats:
+def _rig_columns(bundle: Bundle, pairs: Pairs, rows: Rows, count: int) -> Floats:
     n, m = rows.residual.shape
-    A = np.zeros((n, m, G))
+    A = np.zeros((n, m, count))
     for block, J in rows.by_rig:
         A[:, :, block.place] = J
     if rows.by_point is not None:
@@ -238,6 +255,8 @@ class Step:
     poses : (K, 6) float64
     covariance : (G, G) float64
         Of the rig, in the gauge; directions that are not determined left out.
+    of_held : (G, G) float64
+        What errors of the held parameters add to it.
     unknown : (G, u) float64
         Directions that are not determined, in units of the parameters' sizes.
     """
@@ -245,6 +264,7 @@ class Step:
     rig: Floats
     poses: Floats
     covariance: Floats
+    of_held: Floats
     unknown: Floats
 
 
@@ -264,16 +284,35 @@ def solved(bundle: Bundle, normal: Normal, gauge: Floats, poses: int) -> Step:
     S = normal.S * np.outer(scales, scales)
     basis = _complement(gauge, len(scales))
     inner = basis.T @ S @ basis
-    values, vectors = np.linalg.eigh((inner + inner.T) / 2)
+    pulls = scales[:, None] * normal.held  # of held parameters that are a standard deviation off
+    told = _told(inner, basis.T @ pulls)
+    values, vectors = np.linalg.eigh((told + told.T) / 2)
     known = values > 1.0 / bundle.undetermined**2
     V = basis @ vectors[:, known]
-    covariance = (V / values[known]) @ V.T
+    covariance = V @ np.linalg.inv(V.T @ S @ V) @ V.T
     step = scales * (covariance @ (scales * normal.b))
+    by_held = scales[:, None] * (covariance @ pulls)
     free = np.flatnonzero(bundle.pose_free)
     pose_steps = np.zeros((poses, 6))
     if len(free):
         pose_steps[:, free] = normal.poses_step(step).reshape(poses, len(free))
-    return Step(step, pose_steps, covariance * np.outer(scales, scales), basis @ vectors[:, ~known])
+    return Step(
+        step,
+        pose_steps,
+        covariance * np.outer(scales, scales),
+        by_held @ by_held.T,
+        basis @ vectors[:, ~known],
+    )
+
+
+def _told(information: Floats, pulls: Floats) -> Floats:
+    """Information (g, g) that is left where held parameters are off.
+
+    A solution x = I⁻¹ b then has the covariance I⁻¹ (I + P Pᵀ) I⁻¹.
+    """
+    if not pulls.any():
+        return information
+    return np.asarray(information @ np.linalg.pinv(information + pulls @ pulls.T) @ information)
 
 
 def _complement(gauge: Floats, count: int) -> Floats:

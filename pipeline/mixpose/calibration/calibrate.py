@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.calibration.adjust import Adjusted, GaugeOf, adjust
+from mixpose.calibration.adjust import Adjusted, GaugeOf, adjust, moved_by_held
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.choice import held_back
@@ -18,15 +18,16 @@ from mixpose.calibration.interpolation import neighbours
 from mixpose.calibration.latecomers import placed
 from mixpose.calibration.linking import mean_motion
 from mixpose.calibration.matching import clock_of
-from mixpose.calibration.residuals import met_share, residuals_of, sights_of
+from mixpose.calibration.residuals import explained_share, met_share, residuals_of, sights_of
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.start import Start, searched, start_from_cameras, starts_together, without
-from mixpose.calibration.task import Progress, Task, silent
+from mixpose.calibration.task import Known, Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
+from mixpose.sensors import CalibrationError, RangeSensor
 
 
 def calibrate(
@@ -53,10 +54,10 @@ def calibrate(
     """
     if task.cameras:
         known = searched(task, rules, progress, {} if found is None else found)
-        starts = iter([start_from_cameras(task, known, rules)])
+        best = _from_cameras(task, known, rules, progress)
     else:
         starts = starts_together(task, _probed(task, rules, progress), progress)
-    best = _best(task, starts, rules, progress)
+        best = _best(task, starts, rules, progress)
     if best is None:
         raise RecordingError(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
@@ -71,6 +72,25 @@ def calibrate(
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
     return best[1]
+
+
+def _from_cameras(
+    task: Task, known: Known, rules: CalibrationRules, progress: Progress
+) -> tuple[int, Calibration] | None:
+    """The calibration from what cameras know alone, and again without those it misplaced.
+
+    What these know alone may have linked them wrongly; they are placed by the poses that the others
+    tell then.
+    """
+    best = _best(task, [start_from_cameras(task, known, rules)], rules, progress)
+    if best is None or task.known is not None:
+        return best
+    wrong = {s for s in best[1].doubtful(rules) if "pose" in task.free.get(s, ())}
+    if not wrong or len(wrong) + 1 > len(task.cameras):
+        return best
+    others = {key: one for key, one in known.items() if key[1] not in wrong}
+    again = _best(task, [start_from_cameras(task, others, rules)], rules, progress)
+    return max(best, again or best, key=lambda one: float(np.nansum(one[1].explained)))
 
 
 def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> CalibrationRules:
@@ -226,7 +246,22 @@ class _Run:
     def _bundle(self, part: _Part, blocks: tuple[Block, ...]) -> Bundle:
         near = neighbours([f.time_s for f in part.frames], self._rules.gap)
         clock = clock_of(part.frames, near, len(self._task.rig.sensors))
-        return Bundle(part.frames, clock, blocks, self._pose_free, self._rules.undetermined)
+        errors = self._task.errors if blocks else {}
+        return Bundle(part.frames, clock, blocks, self._pose_free, self._rules.undetermined, errors)
+
+    def _moved_by_biases(self, part: _Part, adjusted: Adjusted) -> Floats:
+        """What biases as large as σ_ε would move (G,), of sensors of which nothing is stated."""
+        task = self._task
+        errors = {
+            s: CalibrationError(range_bias=float(task.sigmas[s]))
+            for s, eye in enumerate(task.rig.sensors)
+            if isinstance(eye, RangeSensor) and s not in task.errors
+            if "range_bias" not in task.free.get(s, ())
+        }
+        if not errors:
+            return np.zeros(sum(len(block.names) for block in self._blocks))
+        bundle = replace(self._bundle(part, self._blocks), errors=errors)
+        return moved_by_held(bundle, adjusted, self._gauge(part.poses), self._rules)
 
     def _gauge(self, poses: Floats) -> GaugeOf:
         freedom = Freedom(self._pose_free, poses)
@@ -299,6 +334,8 @@ class _Run:
             noise=adjusted.noise,
             inflation=adjusted.inflation,
             certainty=adjusted.certainty,
+            moved_by_biases=self._moved_by_biases(part, adjusted),
+            explained=explained_share(adjusted, part.frames, task),
             sights=sights_of(adjusted, numbers),
             poses=dict(zip(numbers, adjusted.poses, strict=True)),
             frames=part.frames,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from mixpose.calibration.rig import KINDS, Kind, Rig, kinds_of
 from mixpose.errors import SessionError
-from mixpose.sensors import RangeSensor
+from mixpose.sensors import CalibrationError, RangeSensor
 
 ALLOWED = ", ".join(KINDS)
 
@@ -92,6 +93,21 @@ def _sensors(rig: Rig, word: str, name: str, kind: Kind, *, every: bool) -> list
     if kind not in has:
         raise SessionError(f"--free {word}: sensor {name!r} has none; it has {', '.join(has)}")
     return [index]
+
+
+_FREES: dict[Kind, tuple[str, ...]] = {
+    "pose": ("rotation_deg", "position"),
+    "position": ("position",),
+    "focal": ("focal",),
+    "principal_point": ("principal_point",),
+    "range_bias": ("range_bias",),
+}
+
+
+def error_of_held(error: CalibrationError, kinds: Sequence[Kind]) -> CalibrationError:
+    """How far a sensor may be off in what is not free."""
+    free = {name: 0.0 for kind in kinds for name in _FREES.get(kind, ())}
+    return replace(error, **free)
 
 
 def words_of(names: Sequence[str], free: Mapping[int, Sequence[Kind]], body: bool) -> str:

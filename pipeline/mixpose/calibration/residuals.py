@@ -63,6 +63,14 @@ def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Fl
     return met / np.maximum(expected, 1)
 
 
+def explained_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:
+    """Share (L,) of what each sensor could show that is met, by the objective; NaN without any."""
+    most, sensors = len(task.rig.points), range(len(task.rig.sensors))
+    could = np.array([sum(min(len(f.points.get(s, ())), most) for f in frames) for s in sensors])
+    met = np.array([weight.sum() for _, _, weight in adjusted.weighted])
+    return np.asarray(np.where(could > 0, met / np.maximum(could, 1), np.nan))
+
+
 def sights_of(adjusted: Adjusted, numbers: Sequence[int]) -> dict[int, Sights]:
     """What each sensor saw and met."""
     found = {}

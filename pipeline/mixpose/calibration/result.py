@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rig import Block, Rig
+from mixpose.calibration.rules import CalibrationRules
 from mixpose.records import Floats
 
 
@@ -80,6 +81,11 @@ class Calibration:
     certainty : float
         Share of the weight of pairs of which each is the nearest that the other has: near 1, or
         detections cannot be told apart.
+    moved_by_biases : (G,) float64
+        Standard deviations that biases of ranges as large as σ_ε would add, where they are held and
+        nothing is stated of them.
+    explained : (L,) float64
+        Share of what each sensor could show that is met, weighted as in the objective; NaN without.
     sights : mapping of int to Sights
     poses : mapping of int to (4, 4) float64
         By frame number.
@@ -103,6 +109,12 @@ class Calibration:
     noise: Floats
     inflation: float
     certainty: float
+    moved_by_biases: Floats
+    explained: Floats
     sights: Mapping[int, Sights]
     poses: Mapping[int, Floats]
     frames: tuple[SeenFrame, ...]
+
+    def doubtful(self, rules: CalibrationRules) -> tuple[int, ...]:
+        """Sensors that most likely stand elsewhere: what they saw is not explained."""
+        return tuple(int(s) for s in np.flatnonzero(self.explained < rules.explained))

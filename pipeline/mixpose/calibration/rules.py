@@ -83,7 +83,9 @@ class CalibrationRules:
     )
     believed: float = constant(0.3, "of the frames: with fewer, doubtful poses are a start too")
     explained: float = constant(
-        0.5, "of a late camera's detections that poses known by then must explain"
+        0.5,
+        "of a sensor's detections, which poses must explain: of fifteen cameras those that stand "
+        "right have 0.68 and more, those 2 and 5 degrees off 0.15",
     )
     least_detections: int = constant(8, "explained likewise: four points fit many places")
     gap: float = constant(2.5, "frame intervals over which motion is interpolated")

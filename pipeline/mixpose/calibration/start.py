@@ -84,7 +84,10 @@ def start_from_cameras(task: Task, known: Known, rules: CalibrationRules) -> Sta
     placed = {s: rig.sensors[s].T_sensor_world for s in task.cameras if s not in movable}  # type: ignore[attr-defined]
     expected = {s: rig.sensors[s].T_sensor_world for s in task.cameras}  # type: ignore[attr-defined]
     if not placed:  # all are free: one stays, and the rig is moved back in the end
-        placed = {movable[0]: expected[movable[0]]}
+        first = next(
+            (s for s in movable if any(len(e[s].poses) for e in seen if s in e)), movable[0]
+        )
+        placed = {first: expected[first]}
     T, through = link_all(seen, placed, movable, expected, task.body.symmetries, rules)
     for sensor in through:
         rig = rig.placed(sensor, T[sensor])

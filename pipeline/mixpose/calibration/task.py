@@ -13,6 +13,7 @@ from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rig import Kind, Rig
 from mixpose.records import Floats
+from mixpose.sensors import CalibrationError
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage, how much of it is done, and of how much."""
@@ -50,6 +51,8 @@ class Task:
         Poses of the body by frame number, where they are known.
     length : (int, int) or None
         Sensors whose distance is known, and right in `rig`.
+    errors : mapping of int to CalibrationError
+        By sensor, how far what is held of it may be off.
     """
 
     rig: Rig
@@ -64,6 +67,7 @@ class Task:
     fuse: bool = True
     known: Mapping[int, Floats] | None = None
     length: tuple[int, int] | None = None
+    errors: Mapping[int, CalibrationError] = field(default_factory=dict)
 
     @property
     def cameras(self) -> tuple[int, ...]:

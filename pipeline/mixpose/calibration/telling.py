@@ -35,10 +35,25 @@ def lines_of(found: Calibration, unit: str) -> list[str]:
             f"{'spread':<10}frames differ {np.sqrt(found.inflation):.2g} times as much as errors "
             "of single detections would let them (motion, body or lens); deviations include it"
         )
+    lines += _held_lines(found, unit)
     lines += [f"{'doubt':<10}{text}" for text in doubts_of(found, unit)]
     for direction in found.refused:
         lines.append(f"{'refused':<10}not determined: {direction}")
     return lines
+
+
+def _held_lines(found: Calibration, unit: str) -> list[str]:
+    """What biases of ranges that are taken as exact would do."""
+    lengths = np.concatenate([[u == "length" for u in b.units] for b in found.blocks] or [[]])
+    moved = np.where(np.isfinite(found.deviations) & (lengths > 0), found.moved_by_biases, 0.0)
+    if not moved.any():
+        return []
+    worst = int(np.argmax(moved))
+    return [
+        f"{'held':<10}range biases, as exact; off by extract.sigma each they would move what "
+        f"was found by {moved[worst]:.2g} {unit}, told as ± {found.deviations[worst]:.2g} {unit}: "
+        "state calibration_error, or free range_bias"
+    ]
 
 
 def doubts_of(found: Calibration, unit: str) -> list[str]:
@@ -49,6 +64,11 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
             f"{100 * (1 - found.certainty):.0f} % of the matches could as well be others': "
             "detections do not tell features apart, so that the deviations hold only if the start "
             "was right"
+        )
+    for sensor in found.doubtful(rules):
+        told.append(
+            f"{found.after.names[sensor]}: {100 * found.explained[sensor]:.0f} % of its detections "
+            "fit: it may stand elsewhere"
         )
     for sensor, each in found.residuals.items():
         if each.held_after > rules.rising * each.after:

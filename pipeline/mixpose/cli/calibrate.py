@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose import __version__
 from mixpose.calibration import Calibration, CalibrationRules, Rig, Task, calibrate, free_parameters
-from mixpose.calibration.free import words_of
+from mixpose.calibration.free import error_of_held, words_of
 from mixpose.calibration.recorded import read_frames, require_points
 from mixpose.calibration.saved import MARK as SAVED_MARK
 from mixpose.calibration.saved import Saved
@@ -181,6 +181,11 @@ def task_of(
         fuse=session.estimator.fuse,
         known=known,
         length=pair,
+        errors={
+            k: error_of_held(one.calibration_error, free.get(k, ()))
+            for k, one in enumerate(setups)
+            if one.calibration_error is not None
+        },
     )
 
 

@@ -36,10 +36,11 @@ _PIXELS = 37  # of an image every so many are compared first
 
 @dataclass
 class Stretches:
-    """Frames in which something was so, as stretches in the order of the run."""
+    """Frames in which something was so: the longest stretches, and the last, in their order."""
 
     count: int = 0
     found: list[list[int]] = field(default_factory=list)
+    left_out: int = 0  # stretches
     _last: int = -2
 
     def add(self, frame: int, place: int) -> None:
@@ -49,6 +50,9 @@ class Stretches:
         if place == self._last + 1:
             self.found[-1][1:] = [frame, self.found[-1][2] + 1]
         else:
+            if len(self.found) > _SHOWN:  # the shortest can be named no more
+                self.found.remove(min(reversed(self.found), key=lambda each: each[2]))
+                self.left_out += 1
             self.found.append([frame, frame, 1])
         self.count, self._last = self.count + 1, place
 
@@ -66,7 +70,7 @@ class Stretches:
         """The frames for people, the longest stretches if there are many."""
         chosen = sorted(sorted(self.found, key=lambda each: -each[2])[:_SHOWN])
         parts = [f"{a}" if a == b else f"{a} to {b}" for a, b, _ in chosen]
-        more = len(self.found) - len(chosen)
+        more = self.left_out + len(self.found) - len(chosen)
         return ", ".join(parts) + (f" and {more} more" if more else "")
 
 

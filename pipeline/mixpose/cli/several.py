@@ -34,6 +34,7 @@ from mixpose.cli.recording_job import (
 from mixpose.cli.request import SUFFIXES, RunRequest
 from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_threads, on_cluster
+from mixpose.limits import MOST_BYTES
 from mixpose.whole_files import appearing_whole
 
 USUAL_STEM = "session"
@@ -79,10 +80,13 @@ def sessions_of(named: Sequence[str]) -> list[Path]:
 def _listed(path: Path) -> list[Path]:
     """The lines of a list; what is not there from the working folder is sought beside the list."""
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        content = _beginning(path)
+        lines = content.decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise SessionError(f"{path}: cannot be read: {reason}") from error
+    if len(content) > MOST_BYTES:
+        raise SessionError(f"{path}: found more than {MOST_BYTES} bytes, as many are allowed")
     names = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     if not names:
         raise SessionError(f"{path}: names no session; allowed: a session file per line")
@@ -222,9 +226,15 @@ def _options(request: RunRequest) -> tuple[str, ...]:
 
 def _sha256(session: Path) -> str:
     try:
-        return hashlib.sha256(session.read_bytes()).hexdigest()
+        return hashlib.sha256(_beginning(session)).hexdigest()
     except OSError:
         return ""
+
+
+def _beginning(path: Path) -> bytes:
+    """The bytes of a file, or one more than are allowed where it has more."""
+    with path.open("rb") as file:
+        return file.read(MOST_BYTES + 1)
 
 
 def _folder(folder: Path | None, count: int) -> Path:

@@ -16,7 +16,7 @@ from mixpose.errors import RecordingError
 from mixpose.frames.quiet import quieten_opencv
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times
-from mixpose.limits import MOST_PIXELS
+from mixpose.limits import MOST_IMAGE_BYTES, MOST_PIXELS
 from mixpose.records import Image, RawFrame
 
 _RASTERS = {".bmp", ".dib", ".pbm", ".pfm", ".pgm", ".png", ".pnm", ".ppm", ".tif", ".tiff"}
@@ -189,9 +189,15 @@ def read_image(path: Path) -> Image:
     """
     quieten_opencv()
     try:
-        data = path.read_bytes()
+        size = path.stat().st_size
+        data = path.read_bytes() if path.is_file() and size <= MOST_IMAGE_BYTES else None
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    if data is None:
+        found = f"{size} bytes" if path.is_file() else "no file"
+        raise RecordingError(
+            f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}"
+        )
     fault = _fault_of(data)
     if fault is not None:
         raise RecordingError(f"{path}: {fault}; record or copy it again, or leave it out")

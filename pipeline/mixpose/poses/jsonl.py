@@ -7,11 +7,13 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 from mixpose import rigid
 from mixpose.errors import RecordingError, SessionError
+from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
@@ -288,8 +290,18 @@ def _sources_text(sources: object) -> str:
 
 
 def _read_bytes(path: Path) -> bytes:
+    lines: list[bytes] = []
     try:
-        return path.read_bytes()
+        with path.open("rb") as file:
+            # a device or a hole may be a line without end
+            for line in iter(partial(file.readline, MOST_BYTES + 1), b""):
+                lines.append(line)
+                if len(line) > MOST_BYTES:
+                    raise RecordingError(
+                        f"{path}:{len(lines)}: found more than {MOST_BYTES} bytes in a line, as "
+                        "many are allowed; a poses file holds one JSON object per line (.jsonl)"
+                    )
+        return b"".join(lines)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -17,6 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mixpose.limits import MOST_OPENED
 from mixpose.rigid import Floats, inverse
 from mixpose.session.arrays import numbers
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
@@ -42,6 +43,7 @@ _SIZE_NODES = (
     ("image_Width", "image_Height"),
     ("img_width", "img_height"),
 )
+_DASH = re.compile(r"-(?:\s|$)")
 _NUMBERED = re.compile(rf"({'|'.join(MATRIX_NODES)})_?(\d+|left|right)")
 
 
@@ -66,6 +68,7 @@ def _recognises(content: Content) -> bool:
 def _open(group: Iterable[Content]) -> _Nodes:
     opened = _Nodes({})
     for content in group:
+        _require_shallow(content)
         try:
             storage = cv2.FileStorage(content.text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         except (cv2.error, SystemError) as error:  # the binding raises SystemError from cv2.error
@@ -76,6 +79,17 @@ def _open(group: Iterable[Content]) -> _Nodes:
         for name in list(storage.root().keys()):
             opened.nodes.setdefault(name, storage.getNode(name))
     return opened
+
+
+def _require_shallow(content: Content) -> None:
+    """Refuse lists within lists without end, which would end the process."""
+    brackets = sum(map(content.text.count, "[{<"))
+    dashes = max((len(_DASH.findall(line)) for line in content.lines), default=0)
+    opened = max(brackets, dashes)
+    if opened > MOST_OPENED:
+        raise BadKeyError(
+            f"found {opened} opening brackets, tags or dashes; allowed: {MOST_OPENED}"
+        )
 
 
 def _groups(contents: Group) -> list[Group]:

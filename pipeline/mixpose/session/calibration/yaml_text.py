@@ -33,7 +33,9 @@ def parse_yaml(text: str) -> Any:
         mark = error.problem_mark or error.context_mark
         line = f" at line {mark.line + 1}" if mark else ""
         raise BadKeyError(f"not YAML{line}: {error.problem or error.context}") from error
-    except (yaml.YAMLError, ValueError, LookupError, TypeError, RecursionError) as error:
+    except RecursionError as error:
+        raise BadKeyError("lists or tables in it are nested too deeply") from error
+    except (yaml.YAMLError, ValueError, LookupError, TypeError) as error:
         raise BadKeyError(f"not YAML: {error}") from error
     if large:
         raise BadKeyError(

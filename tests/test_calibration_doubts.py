@@ -1,0 +1,101 @@
+"""What a calibration holds may be off, and what it found may stand elsewhere: both are told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated_rigs import FPS, PLACES, alone, cameras, motion, recording, task_of
+
+from mixpose.calibration import calibrate
+from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.free import error_of_held
+from mixpose.calibration.telling import doubts_of, lines_of
+from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
+from mixpose.sensors import CalibrationError, RangeSensor
+
+POSES = {k: motion(k / FPS) for k in range(40)}
+
+
+def places(found: Any) -> np.ndarray:
+    return np.concatenate([s.position for s in found.after.sensors])
+
+
+def test_deviations_know_of_a_bias_that_is_held_and_may_be_off() -> None:
+    sensors = [RangeSensor(PLACES[0])]
+    frames = recording(sensors, 40, 0.1)
+    task = task_of(sensors, frames, 5.0, free={0: ("position",)}, known=POSES)
+    plain = calibrate(task)
+    stated = calibrate(replace(task, errors={0: CalibrationError(range_bias=1.0)}))
+    off = calibrate(replace(task, rig=task.rig.exchanged(0, RangeSensor(PLACES[0], range_bias=1))))
+    # to first order the place moves by what a bias of one standard deviation moves it
+    added = np.sqrt(stated.deviations**2 - plain.deviations**2)
+    assert added == pytest.approx(np.abs(places(off) - places(plain)), rel=0.02, abs=1e-3)
+    assert stated.deviations[1] > 100 * plain.deviations[1]
+    np.testing.assert_allclose(places(stated), places(plain), atol=1e-9)
+
+
+def test_a_turn_that_is_held_makes_the_other_camera_as_uncertain() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 12, 0.02)
+    task = replace(task_of(sensors, frames), errors={0: CalibrationError(rotation_deg=0.2)})
+    found = calibrate(task, found=alone(sensors, frames))
+    turn = np.degrees(np.sqrt((found.deviations[3:] ** 2).sum()))
+    # the second turns with the first: 0.2 degrees about each of three axes
+    assert turn == pytest.approx(0.2 * np.sqrt(3), rel=0.02)
+
+
+def test_what_is_free_is_no_longer_as_uncertain_as_was_stated() -> None:
+    error = CalibrationError(focal=1e-3, rotation_deg=0.1, position=2.0)
+    assert error_of_held(error, ("pose", "delay")) == CalibrationError(focal=1e-3)
+    assert error_of_held(error, ("focal",)) == replace(error, focal=0.0)
+
+
+def test_a_direction_that_a_bias_hides_is_named_and_stays() -> None:
+    sensors = [RangeSensor(PLACES[0])]
+    frames = recording(sensors, 40, 0.1)
+    task = task_of(sensors, frames, 5.0, free={0: ("position",)}, known=POSES)
+    found = calibrate(replace(task, errors={0: CalibrationError(range_bias=900.0)}))
+    # the sensor stands 1 m away along y: a quarter of that is no knowledge of it
+    assert found.refused
+    assert all(text.startswith("s0:position y") for text in found.refused)
+
+
+def test_biases_that_are_held_as_exact_are_told_with_what_they_would_do() -> None:
+    sensors = [RangeSensor(p) for p in PLACES]
+    frames = recording(sensors, 20, 0.1)
+    free = dict.fromkeys(range(3), ("position",))
+    found = calibrate(task_of(sensors, frames, 5.0, free=free, known=POSES))
+    told = [line for line in lines_of(found, "mm") if line.startswith("held")]
+    assert len(told) == 1
+    # a bias of 5 mm moves a sensor about 5 mm along its line of sight, or more across
+    assert 5 <= found.moved_by_biases.max() < 30
+
+
+def test_a_camera_that_was_linked_wrongly_is_placed_by_the_others() -> None:
+    sensors = cameras(3)
+    frames = recording(sensors, 6, 0.05)
+    known = alone(sensors, frames)
+    wrong = from_rotation_vector([0.0, 0.0, 0.6], [60.0, 0.0, 0.0])
+    for key, one in known.items():
+        if key[1] == 2:
+            known[key] = Hypotheses(wrong @ one.poses, one.evidence)
+    found = calibrate(task_of(sensors, frames), found=known)
+    truth = sensors[2].T_sensor_world
+    T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
+    # three standard deviations as told: 0.027 degrees, 0.4 mm
+    assert rotation_angle_deg(T, truth) < 0.09
+    assert np.linalg.norm(inverse(T)[:3, 3] - inverse(truth)[:3, 3]) < 1.2
+    assert found.unlinked == ()
+    assert not doubts_of(found, "mm")
+
+
+def test_a_camera_whose_detections_do_not_fit_is_doubted() -> None:
+    sensors = cameras(2)
+    frames = recording(sensors, 12, 0.05)
+    found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
+    assert found.explained.min() > 0.8
+    told = doubts_of(replace(found, explained=np.array([0.9, 0.2])), "mm")
+    assert told == ["s1: 20 % of its detections fit: it may stand elsewhere"]
