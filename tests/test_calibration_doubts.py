@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated_rigs import FPS, PLACES, alone, cameras, motion, recording, task_of
+from simulated_rigs import FPS, PLACES, alone, bumped, cameras, motion, recording, task_of
 
 from mixpose.calibration import calibrate
-from mixpose.calibration.alone import Hypotheses
+from mixpose.calibration.alone import NOTHING, Hypotheses
 from mixpose.calibration.free import error_of_held
 from mixpose.calibration.telling import doubts_of, lines_of
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
@@ -90,6 +90,36 @@ def test_a_camera_that_was_linked_wrongly_is_placed_by_the_others() -> None:
     assert np.linalg.norm(inverse(T)[:3, 3] - inverse(truth)[:3, 3]) < 1.2
     assert found.unlinked == ()
     assert not doubts_of(found, "mm")
+
+
+def test_a_camera_that_sees_three_features_at_a_time_is_placed_by_the_others() -> None:
+    sensors = cameras(3)
+    frames = tuple(
+        replace(frame, points={**frame.points, 2: frame.points[2][:3]})
+        for frame in recording(sensors, 8, 0.05)
+    )
+    known = alone(
+        sensors[:2], [replace(f, points={0: f.points[0], 1: f.points[1]}) for f in frames]
+    )
+    known |= {(frame.number, 2): NOTHING for frame in frames}
+    found = calibrate(bumped(task_of(sensors, frames), 2, 3.0, 40.0), found=known)
+    truth = sensors[2].T_sensor_world
+    T = found.after.sensors[2].T_sensor_world  # type: ignore[attr-defined]
+    # three standard deviations as told: 0.033 degrees, 0.47 mm
+    assert rotation_angle_deg(T, truth) < 0.1
+    assert np.linalg.norm(inverse(T)[:3, 3] - inverse(truth)[:3, 3]) < 1.4
+    assert found.unlinked == ()
+
+
+def test_one_camera_that_knows_no_pose_alone_is_placed_by_known_poses() -> None:
+    sensors = cameras(1)
+    frames = recording(sensors, 6, 0.05)
+    task = bumped(task_of(sensors, frames, free={0: ("pose",)}, known=POSES), 0, 1.0, 5.0)
+    found = calibrate(task, found={(frame.number, 0): NOTHING for frame in frames})
+    T = found.after.sensors[0].T_sensor_world  # type: ignore[attr-defined]
+    # three standard deviations as told: 0.016 degrees
+    assert rotation_angle_deg(T, sensors[0].T_sensor_world) < 0.05
+    assert found.bad == ()
 
 
 def test_a_camera_whose_detections_do_not_fit_is_doubted() -> None:

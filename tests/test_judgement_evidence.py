@@ -156,11 +156,23 @@ def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it()
 
 def test_a_camera_that_misses_a_point_misses_it_whatever_it_is() -> None:
     both = two_cameras_at_right_angles()
+    third = replace(both[0], name="2", shares=np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+    assert odds_by_volume([*both, third]) > odds_by_volume(both)
+    met = log(0.75 / (1e-5 * 2 * pi * 0.4**2))
+    assert odds_by_volume([*both, third], in_space=False) == pytest.approx(
+        odds_by_volume(both, in_space=False) + 3 * met - 3 * log(4), rel=1e-3
+    )
+
+
+def test_a_camera_that_misses_all_of_the_body_is_covered_and_counts_once() -> None:
+    both = two_cameras_at_right_angles()
     blind = replace(both[0], name="2", shares=np.zeros(6))
     assert odds_by_volume([*both, blind]) == pytest.approx(odds_by_volume(both))
-    assert odds_by_volume([*both, blind], in_space=False) == pytest.approx(
-        odds_by_volume(both, in_space=False) - 6 * log(4)
-    )
+    # six misses would count 8.3; and what chance puts near the edge of the gate changes nothing
+    least = odds_by_volume(both, in_space=False) + DetectionModel().log_blind
+    assert odds_by_volume([*both, blind], in_space=False) == pytest.approx(least)
+    by_chance = replace(blind, shares=np.eye(6)[0], offsets=np.full((6, 2), 1.6))
+    assert odds_by_volume([*both, by_chance], in_space=False) == pytest.approx(least, abs=0.1)
 
 
 def test_a_point_in_space_is_off_as_far_as_its_place_is_from_the_feature() -> None:

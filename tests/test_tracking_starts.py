@@ -23,6 +23,7 @@ from mixpose.judgement import (
     Residuals,
 )
 from mixpose.objective import View
+from mixpose.records import SensorReport
 from mixpose.rigid import from_rotation_vector, perturb, rotation_angle_deg, twist_between
 from mixpose.search import SearchBudget, SearchReport, SearchState
 from mixpose.search.result import SearchResult
@@ -34,7 +35,7 @@ from mixpose.tracking.proposers.predicted import is_doubtful, predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import ASIDE, stepped_aside
 from mixpose.tracking.proposers.without_sensor import disagreeing
-from mixpose.tracking.track import Branch
+from mixpose.tracking.track import Branch, SensorTally
 
 Floats = NDArray[np.float64]
 
@@ -212,6 +213,28 @@ def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
     assert not is_doubtful(data, [judged_at(TRUTH, association("0", 8.0))])
 
 
+def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    track = replace(tracker.begin(), tallies={"0": SensorTally(5, 8)}, believed=3, frame=0)
+
+    def doubted(track: Track, met: int) -> bool:
+        seen = replace(association("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
+        judged = replace(judged_at(TRUTH, seen), sensors={"0": SensorReport(True)})
+        return is_doubtful(data_of(tracker, [], track), [judged])
+
+    assert not doubted(track, 5)
+    assert not doubted(track, 4)
+    # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
+    assert doubted(replace(track, tallies={"0": SensorTally(8, 8)}), 5)
+    for other in (
+        replace(track, believed=2),
+        replace(track, misses=1),
+        replace(track, doubted=True),
+        replace(track, branches=2 * track.branches),
+    ):
+        assert doubted(other, 5)
+
+
 def test_of_three_sensors_the_one_whose_residuals_are_far_larger_disagrees() -> None:
     found = [association("0", 8.0), association("1", 8.0, off=0.6), association("2", 8.0)]
     # six times the others' deviation, 36 times their variance
@@ -272,7 +295,7 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
         left_out = likelihood_of(data).judge(fit, Start(TRUTH, left_out={"2": "bumped"}))
         return likelihood_of(two).judge(fit, Start(TRUTH)).log_evidence - left_out.log_evidence
 
-    assert lost(in_space=False) == pytest.approx(8 * np.log(4))
+    assert lost(in_space=False) == pytest.approx(-DetectionModel().log_blind)
     # a third camera misses points in space, which two cameras see, whatever they are
     assert lost(in_space=True) == pytest.approx(0.0)
     data, two = data_of(tracker, views), data_of(tracker, views[:2])

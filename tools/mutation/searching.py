@@ -155,8 +155,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-never-in-doubt",
         "tracking/proposers/predicted.py",
-        "return not ranked or not convinces(ranked[0], data.free, data.rules.acceptance)",
-        "return not ranked",
+        "if not ranked or not is_sure(ranked[0], data.free, rules):",
+        "if not ranked:",
         "where a prediction fails nothing else is tried",
         (_STARTS,),
     ),

@@ -144,6 +144,11 @@ class _Part:
         return _Part(tuple(frames[k] for k in order), poses[order])
 
 
+def _left_out(part: _Part, good: NDArray[np.bool_]) -> list[int]:
+    """Numbers of bad frames; none where all are: then no sensor was placed yet."""
+    return [f.number for f, ok in zip(part.frames, good, strict=True) if not ok and good.any()]
+
+
 class _Run:
     """One calibration: what stays the same during it."""
 
@@ -181,8 +186,8 @@ class _Run:
         adjusted = self._adjusted(training, self._start.rig, None)
         good = met_share(adjusted, training.frames, task) > rules.least_met
         held = everything.only(mask).carried(training.poses, adjusted.poses)
-        bad = [f.number for f, ok in zip(training.frames, good, strict=True) if not ok]
-        if bad and good.any():
+        bad = _left_out(training, good)
+        if bad:
             training = _Part(training.frames, adjusted.poses).only(good)
             self._progress("adjusting without bad frames", 1, 4)
             adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
@@ -192,7 +197,7 @@ class _Run:
         if len(held.poses):
             held_fit = self._posed(held, adjusted.rig)
             good = met_share(held_fit, held.frames, task) > rules.least_met
-            bad += [f.number for f, ok in zip(held.frames, good, strict=True) if not ok]
+            bad += _left_out(held, good)
             held = _Part(held.frames, held_fit.poses).only(good)
             held_fit = self._posed(held, adjusted.rig, adjusted.noise) if good.any() else None
         training = _Part(training.frames, adjusted.poses)

@@ -68,7 +68,7 @@ def gauge_rows(
             rows.append(row / np.linalg.norm(row))
             if text not in said:
                 said.append(text)
-    return np.array(rows).reshape(-1, count), tuple(said)
+    return np.array(rows).reshape(len(rows), count), tuple(said)
 
 
 def _generators(

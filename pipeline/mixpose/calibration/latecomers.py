@@ -4,24 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mixpose.calibration.adjust import adjust
 from mixpose.calibration.bundle import Bundle
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.interpolation import neighbours
-from mixpose.calibration.matching import clock_of, feature_spacing
-from mixpose.calibration.rig import Rig, blocks_of
+from mixpose.calibration.matching import Ints, clock_of, feature_spacing
+from mixpose.calibration.rig import Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
 from mixpose.calibration.starting import agreement
 from mixpose.calibration.task import Task
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse
+from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
+from mixpose.search.alignment import align_triples
+from mixpose.search.p3p import SIDES, depths
+from mixpose.sensors import facing
 
-_STEP_DEG = 0.5
 _TRIED = 6  # starts that are adjusted
+_TRIPLES = 20_000  # of pairs that are tried: of 360 pairs, 18 of them right, 150 triples are right
+_MOST = 1_000_000  # detections of a frame
 
 
 def placed(
@@ -94,34 +100,82 @@ def _starts(
     poses: Floats,
     rules: CalibrationRules,
 ) -> Floats:
-    """Where to begin (H, 4, 4): turns about the mean of what all linked sensors tell.
-
-    A shift looks like a turn from afar, so that turns alone are tried.
-    """
+    """Where to begin (H, 4, 4): near the mean of what all linked sensors tell."""
     session = [one.T_sensor_world for one in task.rig.sensors]  # type: ignore[attr-defined]
     told = np.array(
         [
             session[sensor] @ inverse(session[a]) @ rig.sensors[a].T_sensor_world  # type: ignore[attr-defined]
             for a in linked
         ]
+        or [session[sensor]]
     )
     centre = np.median(np.array([inverse(T)[:3, 3] for T in told]), axis=0)
     R = Rotation.from_matrix(told[:, :3, :3]).mean().as_matrix()
     T_mean = from_parts(R, -R @ centre)
-    reach = np.radians(np.arange(-rules.turn_deg, rules.turn_deg + 1e-9, _STEP_DEG))
-    turns = [[rx, ry, 0.0] for rx in reach for ry in reach]
-    tried = from_parts(Rotation.from_rotvec(turns).as_matrix(), np.zeros(3)) @ T_mean
-    blur = rules.widest / 2 * min(feature_spacing(rig.placed(sensor, T_mean), poses, sensor), 1e6)
-    worth = []
-    for T in tried:
-        one = rig.placed(sensor, T)
-        worth.append(
-            sum(
-                float(agreement(one, sensor, pose[None], frame.points[sensor], blur)[0])
-                * len(frame.points[sensor])
-                for pose, frame in zip(poses, frames, strict=True)
-                if sensor in frame.points
-            )
-        )
-    best = np.argsort(-np.array(worth), kind="stable")[:_TRIED]
-    return np.asarray(tried[best])
+    rig = rig.placed(sensor, T_mean)
+    seen = [
+        (pose, frame.points[sensor])
+        for pose, frame in zip(poses, frames, strict=True)
+        if len(frame.points.get(sensor, ()))
+    ]
+    # moving the world is moving the camera the other way
+    motions = _motions(rig, sensor, seen, rules)
+    blur = rules.widest / 2 * min(feature_spacing(rig, poses, sensor), 1e6)
+    worth = sum(agreement(rig, sensor, motions @ pose, y, blur) * len(y) for pose, y in seen)
+    best = np.argsort(-np.asarray(worth), kind="stable")[:_TRIED]
+    return np.asarray(T_mean @ motions[best])
+
+
+def _motions(
+    rig: Rig, sensor: int, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
+) -> Floats:
+    """Small motions (H, 4, 4) of the world, each of which three detections of any frames tell.
+
+    Three features near them, about equally far off in the image, are brought onto their lines of
+    sight.  The first motion is none.
+    """
+    eye: Any = rig.sensors[sensor]
+    places, lines, off, number = _near(rig, eye, seen, rules)
+    none = np.eye(4)[None]
+    if len(off) < 3:
+        return none
+    reach = float(np.linalg.norm(off, axis=1).max())
+    alike = cKDTree(off).query_ball_point(off, reach / 4)
+    each = -(-_TRIPLES // len(off))
+    rng = np.random.default_rng(0)
+    triples = np.concatenate(
+        [
+            np.column_stack([np.full(each, k), rng.choice(near, (each, 2))])
+            for k, near in enumerate(alike)
+        ]
+    ).T
+    differ = [number[triples[i]] != number[triples[j]] for i, j in SIDES]
+    triples = triples[:, np.all(differ, axis=0)]
+    cosines = np.array([(lines[triples[i]] * lines[triples[j]]).sum(axis=1) for i, j in SIDES])
+    apart = [places[triples[i]] - places[triples[j]] for i, j in SIDES]
+    away, which = depths(cosines, np.array([(d * d).sum(axis=1) for d in apart]))
+    corners, centre = triples[:, which], centre_of(eye)
+    on_lines = centre + lines[corners] * away[..., None]
+    motions = align_triples(places[corners].swapaxes(1, 2), on_lines.swapaxes(1, 2))
+    shift = np.linalg.norm(inverse(motions) @ np.append(centre, 1) - np.append(centre, 1), axis=1)
+    farthest = rules.shift * np.median(np.linalg.norm(places - centre, axis=1))
+    small = (rotation_angle_deg(np.eye(4), motions) < rules.turn_deg) & (shift < farthest)
+    return np.concatenate([none, motions[small]])
+
+
+def _near(
+    rig: Rig, eye: Any, seen: Sequence[tuple[Floats, Floats]], rules: CalibrationRules
+) -> tuple[Floats, Floats, Floats, Ints]:
+    """Features and detections that may be the same (n): place, line of sight, px between, which."""
+    found = []
+    for k, (pose, y) in enumerate(seen):
+        world = transform(pose, rig.points)
+        at, visible = eye.project(world)
+        visible = visible & facing(eye, pose[None], world[None], rig.normals)[0]
+        rays = eye.rays(y)
+        off = rays.pixels - at[:, None]
+        reach = np.tan(np.radians(rules.turn_deg)) / rays.slope
+        i, j = np.nonzero(visible[:, None] & (np.linalg.norm(off, axis=2) < reach))
+        found.append((world[i], rays.directions[j], off[i, j], k * _MOST + j))
+    places, lines, off, number = (np.concatenate(each) for each in zip(*found, strict=True))
+    return places, lines, off, number

@@ -57,6 +57,9 @@ class DetectionModel:
     log_unseen: float = constant(
         -1.2, "for each feature that faces a sensor out of its view: ln 0.3, bodies are in view"
     )
+    log_blind: float = constant(
+        -5.0, "at least, for all features that one sensor misses: in 1 of 150 it sees none"
+    )
     by_count: bool = constant(
         True,
         "whether a pose may pay for its freedom by the features that fix it: cheaper than by "
@@ -218,18 +221,27 @@ def odds_of(
     shape = matches[0].weights.shape
     gained, missed, coordinates = np.zeros((3, *shape))
     near: list[NDArray[np.bool_]] = []
+    is_met = np.zeros(shape, dtype=np.bool_)
     for one in matches:
         m = one.offsets.shape[2]
         density = one.crowd * (2 * np.pi * variance) ** (m / 2)
         rarity = np.log(detection.probability / np.maximum(density, 1e-300))
         gain = one.shares * np.maximum(rarity[:, None] - _costs(one, variance, spreads), 0.0)
+        miss, shares = (one.weights - one.shares) * detection.log_missed, one.shares
+        # what a sensor that is covered, blurred or out of step meets, it meets by chance
+        is_blind = (gain + miss).sum(axis=1, keepdims=True) < detection.log_blind
+        if is_blind.any():
+            even = one.weights / np.maximum(one.weights.sum(axis=1, keepdims=True), 1.0)
+            miss = np.where(is_blind, even * detection.log_blind, miss)
+            gain, shares = np.where(is_blind, 0.0, gain), np.where(is_blind, 0.0, shares)
         gained += gain
-        missed += (one.weights - one.shares) * detection.log_missed
-        coordinates += m * one.shares
+        missed += miss
+        coordinates += m * shares
+        is_met |= shares > 0
         # a detection that chance puts as near is not the feature's
         near.append((gain > 0) & (m == 2))
     # a feature that no sensor sees is covered: cameras do not miss it one by one
-    covered = ~np.any([one.shares > 0 for one in matches], axis=0)
+    covered = ~is_met
     most = detection.log_covered * np.max([one.weights for one in matches], axis=0)
     missed[covered] = np.maximum(missed, most)[covered]
     together = np.nonzero(np.sum(near, axis=0) > 1)

@@ -78,6 +78,11 @@ class SearchBudget:
     crowds: tuple[int, ...] = constant(
         (8, 16, 32), "nearest detections among which triples are drawn: a body is seen in one place"
     )
+    crowded: float = constant(
+        2.0,
+        "detections for a feature above which those far apart are not tried: of the web cams' "
+        "corners the right triples drawn are 2.7 times as many",
+    )
     chunk: int = constant(4096, "problems solved together: numbers stay in the cache")
     min_pixels: float = constant(3.0, "apart in the image, for two features to be told apart")
     min_sine: float = constant(0.02, "of the angle between rays: below it no depth is fixed")
@@ -110,6 +115,9 @@ class SearchBudget:
         12.0,
         "nats behind the best from which a pose is no candidate: of 470 frames of the rows and of "
         "clutter in space none had the right pose more than 4.2 behind",
+    )
+    hopeless: float = constant(
+        -20.0, "the same whatever is best: fits gain 3 nats or, of a board in motion, 12"
     )
     min_slip_features: int = constant(16, "of a body: with fewer, all poses a step off are met")
     max_slip_features: int = constant(120, "of a body up to which shifts by a grid step are tried")

@@ -54,7 +54,8 @@ def evidence(
     variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
     odds = odds_of(matches, variance, np.full(len(poses), 2 * body.radius), _DETECTION)
-    return paid_by_count(odds, matches, free), met
+    unseen = np.count_nonzero(at.faced & ~at.seen, axis=(0, 2)) * _DETECTION.log_unseen
+    return paid_by_count(odds, matches, free) + unseen, met
 
 
 def _matches_of(

@@ -56,24 +56,25 @@ def _problems(
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
-    fix a pose best, and of which the outermost are likely the same; then near ones at random.
+    fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
+    near detections as features that are near each other, at random.
     """
     n, M = len(features), len(rays)
     if comb(M, 3) * perm(n, 3) <= most:
         yield from _all_problems(np.arange(M), np.arange(n), most, budget, rng)
         return
-    spread_rays = far_apart(rays.pixels, int(1.5 * budget.exhaustive))
-    yield from _all_problems(
-        spread_rays, far_apart(features, budget.exhaustive), most // 2, budget, rng
-    )
-    nearest = np.argsort(np.linalg.norm(rays.pixels[:, None] - rays.pixels, axis=2), axis=1)
-    for k in range(most // budget.chunk // 2):
+    if budget.crowded * n >= M:
+        most //= 2
+        spread_rays = far_apart(rays.pixels, int(1.5 * budget.exhaustive))
+        yield from _all_problems(
+            spread_rays, far_apart(features, budget.exhaustive), most, budget, rng
+        )
+    near_rays, near_features = _nearest(rays.pixels), _nearest(features)
+    for k in range(most // budget.chunk):
         crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]
-        first = rng.integers(0, M, budget.chunk)
-        chosen = _drawn(min(crowd, M) - 1, 2, budget.chunk, rng) + 1
         yield (
-            np.stack([first, nearest[first, chosen[0]], nearest[first, chosen[1]]]),
-            _drawn(n, 3, budget.chunk, rng),
+            _drawn(near_rays, min(crowd, M), budget.chunk, rng),
+            _drawn(near_features, min(crowd // 2, n), budget.chunk, rng),
         )
 
 
@@ -93,9 +94,16 @@ def _all_problems(
         yield by_detection[:, a], by_feature[:, b]
 
 
-def _drawn(count: int, size: int, problems: int, rng: np.random.Generator) -> Indices:
-    """Random tuples (size, problems) of different numbers below `count`."""
-    return np.argsort(rng.random((problems, count)), axis=1)[:, :size].T
+def _nearest(points: Floats) -> Indices:
+    """Indices (n, n) of points, from each of them to its farthest."""
+    return np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
+
+
+def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
+    """Random triples (3, count): a point, and two of the `crowd - 1` nearest to it."""
+    first = rng.integers(0, len(nearest), count)
+    chosen = np.argsort(rng.random((count, crowd - 1)), axis=1)[:, :2].T + 1
+    return np.stack([first, *nearest[first, chosen]])
 
 
 def _perspective(

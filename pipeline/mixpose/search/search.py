@@ -157,11 +157,13 @@ class _Run:
             self._body, self._poses, self._ranks, count, self._budget.descent.alike
         )
         if self._by_evidence and kept:
-            least = self._ranks[kept[0]] - self._budget.outdone
-            kept = [k for k in kept if self._ranks[k] > least]
+            least = max(self._ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
+            kept = kept[:1] + [k for k in kept[1:] if self._ranks[k] > least]
         return [Candidate(self._poses[k], float(self._ranks[k])) for k in kept]
 
     def _keep(self, poses: Floats) -> None:
+        if not len(poses):
+            return
         ranks, met = self._judged(poses)
         self._poses = np.concatenate([self._poses, poses])
         self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
@@ -260,7 +262,7 @@ class _Run:
         """Whether the best guesses of several cameras leave no need for others."""
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._judged(guesses)[0].max() < 0:
+        if self._judged(guesses)[0].max() < self._budget.hopeless:
             return False
         self._keep(self._descended(guesses))
         return self._is_beyond_doubt() and self._is_settled()

@@ -169,8 +169,8 @@ class Tracker:
 
         def consider(start: Start, name: str) -> Judged | None:
             fit = likelihood.fit(start)
-            if any(fit is one for one in fits):
-                return None  # judged before
+            if start.T_moved is None and any(fit is one for one in fits):
+                return None  # judged before, and by the same prior
             fits.append(fit)
             judged = replace(likelihood.judge(fit, start), proposer=name)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)

@@ -17,8 +17,12 @@ from mixpose.tracking.likelihood import FrameData, Start
 
 
 def mirrored(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
-    """The best pose tilted the other way, where one camera alone sees a nearly flat body."""
+    """The best pose tilted the other way, where one camera alone meets a nearly flat body."""
     body, views = data.body, data.views
+    if ranked and len(views) > 1:
+        least = data.rules.acceptance.agreeing
+        met = {one.name for one in ranked[0].associations if one.coverage >= least}
+        views = [view for view in views if view.name in met]
     if not ranked or len(views) != 1 or views[0].sensor.dimension != 2:
         return []
     centre = body.means.mean(axis=0)

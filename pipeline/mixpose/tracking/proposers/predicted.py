@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mixpose.judgement import Judged, convinces
+import numpy as np
+
+from mixpose.judgement import Judged, convinces, is_sure
 from mixpose.tracking.likelihood import FrameData, Start
 
 
@@ -15,4 +17,23 @@ def predicted(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
 
 def is_doubtful(data: FrameData, ranked: list[Judged]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere."""
-    return not ranked or not convinces(ranked[0], data.free, data.rules.acceptance)
+    rules = data.rules.acceptance
+    if not ranked or not is_sure(ranked[0], data.free, rules):
+        return True
+    return not (convinces(ranked[0], data.free, rules) or _is_met_as_before(data, ranked[0]))
+
+
+def _is_met_as_before(data: FrameData, best: Judged) -> bool:
+    """Whether of a body that was followed for some frames no more is missed all at once.
+
+    However much of it is hidden: what slips by a step of its grid, or turns over, meets less.
+    """
+    track = data.track
+    if track.misses or track.doubted or len(track.branches) != 1:
+        return False
+    if track.believed < data.rules.proposals.believed:
+        return False
+    before = sum(one.met for one in track.tallies.values())
+    used = [one for one in best.associations if best.sensors[one.name].used]
+    met = sum(int(np.count_nonzero(one.shares)) for one in used)
+    return met > data.rules.acceptance.convincing * before
