@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from mixpose.extraction import METHODS, ExtractOptions, extract
@@ -197,6 +198,25 @@ def test_spots_that_touch_come_apart() -> None:
     found = blobs(photograph(spots((60, 60), truth, 1.5, 150, 90), 8))
     assert len(found) == 2
     assert np.max(distances(found, truth)) < 0.12
+
+
+@pytest.mark.parametrize("peak", [150.0, 400.0])  # the latter saturates to beyond the rim
+@pytest.mark.parametrize("gap", [-4.0, -2.0, 0.5, 4.0])
+def test_disks_that_overlap_or_touch_are_found_apart(peak: float, gap: float) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        turn, radii = rng.uniform(0, np.pi), (20.0, 17.0)
+        half = (sum(radii) + gap) / 2 * np.array([np.cos(turn), np.sin(turn)])
+        truth = 80 + rng.uniform(-0.5, 0.5, 2) + np.array([-half, half])
+        fine = (np.mgrid[:1280, :1280] + 0.5) / 8 - 0.5
+        covered = np.zeros((160, 160))
+        for (u, v), radius in zip(truth, radii, strict=True):
+            inside = (fine[1] - u) ** 2 + (fine[0] - v) ** 2 < radius**2
+            covered = np.maximum(covered, inside.reshape(160, 8, 160, 8).mean(axis=(1, 3)))
+        found = blobs(photograph(peak * gaussian_filter(covered, 1.6), seed))
+        assert len(found) == 2
+        # as good as two that lie apart, which are found to 0.04 px
+        assert np.max(distances(found, truth)) < 0.08
 
 
 def test_spot_that_the_border_cuts_is_left_out_and_a_disk_mostly_seen_is_not() -> None:

@@ -64,11 +64,20 @@ class EllipseRules:
     )
     oblique: float = constant(0.15, "width by length: a disk seen at less than 9° is not located")
     long: float = constant(1.35, "length by width from which an ellipse may be two spots")
+    long_coverage: float = constant(
+        0.8, "of the directions, then: the hull of two disks that touch has 0.6"
+    )
     waist: float = constant(
         0.7, "of the minor half-axis, where the waist of two spots is looked at"
     )
     dip: float = constant(0.1, "of the height, that the middle is dimmer than either half")
     ridge: float = constant(0.03, "of the height, that it is brighter than beside: two, not a ring")
+    lit: float = constant(
+        0.3,
+        "of the step at the rim, by which it may be brighter outside than at most of the rim: "
+        "beside a neighbour half the height is no edge, and the centre 0.3 px off",
+    )
+    dark: float = constant(0.7, "of the edges, that are enough without those")
     hidden_arcs: int = constant(8, "arcs, of which three that follow each other may be hidden")
 
 
@@ -94,8 +103,9 @@ class Rim:
 
     def is_good(self, rules: EllipseRules = EllipseRules()) -> bool:
         """Whether the rim is an ellipse."""
-        near = self.residual <= tolerance(min(self.ellipse.half_axes), rules) / 2
-        return self.coverage >= rules.coverage and bool(near)
+        minor, major = sorted(self.ellipse.half_axes)
+        least = rules.coverage if major < rules.long * minor else rules.long_coverage
+        return self.coverage >= least and bool(self.residual <= tolerance(minor, rules) / 2)
 
 
 def find_rims(
@@ -156,9 +166,12 @@ def _rims_near(
     signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
     """Ellipses through the edges near others, with coverage, residual and contrast of each."""
-    edges, found, steps = _edges(signal, ellipses, least_contrast, rules)
+    edges, found, steps, lows = _edges(signal, ellipses, least_contrast, rules)
     found &= (found.sum(axis=1) >= rules.coverage / 2 * DIRECTIONS)[:, None]
-    better = fit_ellipses(edges, found, rules)
+    light = lows - _medians(lows, found)[:, None]
+    dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
+    enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
+    better = fit_ellipses(edges, np.where(enough[:, None], dark, found), rules)
     distance = np.abs(distances(better, edges))
     within = tolerance(better.half_axes.min(axis=1), rules)
     on_rim = found & (distance <= within[:, None]) & better.sound[:, None]
@@ -273,7 +286,7 @@ def _medians(values: Floats, there: Mask) -> Floats:
 
 def _edges(
     signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
-) -> tuple[Floats, Mask, Floats]:
+) -> tuple[Floats, Mask, Floats, Floats]:
     """Edges along the normals of ellipses.
 
     Returns
@@ -284,6 +297,8 @@ def _edges(
         Whether it falls by `least_contrast` there, well within reach.
     steps : (B, DIRECTIONS) float64
         By how much it falls.
+    lows : (B, DIRECTIONS) float64
+        Down to what.
     """
     axes = ellipses.half_axes[:, None]
     turned = turns(ellipses.angle).swapaxes(1, 2)
@@ -292,7 +307,7 @@ def _edges(
     normals /= np.hypot(normals[..., 0], normals[..., 1])[..., None]
     reach = np.clip(rules.reach * ellipses.half_axes.min(axis=1), rules.min_reach, rules.max_reach)
     reach = reach.astype(np.intp)
-    where, found, steps = np.zeros((3, len(reach), DIRECTIONS))
+    where, found, steps, lows = np.zeros((4, len(reach), DIRECTIONS))
     for whole in sorted(set(reach.tolist())):
         some = np.flatnonzero(reach == whole)
         # Half steps, so that the fall between samples is known at the ellipse itself.
@@ -302,15 +317,21 @@ def _edges(
             for k in (0, 1)
         )
         profiles = sample_each(signal, u, v)
-        step, place, below = _fall(profiles.reshape(-1, len(offsets)), offsets)
+        step, place, below, low = _fall(profiles.reshape(-1, len(offsets)), offsets)
         sure = (step >= least_contrast) & below & (np.abs(place) <= whole)
         shape = (len(some), DIRECTIONS)
-        steps[some], where[some], found[some] = (x.reshape(shape) for x in (step, place, sure))
-    return on_rim + normals * where[..., None], found > 0, steps
+        for whole_array, part in ((steps, step), (where, place), (found, sure), (lows, low)):
+            whole_array[some] = part.reshape(shape)
+    return on_rim + normals * where[..., None], found > 0, steps, lows
 
 
-def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Floats, Mask]:
-    """Of profiles (n, k) how far each falls, where it is at half the height, and whether it is."""
+def _fall(
+    profiles: NDArray[np.float32], offsets: Floats
+) -> tuple[Floats, Floats, Mask, NDArray[np.float32]]:
+    """Of profiles (n, k) how far each falls, where it is at half the height, whether it is.
+
+    And how low it is outside.
+    """
     # The rim is near where the signal falls most over a width that optics blur an edge to...
     fall = profiles[:, :-3] - profiles[:, 3:]
     rows = np.arange(len(profiles))
@@ -326,4 +347,4 @@ def _fall(profiles: NDArray[np.float32], offsets: Floats) -> tuple[Floats, Float
     after = np.maximum(below.argmax(axis=1), 1)
     upper, lower = profiles[rows, after - 1].astype(np.float64), profiles[rows, after]
     where = offsets[after - 1] + (upper - half) / np.maximum(upper - lower, 1e-12)
-    return fall[rows, steepest], where, below[rows, after]
+    return fall[rows, steepest], where, below[rows, after], low

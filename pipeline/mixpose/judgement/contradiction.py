@@ -46,13 +46,13 @@ def contradict(
 def _is_unmet(used: Sequence[Association], agreed: bool, rules: AcceptanceRules) -> bool:
     """One meets most of the body; the other misses it, and sees as much beside it.
 
-    Where the two never agreed, wherever it sees as much.
+    Where the two never agreed, wherever it sees that.
     """
     least, most = sorted(used, key=lambda one: one.coverage)
     if not least.coverage < rules.agreeing <= most.coverage:
         return False
     if not agreed:
-        return least.count >= rules.agreeing * most.met
+        return least.count - least.met >= rules.agreeing * most.met
     return least.missed > 0 and least.surplus >= rules.agreeing * least.missed
 
 
