@@ -40,6 +40,16 @@ def test_features_side_by_side_meet_the_nearest_detection_each() -> None:
     np.testing.assert_allclose(found.offsets, [[0.0, -0.1], [0.0, -0.1]], atol=1e-12)
 
 
+def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
+    spots, places = detections((10.0, 10.0)), np.array([[14.0, 10.0]])
+    arguments = spots, places, np.ones(1), VARIANCE, np.ones((1, 3)), 1.0, AssociationRules()
+    # met within 1.55 standard deviations of what the place and the detection may be off
+    assert features_met(*arguments).shares.tolist() == [0.0]
+    wide = np.array([(4.0 / 1.55) ** 2 - VARIANCE])
+    assert features_met(*arguments, 0.98 * wide).shares.tolist() == [0.0]
+    assert features_met(*arguments, 1.02 * wide).shares.tolist() == [1.0]
+
+
 def test_two_features_that_share_a_detection_count_as_one_and_a_third_is_missed() -> None:
     # the detection is nearer to the middle of the first two than to either; the middle of the
     # second and the third would be met as well, had the second not its partner already

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
 from mixpose.extraction import METHODS, ExtractOptions, extract
+from mixpose.extraction.conics import fit_conics
 from mixpose.extraction.threshold import RULES
 from mixpose.records import Pattern, PointPattern
 
@@ -288,6 +289,13 @@ def test_grey_level_is_in_units_of_the_image(polarity: str) -> None:
         found = blobs(grey.astype(dtype), threshold=100 * scale, polarity=polarity)
         assert len(found) == 1, dtype
         assert distances(found, np.array([(20.2, 30.4)]))[0] < 0.1
+
+
+def test_edges_that_fix_no_ellipse_give_the_same_one_each_time() -> None:
+    # OpenCV moves such points by chance; a run that goes on would not repeat its frames
+    line = np.stack([np.arange(8.0), 2 * np.arange(8.0)], axis=1)[None]
+    found = [fit_conics(line, np.ones((1, 8), np.bool_), 0.0).centre.tolist() for _ in range(3)]
+    assert found[0] == found[1] == found[2]
 
 
 def test_blobs_in_a_window_are_those_of_the_whole_image() -> None:

@@ -60,3 +60,25 @@ def test_bodies_judged_at_once_are_worth_what_each_is_alone(
         assert together.residuals.noise == alone.residuals.noise
         for a, b in zip(together.residuals.lasting, alone.residuals.lasting, strict=True):
             np.testing.assert_allclose(a.information, b.information, rtol=1e-6, atol=1e-9)
+
+
+def test_a_body_that_gives_way_is_as_evident_bent_as_its_spread_lets_it_be(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    def giving_way(sigma: float, off: float = 0.0) -> Body:
+        moves = np.random.default_rng(3).normal(0, 1, (8, 3)) * off
+        positions = EIGHT.means + moves
+        features = (PointFeature(p, sigma**2 * np.eye(3)) for p in positions)
+        return Body("soft", tuple(features))
+
+    def evidence(body: Body, seen: Body) -> float:
+        views = detect(pinhole_cameras, seen, TRUTH, noise=0.2, seed=4)
+        case = Case(matched_objective(views, body, [1.5, 1.5]), TRUTH)
+        return judge(case, ALL_FREE).log_evidence
+
+    # rigid or bent, the one as likely as the other
+    lost = evidence(giving_way(0.0), EIGHT) - evidence(giving_way(2.0), EIGHT)
+    assert 0 < lost <= np.log(2) + 1e-9
+    # what both cameras see alike is no noise of either
+    bent = giving_way(0.0, off=1.0)
+    assert evidence(giving_way(1.0), bent) > evidence(giving_way(0.0), bent) + 1

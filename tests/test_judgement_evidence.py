@@ -40,12 +40,18 @@ SIX = Association(
 
 
 def odds_at(
-    found: list[Association], information: Floats, prior: Prior, size: float, model: DetectionModel
+    found: list[Association],
+    information: Floats,
+    prior: Prior,
+    size: float,
+    model: DetectionModel,
+    spreads: Floats | None = None,
 ) -> float:
     """Of one pose."""
     variances, sizes = np.full((1, len(found)), S2), np.array([size])
     stacked = Stacked.of([found])
-    odds = log_evidence(stacked, information[None] / S2, variances, FREE, [prior], sizes, model)
+    at_S2 = information[None] / S2
+    odds = log_evidence(stacked, variances, FREE, [prior], sizes, model, at_S2, spreads)
     return float(odds[0])
 
 
@@ -124,10 +130,12 @@ def two_cameras_at_right_angles() -> list[Association]:
     return [replace(SIX, name=str(k), J=J[k]) for k in (0, 1)]
 
 
-def odds_by_volume(found: list[Association], *, in_space: bool = True) -> float:
+def odds_by_volume(
+    found: list[Association], *, in_space: bool = True, spreads: Floats | None = None
+) -> float:
     detection = DetectionModel(by_count=False, in_space=in_space)
     prior = Prior(0.0, np.ones(6))
-    return odds_at(found, KNOWN, prior, 200.0, detection)
+    return odds_at(found, KNOWN, prior, 200.0, detection, spreads)
 
 
 def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it() -> None:
@@ -173,6 +181,33 @@ def test_a_point_in_space_is_off_as_far_as_its_place_is_from_the_feature() -> No
     offsets[0, 0] = 0.8  # one camera alone knows this direction: two standard deviations
     off = odds_by_volume([replace(both[0], offsets=offsets), both[1]])
     assert odds_by_volume(both) - off == pytest.approx(2.0, rel=1e-3)
+
+
+def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
+    both = two_cameras_at_right_angles()
+    offsets, spreads = np.zeros((6, 2)), np.zeros((1, 6, 3, 3))
+    offsets[0, 0] = 0.8  # as above: two standard deviations of 0.4
+    spreads[0, 0, 0, 0] = 0.4**2 * 3  # variance four times as large, in this direction alone
+    off = [replace(both[0], offsets=offsets), both[1]]
+    lost = odds_by_volume(both, spreads=spreads) - odds_by_volume(off, spreads=spreads)
+    assert lost == pytest.approx(2.0 / 4, rel=1e-3)
+    # what may lie anywhere around tells less where it lies at its place
+    assert odds_by_volume(both) - odds_by_volume(both, spreads=spreads) == pytest.approx(
+        log(2), rel=1e-3
+    )
+
+
+def test_features_that_may_be_off_tell_less_of_the_pose() -> None:
+    both = Stacked.of([two_cameras_at_right_angles()])
+    variances, spreads = np.full((1, 2), S2), np.zeros((1, 6, 3, 3))
+    exact = information_of(both, variances)
+    np.testing.assert_allclose(information_of(both, variances, spreads), exact)
+    spreads[...] = 0.5**2 * np.eye(3)
+    # along z both cameras see them: (S2 σ² / 2 + 0.25) each, along x one of them
+    found = information_of(both, variances, spreads)[0]
+    noise = S2 * 2.0**2
+    assert found[2, 2] == pytest.approx(6 / (noise / 2 + 0.25))
+    assert found[0, 0] == pytest.approx(6 / (noise + 0.25))
 
 
 def test_information_is_that_of_least_squares() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import random
 import re
 import shutil
@@ -21,6 +23,7 @@ from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
 from mixpose.rigid import Floats
 from mixpose.runner import Memory
+from mixpose.whole_files import appearing_whole
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
@@ -126,6 +129,29 @@ def test_on_a_full_disk_the_last_line_is_whole_and_the_file_is_named(tmp_path: P
     assert command("run", RANGES, "-o", poses, "--resume") == 0
     assert command("run", RANGES, "-o", whole) == 0
     assert without_latency(poses) == without_latency(whole)
+
+
+@needs_posix
+def test_a_note_that_finds_no_room_stops_no_run(tmp_path: Path) -> None:
+    poses, whole = tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
+    assert command("run", RANGES, "-o", whole, "--stop", "5") == 0
+    note_path(poses).mkdir()  # nothing can be put there, as on a disk that the note would fill
+    assert command("run", RANGES, "-o", poses, "--stop", "5") == 0
+    assert without_latency(poses) == without_latency(whole)
+    assert command("run", RANGES, "-o", poses, "--resume") == 0
+    assert command("run", RANGES, "-o", whole) == 0
+    assert without_latency(poses) == without_latency(whole)
+
+
+def test_a_full_disk_under_a_file_that_appears_whole_is_told_with_its_name(tmp_path: Path) -> None:
+    def write() -> None:
+        with appearing_whole(tmp_path / "summary.json") as part:
+            part.write_text("half", encoding="ascii")
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write itself has it
+
+    with pytest.raises(OSError, match=r"No space left on device: .*summary\.json"):
+        write()
+    assert list(tmp_path.iterdir()) == []
 
 
 @needs_posix

@@ -206,6 +206,24 @@ def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_no
     assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
 
 
+def test_three_markers_of_a_body_that_gives_way_may_be_three_of_its_others() -> None:
+    four, other = TOOL[:4], body("other", OTHER)
+    soft = Body("soft", tuple(PointFeature(point, 4.0 * np.eye(3)) for point in four))
+    seen, part = body("soft", four), body("part", four[:3])
+    scene = scene_of(soft, other)
+    tracks, there = scene.begin(), at(150.0, 60.0)
+    told = []
+    # three of its markers, then all of them, then three again while it is followed
+    for frame, shown in enumerate((part, seen, seen, part)):
+        views = views_of([shown, other], [at(2.0 * frame), there], frame)
+        outcomes = scene.advance(tracks, frame, None, views)
+        tracks = tuple(one.track for one in outcomes)
+        told.append(outcomes[0].estimate.status)
+        assert outcomes[1].estimate.status == "ok"
+    assert told[0] != "ok"
+    assert told[1:] == ["ok"] * 3
+
+
 def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

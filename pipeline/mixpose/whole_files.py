@@ -17,7 +17,8 @@ def partial_of(path: Path) -> Path:
 def appearing_whole(path: Path) -> Iterator[Path]:
     """A path to write to, moved to `path` at the end; nothing is left of it after an error.
 
-    What stood at `path` stays until then.  A device or a pipe is written to as it is.
+    What stood at `path` stays until then.  A device or a pipe is written to as it is.  An OSError
+    that names no file, as that of a full disk, gets the name of this one.
     """
     if path.exists() and not path.is_file():
         yield path
@@ -26,5 +27,8 @@ def appearing_whole(path: Path) -> Iterator[Path]:
     try:
         yield part
         os.replace(part, path)  # noqa: PTH105 - also where the file exists, on every system
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)

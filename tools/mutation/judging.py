@@ -133,8 +133,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "gain[:, None] - squares / (2 * variance[:, None])",
-        "gain[:, None] - 0 * squares",
+        "rarity[:, None] - _costs(one, variance, spreads)",
+        "rarity[:, None]",
         "a pose that meets features loosely is as good as one that meets them",
     ),
     Mutant(

@@ -143,6 +143,11 @@ class Body:
         """Largest standard deviation of any feature in any direction."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariances).max(), 0.0)))
 
+    def node_spreads(self, T_world_object: Floats) -> Floats:
+        """Spreads Σ_i of the nodes (Q, 3, 3) in the world, of the body at a pose (4, 4)."""
+        R = T_world_object[:3, :3]
+        return np.asarray((R @ self.covariances @ R.T)[self.nodes.feature])
+
     @cached_property
     def symmetries(self) -> Floats:
         """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""

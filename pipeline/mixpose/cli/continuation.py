@@ -65,12 +65,13 @@ class Notes:
             self.write()
 
     def write(self) -> None:
-        """Write down what was taken last."""
+        """Write down what was taken last, where there is room: poses are worth more than notes."""
         if self._last is None:
             return
         frame, file, memory = self._last
         note = Note(self._version, frame, file.size, file.checksum, memory)
-        with appearing_whole(self._path) as part:
+        # without it, as on a full disk, frames are estimated again
+        with suppress(OSError), appearing_whole(self._path) as part:
             part.write_text(json.dumps(encode(note)), encoding="ascii")
         self._last, self._written_at = None, time.monotonic()
 

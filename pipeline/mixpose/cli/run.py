@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from mixpose import __version__
@@ -114,8 +114,7 @@ def _notes(request: RunRequest) -> Iterator[Notes | None]:
     try:
         yield notes
     except BaseException:
-        with suppress(OSError):  # as on a full disk: then the frames are estimated again
-            notes.write()
+        notes.write()
         raise
     if request.selection.stop is None:
         notes.drop()

@@ -86,6 +86,7 @@ def features_met(
     sampled: Floats,
     amplitude: float,
     rules: AssociationRules,
+    wide: Floats | float = 0.0,
     *,
     unlike: bool = True,
 ) -> FeaturesMet:
@@ -104,25 +105,27 @@ def features_met(
     amplitude : float
         The factor with which the predicted mixture meets the observed one.
     rules : AssociationRules
+    wide : (n,) array or float
+        Variances by which features may be off their places beside that, squared sensor units.
     unlike : bool
         Whether features of a grid of values have amplitudes of their own, as the fit gave them.
     """
     if isinstance(observation.pattern, GridPattern):
         return _residuals(y, weights, variance, sampled, amplitude, rules, unlike)
-    reach = rules.reach_squared * variance
+    reach = rules.reach_squared * (variance + np.broadcast_to(wide, len(y)))
     found = _nearest(observation.pattern, y, weights, reach)
     if not rules.merged or np.count_nonzero(found.shares) == len(y):
         return found
     return _run_together(found, y, weights, reach)
 
 
-def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: float) -> FeaturesMet:
+def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:
     """Features met by the nearest detections, each taken once."""
     shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
     detections = np.full(len(y), -1)
     away = pattern.points - y[:, None]
     squared = (away * away).sum(axis=-1)
-    near_i, near_j = np.nonzero(squared <= reach)
+    near_i, near_j = np.nonzero(squared <= reach[:, None])
     order = np.argsort(squared[near_i, near_j], kind="stable")
     met: set[int] = set()
     taken: set[int] = set()
@@ -136,7 +139,7 @@ def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: float) ->
     return FeaturesMet(shares, offsets, np.arange(len(y)), detections)
 
 
-def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) -> FeaturesMet:
+def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:
     """Let two features share a detection that lies nearer to their middle than to either.
 
     Images that overlap are detected as one, in the middle.  The two count as one feature that was
@@ -150,7 +153,7 @@ def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: float) 
         if not len(seen):
             break
         places = y[seen] + offsets[seen]
-        near = ((places - y[i]) ** 2).sum(axis=1) <= reach
+        near = ((places - y[i]) ** 2).sum(axis=1) <= reach[i]
         middle = places - (y[seen] + y[i]) / 2
         closer = (middle**2).sum(axis=1) - (offsets[seen] ** 2).sum(axis=1)
         k = int(np.argmin(np.where(near, closer, np.inf)))

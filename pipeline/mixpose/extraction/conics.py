@@ -101,6 +101,8 @@ def fit_conics(points: Floats, chosen: Mask, oblique: float) -> Ellipses:
     middle = points[np.arange(len(points)), chosen.argmax(axis=1)]
     near = (points - middle[:, None]).astype(np.float32)
     for k in np.flatnonzero(sound).tolist():
+        # it moves points by chance where they fix no ellipse, each time otherwise but for this
+        cv2.setRNGSeed(0)
         centre, axes, angle = cv2.fitEllipseAMS(near[k][chosen[k]])
         found[k] = *centre, *axes, angle
     sound &= np.isfinite(found).all(axis=1)

@@ -210,7 +210,7 @@ def _alike(
     T_b = nearest_alike(b.T_world_object, body, T_a)
     # one peak, of which one of the two is not the top: as in depth, seen by one camera
     away = twist_between(T_a, T_b)[free]
-    both = (a.covariance + b.covariance)[np.ix_(free, free)]
+    both = (a.covariance + b.covariance + a.bent)[np.ix_(free, free)]
     inside = bool(away @ np.linalg.solve(both, away) < rules.same_peak)
     if a.spread is not None:
         return inside  # of the likelihood, drawn to different priors
@@ -219,4 +219,6 @@ def _alike(
     apart = float(np.linalg.norm((T_a - T_b) @ centre))
     if apart < rules.same_distance * body.radius and turned < rules.same_rotation_deg:
         return True
-    return inside and turned < rules.same_peak_deg
+    # features that may be off leave a turn as open as that
+    open_turn = 3 * np.degrees(np.sqrt(np.linalg.eigvalsh(a.bent[3:, 3:]).max()))
+    return inside and turned < max(rules.same_peak_deg, min(open_turn, rules.widest_turn_deg))

@@ -158,8 +158,10 @@ def associate(
         The objective at the pose.
     """
     at, sampled, over = objective.match(T_world_object[None])
-    nodes = objective.projection.body.nodes
+    body = objective.projection.body
+    nodes = body.nodes
     node_weights, world = nodes.weights, transform(T_world_object, nodes.points)
+    spreads = body.node_spreads(T_world_object) if body.spread else None
     found, value = [], 0.0
     # beside detections the fit gives all features of a sensor one amplitude
     unlike = all(view.observation.cell is not None for view in objective.views)
@@ -175,7 +177,8 @@ def associate(
         detections = np.full(len(y), -1)
         if product > 0:
             a = product / norm
-            met = features_met(observation, y, weights, variance, C, a, rules, unlike=unlike)
+            wide = _wide(J, spreads[features]) if spreads is not None else np.zeros(len(y))
+            met = features_met(observation, y, weights, variance, C, a, rules, wide, unlike=unlike)
             shares, offsets, detections = met.shares, met.offsets, met.detections
             paired = met.partner != np.arange(len(y))
             merged = int(np.count_nonzero(paired)) // 2
@@ -208,6 +211,12 @@ def associate(
             )
         )
     return found, value
+
+
+def _wide(J: Floats, spreads: Floats) -> Floats:
+    """How far features (n,) may be off by their spreads, mean variance along a coordinate."""
+    by_world = J[..., :3]
+    return np.asarray(np.einsum("nmi,nij,nmj->n", by_world, spreads, by_world) / J.shape[1])
 
 
 def _crowd(

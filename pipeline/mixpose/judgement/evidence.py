@@ -157,12 +157,13 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 
 def log_evidence(
     found: Stacked,
-    information: Floats,
     variances: Floats,
     free: NDArray[np.bool_],
     priors: Sequence[Prior],
     sizes: Floats,
     detection: DetectionModel,
+    information: Floats,
+    spreads: Floats | None = None,
 ) -> Floats:
     """Logarithm of the odds (K,) for bodies at K poses against mere clutter.
 
@@ -170,7 +171,6 @@ def log_evidence(
     ----------
     found : Stacked
         Of all sensors that saw something.
-    information : (K, 6, 6) array
     variances : (K, L) array
         Of the noise of each, in σ_ε².
     free : (6,) bool
@@ -178,15 +178,18 @@ def log_evidence(
     sizes : (K,) array
         Of the bodies, length units.
     detection : DetectionModel
+    information : (K, 6, 6) array
+    spreads : (K, N, 3, 3) array or None
+        Covariances of features in the world, of bodies that give way.
     """
     matches = _matches_of(found, variances)
-    odds = odds_of(matches, np.ones(len(variances)), sizes, detection)
+    odds = odds_of(matches, np.ones(len(variances)), sizes, detection, spreads)
     unseen = found.gathered("unseen").sum(axis=1) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
-    spreads = np.array([prior.spread for prior in priors])[:, free]
-    inner = information[:, free][..., free] + np.eye(spreads.shape[1]) / spreads[:, None] ** 2
-    laplace = 0.5 * (spreads.shape[1] * math.log(2 * math.pi) - _log_det(inner))
+    wide = np.array([prior.spread for prior in priors])[:, free]
+    inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
+    laplace = 0.5 * (wide.shape[1] * math.log(2 * math.pi) - _log_det(inner))
     log_densities = np.array([prior.log_density for prior in priors])
     evidence = odds.gained + odds.missed + laplace + log_densities
     if detection.by_count:
@@ -195,7 +198,11 @@ def log_evidence(
 
 
 def odds_of(
-    matches: Sequence[SensorMatches], variance: Floats, sizes: Floats, detection: DetectionModel
+    matches: Sequence[SensorMatches],
+    variance: Floats,
+    sizes: Floats,
+    detection: DetectionModel,
+    spreads: Floats | None = None,
 ) -> Odds:
     """Odds of H poses against clutter, as if they had not been chosen to fit.
 
@@ -208,6 +215,8 @@ def odds_of(
     sizes : (H,) array
         Of the body, length units.
     detection : DetectionModel
+    spreads : (H, N, 3, 3) array or None
+        Covariances of features in the world, of a body that gives way; None: it does not.
     """
     shape = matches[0].weights.shape
     gained, missed, coordinates = np.zeros((3, *shape))
@@ -215,10 +224,9 @@ def odds_of(
     is_met = np.zeros(shape, dtype=np.bool_)
     for one in matches:
         m = one.offsets.shape[2]
-        squares = (one.offsets**2).sum(axis=2)
         density = one.crowd * (2 * np.pi * variance) ** (m / 2)
-        gain = np.log(detection.probability / np.maximum(density, 1e-300))
-        gain = one.shares * np.maximum(gain[:, None] - squares / (2 * variance[:, None]), 0.0)
+        rarity = np.log(detection.probability / np.maximum(density, 1e-300))
+        gain = one.shares * np.maximum(rarity[:, None] - _costs(one, variance, spreads), 0.0)
         miss, shares = (one.weights - one.shares) * detection.log_missed, one.shares
         # what a sensor that is covered, blurred or out of step meets, it meets by chance
         is_blind = (gain + miss).sum(axis=1, keepdims=True) < detection.log_blind
@@ -238,7 +246,8 @@ def odds_of(
     missed[covered] = np.maximum(missed, most)[covered]
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
-        space, share = _in_space(matches, near, together, variance, sizes[together[0]])
+        given = None if spreads is None else spreads[together]
+        space, share = _in_space(matches, near, together, variance, sizes[together[0]], given)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -247,12 +256,25 @@ def odds_of(
     return Odds(gained.sum(axis=1), missed.sum(axis=1), coordinates.sum(axis=1))
 
 
+def _costs(one: SensorMatches, variance: Floats, spreads: Floats | None) -> Floats:
+    """What offsets (H, N) cost in a sensor: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
+    if spreads is None:
+        return np.asarray((one.offsets**2).sum(axis=2) / (2 * variance[:, None]))
+    m = one.offsets.shape[2]
+    J = one.by_world / np.sqrt(variance)[:, None, None, None]
+    S = np.eye(m) + J @ spreads @ J.swapaxes(2, 3)
+    r = (one.offsets / np.sqrt(variance)[:, None, None])[..., None]
+    away = (r * np.linalg.solve(S, r)).sum(axis=(2, 3))
+    return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
+
+
 def _in_space(
     matches: Sequence[SensorMatches],
     near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
     variance: Floats,
     sizes: Floats,
+    spreads: Floats | None,
 ) -> tuple[Floats, Floats]:
     """What features met by several cameras say if clutter are points in space (K,), and shares.
 
@@ -273,7 +295,10 @@ def _in_space(
         across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(1, 2)), 1e-300))
         rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + np.log(sizes)
         log_rarity = np.maximum(log_rarity, np.where(met, rarity, -np.inf))
-    away = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1)
+    place = np.linalg.solve(A, b[..., None])
+    if spreads is not None:  # as far as it is known, and as far as the feature may be off
+        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads, A))
+    away = (place * (A @ place)).sum(axis=(1, 2))
     tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
 

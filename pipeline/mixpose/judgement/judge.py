@@ -14,6 +14,7 @@ from mixpose.body import Body
 from mixpose.density import AssociationRules
 from mixpose.judgement.association import Association, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
+from mixpose.judgement.moments import inverses
 from mixpose.judgement.noise import (
     FrameNoise,
     NoiseModel,
@@ -67,6 +68,9 @@ class Judged:
         Of what was climbed, at the pose.
     lasting : (6, 6) float64
         Of the covariance, what lasts from frame to frame.
+    bent : (6, 6) float64
+        Covariance of the pose where features are off by all that the body's spreads let them be;
+        zero of a body that is exact.
     """
 
     T_world_object: Floats
@@ -82,6 +86,7 @@ class Judged:
     proposer: str = ""
     value: float = 0.0
     lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
 @dataclass(frozen=True)
@@ -133,30 +138,39 @@ def judge_together(
     stacked = Stacked.of(found)
     noises = noises_of(stacked, free, [one.before for one in cases], rules.noise)
     variances = np.array([noise.variances for noise in noises])
-    information = information_of(stacked, variances)
+    bodies = [one.objective.projection.body for one in cases]
+    whole, widened = stacked, variances
     blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
     if any(blind):
-        stacked = Stacked.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
-        variances = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
-    bodies = [one.objective.projection.body for one in cases]
-    evidence = log_evidence(
-        stacked,
-        information,
-        variances,
-        free,
-        [
-            one.prior or flat_prior(body, free, rules.detection)
-            for one, body in zip(cases, bodies, strict=True)
-        ],
-        np.array([2 * body.radius for body in bodies]),
-        rules.detection,
-    )
-    parts = zip(cases, pairs, noises, evidence.tolist(), strict=True)
+        whole = Stacked.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
+        widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
+    priors = [
+        one.prior or flat_prior(body, free, rules.detection)
+        for one, body in zip(cases, bodies, strict=True)
+    ]
+    sizes = np.array([2 * body.radius for body in bodies])
+    beside = whole, widened, free, priors, sizes, rules.detection
+    evidence = log_evidence(*beside, information_of(stacked, variances))
+    spreads = _spreads(cases, stacked.weights.shape[2])
+    bent = np.zeros((len(cases), 6, 6))
+    if spreads is not None:
+        # rigid as a rule, and bent now and then: as often the one as the other
+        information = information_of(stacked, variances, spreads)
+        at_all = spreads.any(axis=(1, 2, 3))
+        both = np.logaddexp(evidence, log_evidence(*beside, information, spreads)) - math.log(2)
+        evidence = np.where(at_all, both, evidence)
+        inner = inverses(information[:, free][..., free])
+        bent[np.ix_(at_all, free, free)] = inner[at_all]
+    parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
     return [_judged(*each) for each in parts]
 
 
 def _judged(
-    case: Case, associated: tuple[list[Association], float], noise: FrameNoise, evidence: float
+    case: Case,
+    associated: tuple[list[Association], float],
+    noise: FrameNoise,
+    evidence: float,
+    bent: Floats,
 ) -> Judged:
     found, value = associated
     count = len(found)
@@ -172,7 +186,19 @@ def _judged(
         residuals=noise.remembered,
         associations=tuple(found),
         value=value,
+        bent=bent,
     )
+
+
+def _spreads(cases: Sequence[Case], most: int) -> Floats | None:
+    """Covariances (K, N, 3, 3) of the bodies' features in the world; None where all are exact."""
+    if not any(case.objective.projection.body.spread for case in cases):
+        return None
+    spreads = np.zeros((len(cases), most, 3, 3))
+    for own, case in zip(spreads, cases, strict=True):
+        turned = case.objective.projection.body.node_spreads(case.T_world_object)
+        own[: len(turned)] = turned[:most]
+    return spreads
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:

@@ -102,7 +102,7 @@ def frames_of(
     P = _fields(found.places, shares, roots, axes)
     split = P[0].shape[2]
     fields = np.concatenate(P, axis=2)
-    inverse = _inverse(J.swapaxes(1, 2) @ J)
+    inverse = inverses(J.swapaxes(1, 2) @ J)
     drawn = inverse @ (J.swapaxes(1, 2) @ fields)
     left = fields - J @ drawn
     information, vector = left.swapaxes(1, 2) @ left, (left.swapaxes(1, 2) @ r)[..., 0]
@@ -236,7 +236,7 @@ def _doubts(found: Stacked, scale: Floats, J: Floats, inverse: Floats) -> list[F
     return moved
 
 
-def _inverse(information: Floats) -> Floats:
+def inverses(information: Floats) -> Floats:
     """Inverses of information matrices (K, k, k).
 
     Directions that the data leave open get the variance that their information says: large, and

@@ -272,8 +272,19 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     return _Shares(variances, once**2 / np.maximum(squared, LEAST))
 
 
-def information_of(found: Stacked, variances: Floats) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε²."""
+def information_of(found: Stacked, variances: Floats, spreads: Floats | None = None) -> Floats:
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε².
+
+    What features tell that are off by `spreads` (K, N, 3, 3) in the world is less.
+    """
+    frames, sensors, n, m, _ = found.J.shape
     weights = (found.shares / variances[..., None])[..., None, None]
-    J = found.J.reshape(len(variances), -1, 6)
-    return np.asarray((weights * found.J).reshape(J.shape).swapaxes(1, 2) @ J)
+    by_feature = frames, n, sensors * m, 6
+    J = found.J.transpose(0, 2, 1, 3, 4).reshape(by_feature)
+    weighted = (weights * found.J).transpose(0, 2, 1, 3, 4).reshape(by_feature)
+    information = weighted.swapaxes(2, 3) @ J
+    if spreads is not None:
+        place = information[..., :3, :3]
+        taken = spreads @ np.linalg.inv(np.eye(3) + place @ spreads)
+        information = information - information[..., :3] @ taken @ information[..., :3, :]
+    return np.asarray(information.sum(axis=1))

@@ -39,7 +39,8 @@ def may_be_another(
     elsewhere : sequence of bool
         Which members are surely where they are.
     alike : float
-        How far markers of two bodies may be off each other, of the smaller one's radius.
+        How far markers of two bodies may be off each other, of the smaller one's radius; at least
+        as far as either gives way.
     """
     met = {int(i) for one in best.associations for i in one.features[one.shares > 0]}
     body = members[k].tracker.body
@@ -64,4 +65,5 @@ def may_be_another(
 @lru_cache(maxsize=4096)
 def parts_of(body: Body, other: Body, alike: float) -> tuple[SharedPart, ...]:
     """Parts that two bodies have in common."""
-    return tuple(shared_parts(body.means, other.means, alike * min(body.radius, other.radius)))
+    tolerance = max(alike * min(body.radius, other.radius), body.spread, other.spread)
+    return tuple(shared_parts(body.means, other.means, tolerance))

@@ -16,6 +16,7 @@ from mixpose.scene.members import Member, groups
 from mixpose.scene.rules import SceneRules
 from mixpose.tracking import Track
 from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.recognition import TRIANGLE, is_known
 
 
 class Outcome(NamedTuple):
@@ -72,7 +73,12 @@ class Scene:
         ]
 
     def _decided(self, k: int, data: FrameData, ranked: Sequence[Judged]) -> Decided:
-        return Decided(self.members[k].tracker.verdict(data, ranked), ranked)
+        verdict = self.members[k].tracker.verdict(data, ranked)
+        # of a body that gives way, three markers may be three of its others
+        gives_way = verdict.status == "ok" and data.body.spread > 0
+        if gives_way and verdict.best and not is_known(data, verdict.best):
+            verdict = replace(verdict, status="ambiguous", doubt=TRIANGLE)
+        return Decided(verdict, ranked)
 
     def _identify(
         self, group: Sequence[int], found: list[Decided], data: Mapping[int, FrameData]

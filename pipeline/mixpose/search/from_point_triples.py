@@ -94,13 +94,15 @@ def from_point_triples(
     if not len(triangles.corners) or len(found) < 3:
         return
     longest = float(triangles.sides.max())
+    bent = budget.gate * np.sqrt(2) * body.spread  # of a side between two features that give way
     for drawn in islice(_point_triples(found, longest, budget, rng), skipped, None):
         sides = _sides(found.points, drawn)
-        slack = 2 * found.tolerance[drawn].max(axis=1)
+        slack = 2 * found.tolerance[drawn].max(axis=1) + bent
         possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
         triples, sides = drawn[possible], sides[possible]
         tolerance = found.tolerance[triples]
-        allowed = np.stack([np.hypot(tolerance[:, i], tolerance[:, j]) for i, j in _SIDES], axis=1)
+        squares = np.stack([tolerance[:, i] ** 2 + tolerance[:, j] ** 2 for i, j in _SIDES], axis=1)
+        allowed = np.sqrt(squares + bent**2)
         k = min(budget.triangles_alike, len(triangles.corners))
         away, index = triangles.tree.query(
             sides,

@@ -109,8 +109,8 @@ class ObjectTable(Table):
     Example: `file = "markers.csv"`
     """
     sigma: Annotated[Any, Field(description=SIGMA_ALLOWED)] = None
-    """How far features may be off their places: standard deviation in `unit`, or covariance in
-    `unit`². Left out, or 0: exact.
+    """How far features may be off their places now and then, as markers on skin or cloth: standard
+    deviation in `unit`, or covariance in `unit`². Left out, or 0: exact.
 
     Example: `sigma = 0.5`
     """

@@ -242,6 +242,16 @@ class FrameData:
             for J, y, seen, m, view in each
         )
 
+    def given(self, T_world_object: Floats) -> float:
+        """How far features in view may be off by the body's spread, in σ_ε of their sensor."""
+        if not self.body.spread:
+            return 0.0
+        at = self.finest.projection.project(T_world_object[None])
+        J, spreads = at.J[:, 0, ..., :3], self.body.node_spreads(T_world_object)
+        variances = np.einsum("lnmi,nij,lnmj->ln", J, spreads, J) * at.seen[:, 0]
+        variances /= self.finest.projection.dimensions[:, None]
+        return float(np.sqrt((variances / np.square(self.sigmas)[:, None]).max()))
+
     def offsets(
         self,
         T_world_object: Floats,
@@ -297,6 +307,8 @@ class MatchedLikelihood:
             if data.begun.fit is not None:
                 return data.begun.fit
 
+        given = data.given(start.T_world_object) if self.knows_detections else 0.0
+
         def climb(seen: FrameData, T_start: Floats, beside: float = 0.0) -> Fit:
             return fit_near(
                 seen.views,
@@ -309,7 +321,7 @@ class MatchedLikelihood:
                 begun=begun,
                 climbed=None if timed else climbed,
                 noise=seen.noise,
-                beside=beside,
+                beside=max(beside, given),
                 errors=seen.rules.judgement.noise.errors,
                 rules=seen.rules.fit,
             )
