@@ -27,7 +27,7 @@ SPOTS = SimulationOptions(40, noise=1.0, spot_sigma=4.0, period_s=3.0)
 TABLE = SimulationOptions(40, pixel_noise=0.05, clutter=2, hidden=0.1)
 # half a metre and a hundred degrees per second
 FAST = SimulationOptions(
-    40, pixel_noise=0.02, amplitude_translation=150.0, amplitude_rotation_deg=30.0, period_s=2.5
+    100, pixel_noise=0.02, amplitude_translation=150.0, amplitude_rotation_deg=30.0, period_s=2.5
 )
 EVERYTHING = replace(SPOTS, noise=2.0, lamps=2, others=1, occluder=1, jpeg=80, exposure=0.004)
 
