@@ -16,6 +16,7 @@ from mixpose.errors import MixposeError
 from mixpose.frames import SourceSpec, open_source, read_image
 from mixpose.frames.containers import missing_bytes
 from mixpose.poses.jsonl import read_poses
+from mixpose.runner import run
 from mixpose.session import load_session
 
 pytest.importorskip("hypothesis")
@@ -187,3 +188,18 @@ def test_mutated_inputs_end_in_one_line_in_time_and_memory() -> None:
     )  # fmt: skip
     assert result.returncode == 0, result.stdout[-2000:] + result.stderr[-500:]
     assert result.stdout.startswith("20 mutated inputs: 0 findings")
+
+
+def test_a_profile_of_one_bin_far_above_all_others_ends_the_run_in_no_traceback(
+    tmp_path: Path,
+) -> None:
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
+    from fuzzed.recordings import KINDS
+
+    KINDS["npy"].make(tmp_path)
+    values = np.load(tmp_path / "p.npy")
+    values[1] = 0.0
+    values[1, 0] = 1e12
+    np.save(tmp_path / "p.npy", values)
+    statuses = [one.status for one in run(load_session(tmp_path / "session.toml"))]
+    assert len(statuses) == 3

@@ -114,7 +114,9 @@ class AmplitudesObjective:
             common = max(float(C[:, 0].sum()), 0.0) / float(over.norm[k, 0])
             # bounded, so that features at one place are told apart by nothing
             least = 1e-9 * top * float(w @ w)
-            strength = float(self.noise[k]) / max(self.spread * common, 1e-300) ** 2 + least
+            # and where nothing is seen, amplitudes are as good as one
+            squares = max((self.spread * common) ** 2, 1e-300)
+            strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1))
             inner += least * np.eye(len(w))
             alpha = np.linalg.solve(inner, C[:, 0])
