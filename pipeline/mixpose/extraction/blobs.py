@@ -32,7 +32,6 @@ from mixpose.extraction.contours import (
     neighbours,
     on_border,
     outlines,
-    parts_at_necks,
     pieces,
 )
 from mixpose.extraction.ellipse import EllipseRules, Rim, find_rims, is_waisted
@@ -213,32 +212,15 @@ def _other(
         and cv2.contourArea(contour) >= rules.solidity * cv2.contourArea(cv2.convexHull(contour))
         and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
     )
-    inner = _touching(scene, inside, corner, level, rules)
-    if not inner:
-        for part, higher in come_apart(scene, contour, patch, inside, level, rules.spots):
-            inner += _search(scene, pieces(part, corner), higher, min_area, rules)
+    inner: list[Blob] = []
+    for part, higher in come_apart(scene, contour, patch, inside, level, rules.spots):
+        inner += _search(scene, pieces(part, corner), higher, min_area, rules)
     higher = rules.level_ratio * level
     clear = stands_out and peak < rules.core_ratio * typical
     if not inner and not clear and higher < peak:
         brighter = pieces(above(patch, higher) & inside, corner)
         inner = _search(scene, brighter, higher, min_area, rules)
     return found + (inner or (whole if stands_out else []))
-
-
-def _touching(
-    scene: Foreground,
-    inside: NDArray[np.uint8],
-    corner: tuple[int, int],
-    level: float,
-    rules: BlobRules,
-) -> list[Blob]:
-    """Disks that touch, of which nothing but the shape tells where they are saturated."""
-    for parts in parts_at_necks(inside, corner):
-        disks = _disks(scene, parts, level, rules)
-        found = [disk for disk in disks if disk is not None]
-        if 1 < len(found) == len(disks):
-            return found
-    return []
 
 
 def _hull_blob(contour: Contour) -> Blob:

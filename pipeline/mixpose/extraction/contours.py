@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -23,9 +23,6 @@ Box: TypeAlias = Sequence[int]
 MOST_ROWS_SHARE = 0.5
 
 CONTOUR_SAMPLES = 64
-
-# Half-widths of necks that are looked for, as shares of that of the widest part.
-NECKS = (0.5, 0.6, 0.7, 0.8, 0.9)
 
 
 @dataclass(frozen=True)
@@ -70,29 +67,6 @@ def pieces(mask: NDArray[np.uint8], corner: tuple[int, int]) -> list[Contour]:
         return []
     # The last entry of a contour's family is its parent, which only holes have.
     return [c for c, relatives in zip(contours, family[0], strict=True) if relatives[3] < 0]
-
-
-def parts_at_necks(mask: NDArray[np.uint8], corner: tuple[int, int]) -> Iterator[list[Contour]]:
-    """Outlines of parts that hang together by necks, as disks do that touch.
-
-    Once for every width of necks that sets parts apart; narrow ones first.
-
-    Parameters
-    ----------
-    mask : (h, w) uint8
-        1 inside of a blob.
-    corner : (u, v)
-        Place of the mask's first pixel.
-    """
-    depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, cv2.DIST_MASK_5)[1:-1, 1:-1]
-    deepest = float(depth.max())
-    for share in NECKS:
-        count, labels = cv2.connectedComponents((depth > share * deepest).view(np.uint8))
-        if count > 2:
-            side = 2 * int(share * deepest) + 1
-            ball = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-            cores = [cv2.dilate((labels == k).view(np.uint8), ball) > 0 for k in range(1, count)]
-            yield [one for core in cores for one in pieces(mask * core, corner)]
 
 
 def filled_area(contour: Contour) -> float:
