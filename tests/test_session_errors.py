@@ -271,6 +271,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         [LEFT + "camera_matrix: found the focal length fx = -800"],
     ),
     (
+        {"matrix": "camera_matrix = [[5e-324, 0, 640], [0, 800, 512], [0, 0, 1]]"},
+        [LEFT + "camera_matrix: found the focal length fx = 4.94066e-324"],
+    ),
+    (
         {"matrix": "camera_matrix = [[800, 0, 0], [0, 800, 0], [640, 512, 1]]"},
         [LEFT + "camera_matrix", "transpose it"],
     ),

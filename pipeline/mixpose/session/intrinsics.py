@@ -16,6 +16,9 @@ CameraModel: TypeAlias = Literal["pinhole", "fisheye"]
 MATRIX_FORM = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
 DISTORTION_COUNTS: dict[str, tuple[int, ...]] = {"pinhole": (4, 5, 8, 12, 14), "fisheye": (4,)}
 
+# No camera is near these; beyond them the squares of directions are no numbers.
+SHORTEST_FOCAL_PX, LONGEST_FOCAL_PX = 1e-3, 1e9
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -56,9 +59,10 @@ def camera_matrix(value: Any) -> Floats:
     if K[0, 1] != 0 and K[0, 2] == 0:
         raise BadKeyError(found(K.tolist(), MATRIX_FORM) + "; cx comes third")
     for axis, focal in (("fx", K[0, 0]), ("fy", K[1, 1])):
-        if not focal > 0:
+        if not SHORTEST_FOCAL_PX <= focal <= LONGEST_FOCAL_PX:
             raise BadKeyError(
-                f"found the focal length {axis} = {focal:g}; allowed: greater than 0, in px"
+                f"found the focal length {axis} = {focal:g}; allowed: greater than 0, in px, "
+                f"from {SHORTEST_FOCAL_PX:g} to {LONGEST_FOCAL_PX:g}"
             )
     return K
 
