@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 
 from mixpose.density import Noise
 from mixpose.judgement import Association, NoiseModel, Residuals
-from mixpose.judgement.noise import noise_of
+from mixpose.judgement.noise import FrameNoise, noises_of
+from mixpose.judgement.stacked import Stacked
 
 Floats = NDArray[np.float64]
 
@@ -18,6 +20,16 @@ FREE = np.ones(6, dtype=np.bool_)
 MODEL = NoiseModel()
 ALONE = replace(MODEL, confidence=0.0, lasting=0.0)
 """Nothing is enlarged, and nothing believed to last before it is seen."""
+
+
+def noise_of(
+    associations: Sequence[Association],
+    free: NDArray[np.bool_],
+    before: Residuals,
+    model: NoiseModel,
+) -> FrameNoise:
+    """The noise of one frame."""
+    return noises_of(Stacked.of([associations]), free, [before], model)[0]
 
 
 def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Association:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -105,6 +105,10 @@ class Verdict:
     best: Judged | None
     kept: list[tuple[Judged, float]]
     doubt: str = ""
+
+    def doubted(self, doubt: str) -> Verdict:
+        """The same, ambiguous for a reason; no reason leaves it as it is."""
+        return replace(self, status="ambiguous", doubt=doubt) if doubt else self
 
 
 def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:

@@ -18,7 +18,7 @@ from mixpose.density import (
     features_met,
     surplus,
 )
-from mixpose.objective import MatchedObjective
+from mixpose.objective import MatchedObjective, in_image
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
@@ -177,7 +177,7 @@ def associate(
         detections = np.full(len(y), -1)
         if product > 0:
             a = product / norm
-            wide = _wide(J, spreads[features]) if spreads is not None else np.zeros(len(y))
+            wide = in_image(spreads[features], J) if spreads is not None else np.zeros(len(y))
             met = features_met(observation, y, weights, variance, C, a, rules, wide, unlike=unlike)
             shares, offsets, detections = met.shares, met.offsets, met.detections
             paired = met.partner != np.arange(len(y))
@@ -211,12 +211,6 @@ def associate(
             )
         )
     return found, value
-
-
-def _wide(J: Floats, spreads: Floats) -> Floats:
-    """How far features (n,) may be off by their spreads, mean variance along a coordinate."""
-    by_world = J[..., :3]
-    return np.asarray(np.einsum("nmi,nij,nmj->n", by_world, spreads, by_world) / J.shape[1])
 
 
 def _crowd(

@@ -128,24 +128,14 @@ class FrameNoise:
     remembered: Residuals
 
 
-def noise_of(
-    associations: Sequence[Association],
-    free: NDArray[np.bool_],
-    before: Residuals,
-    model: NoiseModel,
-) -> FrameNoise:
-    """The noise of a frame, from its residuals and from those before it.
+def noises_of(
+    found: Stacked, free: NDArray[np.bool_], before: Sequence[Residuals], model: NoiseModel
+) -> list[FrameNoise]:
+    """The noise of K frames, from the residuals of each and from those before it.
 
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    return noises_of(Stacked.of([associations]), free, [before], model)[0]
-
-
-def noises_of(
-    found: Stacked, free: NDArray[np.bool_], before: Sequence[Residuals], model: NoiseModel
-) -> list[FrameNoise]:
-    """The same of K frames at once."""
     levels = [
         _level(associations, int(free.sum()), known, model)
         for associations, known in zip(found.each, before, strict=True)

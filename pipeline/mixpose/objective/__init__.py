@@ -7,7 +7,13 @@ from mixpose.objective.base import Objective, Quadratic, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
 from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
-from mixpose.objective.projection import BodyProjection, Projected, pose_jacobian, project_body
+from mixpose.objective.projection import (
+    BodyProjection,
+    Projected,
+    in_image,
+    pose_jacobian,
+    project_body,
+)
 from mixpose.objective.together import Together, can_be_together
 
 __all__ = [
@@ -26,6 +32,7 @@ __all__ = [
     "View",
     "build_objective",
     "can_be_together",
+    "in_image",
     "matched_objective",
     "pose_jacobian",
     "project_body",

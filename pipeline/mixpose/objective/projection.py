@@ -93,6 +93,21 @@ def project_body(sensors: tuple[Sensor, ...], body: Body) -> BodyProjection:
     return BodyProjection(sensors, body)
 
 
+def in_image(spreads: Floats, J: Floats) -> Floats:
+    """How far features (..., n) are off in a sensor's coordinates, mean variance along one.
+
+    Parameters
+    ----------
+    spreads : (n, 3, 3) array
+        Covariances of the features in the world.
+    J : (..., n, m, 6) array
+        As `Projected` has it, for the sensor's own m coordinates.
+    """
+    by_world = J[..., :3]
+    total = np.einsum("...nmi,nij,...nmj->...n", by_world, spreads, by_world)
+    return np.asarray(total / J.shape[-2])
+
+
 def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
     """Chain Jacobians (..., n, m, 3) by world points into (..., n, m, 6) by the pose's twist.
 

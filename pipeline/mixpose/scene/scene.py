@@ -77,7 +77,7 @@ class Scene:
         # of a body that gives way, three markers may be three of its others
         gives_way = verdict.status == "ok" and data.body.spread > 0
         if gives_way and verdict.best and not is_known(data, verdict.best):
-            verdict = replace(verdict, status="ambiguous", doubt=TRIANGLE)
+            verdict = verdict.doubted(TRIANGLE)
         return Decided(verdict, ranked)
 
     def _identify(

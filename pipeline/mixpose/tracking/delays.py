@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.judgement import Association
+from mixpose.judgement.moments import inverses
 from mixpose.objective import View
 from mixpose.records import DelaySeen
 from mixpose.sensors import Motion, in_motion, moments
@@ -242,11 +243,9 @@ def _known(
     return prior[rows], known[rows]
 
 
-def _inverse(matrix: Floats) -> Floats:
-    """Inverse of a symmetric matrix whose rows differ in their units; large where it is open."""
-    scale = 1 / np.sqrt(np.maximum(matrix.diagonal(), 1e-18))
-    values, vectors = np.linalg.eigh(matrix * scale * scale[:, None])
-    return np.asarray((vectors / np.maximum(values, 1e-14)) @ vectors.T * scale * scale[:, None])
+def _inverse(information: Floats) -> Floats:
+    """Inverse of one information matrix; large where it is open."""
+    return np.asarray(inverses(information[None])[0])
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from mixpose.judgement import (
 from mixpose.objective import (
     MatchedObjective,
     View,
+    in_image,
     matched_objective,
     project_body,
 )
@@ -247,9 +248,9 @@ class FrameData:
         if not self.body.spread:
             return 0.0
         at = self.finest.projection.project(T_world_object[None])
-        J, spreads = at.J[:, 0, ..., :3], self.body.node_spreads(T_world_object)
-        variances = np.einsum("lnmi,nij,lnmj->ln", J, spreads, J) * at.seen[:, 0]
-        variances /= self.finest.projection.dimensions[:, None]
+        spreads = self.body.node_spreads(T_world_object)
+        each = zip(at.J[:, 0], self.finest.projection.dimensions.tolist(), strict=True)
+        variances = np.array([in_image(spreads, J[:, :m]) for J, m in each]) * at.seen[:, 0]
         return float(np.sqrt((variances / np.square(self.sigmas)[:, None]).max()))
 
     def offsets(

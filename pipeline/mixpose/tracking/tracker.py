@@ -126,8 +126,7 @@ class Tracker:
         verdict = self.verdict(data, ranked)
         if verdict.status == "ok" and (best := verdict.best):
             alone = ALONE if is_alone(data, best, len(views)) else ""
-            if doubt := alone if is_known(data, best) else TRIANGLE:
-                verdict = replace(verdict, status="ambiguous", doubt=doubt)
+            verdict = verdict.doubted(alone if is_known(data, best) else TRIANGLE)
         followed = self.followed(data, frame, time_s, verdict)
         estimate = self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
         if data.log.report:
@@ -148,10 +147,10 @@ class Tracker:
         if not is_sure(best, self.free, self.rules.acceptance):
             return verdict
         if is_reflection(data, best):
-            return replace(verdict, status="ambiguous", doubt=MIRRORED)
+            return verdict.doubted(MIRRORED)
         track, noise = data.track, self.rules.judgement.noise
         if contradict(best, track.residuals.total, track.agreed, self.rules.acceptance, noise):
-            return replace(verdict, status="ambiguous", doubt=APART)
+            return verdict.doubted(APART)
         return verdict
 
     def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
