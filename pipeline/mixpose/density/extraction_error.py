@@ -163,7 +163,7 @@ def errors_seen(
 def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
     """Blurs (L,) by what was known of the noise before a frame; arguments as of `errors_seen`."""
     variances = pooled(known, rules, rules.typical_degrees)
-    return np.clip(rules.blur * np.sqrt(variances), finest, 1.0)
+    return np.asarray(np.minimum(np.maximum(rules.blur * np.sqrt(variances), finest), 1.0))
 
 
 def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
@@ -182,7 +182,7 @@ def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: E
         squares.append(factor * q * degrees[-1])
     most = sum(degrees)
     left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
-    own = np.array([squares, degrees]) * [[left > 0], [left]]
+    own = np.array([squares if left else [0.0] * len(squares), [one * left for one in degrees]])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))

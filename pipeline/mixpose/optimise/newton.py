@@ -212,7 +212,7 @@ def _step(here: Model, inner: _Inner | None, damping: float) -> tuple[Floats, fl
     # a direction without curvature must not make the system singular
     floor = max(diagonal.tolist(), default=0.0) * 1e-12 * damping + _TINY
     A = C.copy()
-    A.flat[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
+    A.reshape(-1)[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
     partial = _solved(A, g)
     gain = float(partial @ (g - 0.5 * (C @ partial)))
     if inner is None:
