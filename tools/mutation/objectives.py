@@ -98,8 +98,8 @@ _MATCHED = (
     Mutant(
         "objective-out-of-the-picture-is-free",
         "objective/matched.py",
-        "norm = norm + self.tops * (hidden**2).sum(axis=2)",
-        "norm = norm + 0.0 * (hidden**2).sum(axis=2)",
+        "(norm + self.tops * (hidden**2).sum(axis=2))",
+        "(norm + 0.0 * (hidden**2).sum(axis=2))",
         "a pose gains by moving features that meet nothing out of the picture",
     ),
     Mutant(

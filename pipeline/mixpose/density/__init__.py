@@ -13,7 +13,13 @@ from mixpose.density.extraction_error import (
     log_likelihood,
     pooled,
 )
-from mixpose.density.features_met import AssociationRules, crowding, features_met, surplus
+from mixpose.density.features_met import (
+    AssociationRules,
+    FeaturesMet,
+    crowding,
+    features_met,
+    surplus,
+)
 from mixpose.density.grid import FAR, FLOOR, Density, Window
 from mixpose.density.observation import Observation, matched_atlas
 from mixpose.density.overlap import close_pairs, peak, self_overlap
@@ -25,6 +31,7 @@ __all__ = [
     "Atlas",
     "Density",
     "ErrorRules",
+    "FeaturesMet",
     "Noise",
     "Observation",
     "Offsets",

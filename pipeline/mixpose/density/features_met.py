@@ -77,6 +77,12 @@ class FeaturesMet(NamedTuple):
     partner: NDArray[np.intp]
     detections: NDArray[np.intp]
 
+    @classmethod
+    def none(cls, y: Floats) -> FeaturesMet:
+        """No feature of those at y (n, m)."""
+        n = len(y)
+        return cls(np.zeros(n), np.zeros(y.shape), np.arange(n), np.full(n, -1))
+
 
 def features_met(
     observation: Observation,
@@ -121,8 +127,7 @@ def features_met(
 
 def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:
     """Features met by the nearest detections, each taken once."""
-    shares, offsets = np.zeros(len(y)), np.zeros(y.shape)
-    detections = np.full(len(y), -1)
+    found = FeaturesMet.none(y)
     away = pattern.points - y[:, None]
     squared = (away * away).sum(axis=-1)
     near_i, near_j = np.nonzero(squared <= reach[:, None])
@@ -133,10 +138,10 @@ def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -
         if i not in met and j not in taken:
             met.add(i)
             taken.add(j)
-            shares[i] = weights[i]
-            offsets[i] = away[i, j]
-            detections[i] = j
-    return FeaturesMet(shares, offsets, np.arange(len(y)), detections)
+            found.shares[i] = weights[i]
+            found.offsets[i] = away[i, j]
+            found.detections[i] = j
+    return found
 
 
 def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:

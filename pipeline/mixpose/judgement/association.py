@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 from mixpose.density import (
     AssociationRules,
     ErrorRules,
+    FeaturesMet,
     Observation,
     crowding,
     features_met,
     surplus,
 )
-from mixpose.objective import MatchedObjective, in_image
+from mixpose.objective import Match, MatchedObjective, in_image
 from mixpose.records import PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
@@ -157,60 +158,72 @@ def associate(
     float
         The objective at the pose.
     """
-    at, sampled, over = objective.match(T_world_object[None])
+    match = objective.match(T_world_object[None])
     body = objective.projection.body
-    nodes = body.nodes
-    node_weights, world = nodes.weights, transform(T_world_object, nodes.points)
+    world = transform(T_world_object, body.nodes.points)
     spreads = body.node_spreads(T_world_object) if body.spread else None
-    found, value = [], 0.0
-    # beside detections the fit gives all features of a sensor one amplitude
-    unlike = all(view.observation.cell is not None for view in objective.views)
-    for k, view in enumerate(objective.views):
-        m, observation = int(objective.projection.dimensions[k]), view.observation
-        variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
-        features = np.flatnonzero(at.seen[k, 0])
-        y, weights = at.y[k, 0, features, :m], at.weights[k, 0, features]
-        J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
-        product, norm = float(weights @ C[:, 0]), float(over.norm[k, 0])
-        value += float(objective.weights[k, 0]) / energy * product**2 / norm
-        shares, offsets, merged = np.zeros(len(y)), np.zeros(y.shape), 0
-        detections = np.full(len(y), -1)
-        if product > 0:
-            a = product / norm
-            wide = in_image(spreads[features], J) if spreads is not None else np.zeros(len(y))
-            met = features_met(observation, y, weights, variance, C, a, rules, wide, unlike=unlike)
-            shares, offsets, detections = met.shares, met.offsets, met.detections
-            paired = met.partner != np.arange(len(y))
-            merged = int(np.count_nonzero(paired)) // 2
-            J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
-        sigma = math.sqrt(variance / 2)
-        # of grey values as many equal features as would give their energy
-        count, crowd = _crowd(observation, y, sigma, float(objective.tops[k, 0]) / energy, rules)
-        complete = np.count_nonzero(shares) == len(y)
-        found.append(
-            Association(
-                name=view.name,
-                explained=min(product**2 / (energy * norm), 1.0) if product > 0 else 0.0,
-                features=features,
-                shares=shares,
-                places=y,
-                offsets=offsets,
-                J=J,
-                expected=float(weights.sum()),
-                unseen=float(node_weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
-                sigma=sigma,
-                finest=observation.narrowest(narrowest, y),
-                crowd=crowd,
-                count=count,
-                detections=detections,
-                merged=merged,
-                surplus=0.0 if complete else surplus(observation, y, float(shares.sum()), rules),
-                by_calibration=by_calibration(view.doubts, world[features])
-                if view.doubts
-                else None,
-            )
-        )
+    value = float(objective.shares_of(match).sum())
+    found = [
+        _associated(objective, match, k, world, spreads, rules, narrowest)
+        for k in range(len(objective.views))
+    ]
     return found, value
+
+
+def _associated(
+    objective: MatchedObjective,
+    match: Match,
+    k: int,
+    world: Floats,
+    spreads: Floats | None,
+    rules: AssociationRules,
+    narrowest: float,
+) -> Association:
+    """The same of sensor k; the body's features are at `world` (N, 3), off by `spreads`."""
+    at, sampled, over = match
+    view, node_weights = objective.views[k], objective.projection.body.nodes.weights
+    m, observation = int(objective.projection.dimensions[k]), view.observation
+    variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
+    features = np.flatnonzero(at.seen[k, 0])
+    y, weights = at.y[k, 0, features, :m], at.weights[k, 0, features]
+    J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
+    product, norm = float(weights @ C[:, 0]), float(over.norm[k, 0])
+    if product > 0:
+        wide = in_image(spreads[features], J) if spreads is not None else np.zeros(len(y))
+        # beside detections the fit gives all features of a sensor one amplitude
+        unlike = all(one.observation.cell is not None for one in objective.views)
+        amplitude = product / norm
+        met = features_met(
+            observation, y, weights, variance, C, amplitude, rules, wide, unlike=unlike
+        )
+    else:
+        met = FeaturesMet.none(y)
+    paired = met.partner != np.arange(len(y))
+    if paired.any():
+        J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
+    sigma = math.sqrt(variance / 2)
+    # of grey values as many equal features as would give their energy
+    count, crowd = _crowd(observation, y, sigma, float(objective.tops[k, 0]) / energy, rules)
+    complete, total = np.count_nonzero(met.shares) == len(y), float(met.shares.sum())
+    return Association(
+        name=view.name,
+        explained=min(product**2 / (energy * norm), 1.0) if product > 0 else 0.0,
+        features=features,
+        shares=met.shares,
+        places=y,
+        offsets=met.offsets,
+        J=J,
+        expected=float(weights.sum()),
+        unseen=float(node_weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
+        sigma=sigma,
+        finest=observation.narrowest(narrowest, y),
+        crowd=crowd,
+        count=count,
+        detections=met.detections,
+        merged=int(np.count_nonzero(paired)) // 2,
+        surplus=0.0 if complete else surplus(observation, y, total, rules),
+        by_calibration=by_calibration(view.doubts, world[features]) if view.doubts else None,
+    )
 
 
 def _crowd(

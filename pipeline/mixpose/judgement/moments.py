@@ -108,20 +108,10 @@ def frames_of(
     information, vector = left.swapaxes(1, 2) @ left, (left.swapaxes(1, 2) @ r)[..., 0]
     markers = _of_markers(shift, J, r, left, split, inverse)
     kinds = slice(split), slice(split, None)
-    expected = np.zeros((frames, 4, 4))
     degrees = (shares * found.dimensions[:, None]).sum(axis=(1, 2)) - count
-    expected[:, 0, 0] = degrees
-    expected[:, 0, 3] = expected[:, 3, 0] = markers.once
-    expected[:, 3, 1:] = expected[:, 1:, 3] = markers.K
-    seen = np.zeros((frames, 4))
-    seen[:, 0], seen[:, 3] = (r * r).sum(axis=(1, 2)), markers.squares
+    of_errors = (r * r).sum(axis=(1, 2)), degrees
     by_fields = (fields.swapaxes(1, 2) @ r)[..., 0] ** 2
-    for i, a in enumerate(kinds):
-        seen[:, 1 + i] = by_fields[:, a].sum(axis=1)
-        own = information[:, a, a].trace(axis1=1, axis2=2)
-        expected[:, 0, 1 + i] = expected[:, 1 + i, 0] = own
-        for j, b in enumerate(kinds):
-            expected[:, 1 + i, 1 + j] = (information[:, a, b] ** 2).sum(axis=(1, 2))
+    moments = _moments(of_errors, by_fields, information, kinds, markers)
     of_fields = [drawn[..., kind] @ drawn[..., kind].swapaxes(1, 2) for kind in kinds]
     parts = np.stack([inverse, *of_fields, markers.part], axis=1)
     sizes = _sizes(np.sqrt(variances), axes)
@@ -130,7 +120,7 @@ def frames_of(
     doubts = _doubts(found, scale, J, inverse)
     return [
         Frame(
-            Moments(seen[k], expected[k]) if degrees[k] > 0 else Moments(),
+            moments[k] if degrees[k] > 0 else Moments(),
             parts[k],
             Lasting(names, information[k], vector[k] / sizes[k]),
             drawn[k] / sizes[k],
@@ -140,6 +130,29 @@ def frames_of(
         )
         for k in range(frames)
     ]
+
+
+def _moments(
+    of_errors: tuple[Floats, Floats],
+    by_fields: Floats,
+    information: Floats,
+    kinds: tuple[slice, slice],
+    markers: _OfMarkers,
+) -> list[Moments]:
+    """Moments of K frames, of errors (K,), of fields of two kinds (K, q), and of markers."""
+    frames = len(information)
+    seen, expected = np.zeros((frames, 4)), np.zeros((frames, 4, 4))
+    seen[:, 0], expected[:, 0, 0] = of_errors
+    seen[:, 3] = markers.squares
+    expected[:, 0, 3] = expected[:, 3, 0] = markers.once
+    expected[:, 3, 1:] = expected[:, 1:, 3] = markers.K
+    for i, a in enumerate(kinds):
+        seen[:, 1 + i] = by_fields[:, a].sum(axis=1)
+        own = information[:, a, a].trace(axis1=1, axis2=2)
+        expected[:, 0, 1 + i] = expected[:, 1 + i, 0] = own
+        for j, b in enumerate(kinds):
+            expected[:, 1 + i, 1 + j] = (information[:, a, b] ** 2).sum(axis=(1, 2))
+    return [Moments(*pair) for pair in zip(seen, expected)]
 
 
 def _in_noise(shift: Floats, found: Stacked) -> Floats:

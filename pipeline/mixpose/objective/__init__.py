@@ -5,6 +5,7 @@ from __future__ import annotations
 from mixpose.objective.amplitudes import AmplitudesObjective
 from mixpose.objective.base import Objective, Quadratic, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
+from mixpose.objective.kernel import Match
 from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 from mixpose.objective.projection import (
@@ -21,6 +22,7 @@ __all__ = [
     "AmplitudesObjective",
     "BodyProjection",
     "IndependentObjective",
+    "Match",
     "MatchedObjective",
     "Objective",
     "ObjectiveName",

@@ -94,13 +94,13 @@ class MatchedObjective:
         """
         parts = []
         for some in self._blocks(poses):
-            at, sampled, over = self.match(some)
-            norm = over.norm
+            match = self.match(some)
+            own = self.shares_of(match)
             if whole:
-                hidden = np.where(at.seen, 0.0, self.projection.body.nodes.weights)
-                norm = norm + self.tops * (hidden**2).sum(axis=2)
-            product = (sampled[..., 0] * at.weights).sum(axis=2)
-            parts.append(self.weights / self.energies * product**2 / norm)
+                hidden = np.where(match.at.seen, 0.0, self.projection.body.nodes.weights)
+                norm = match.over.norm
+                own = own * (norm / (norm + self.tops * (hidden**2).sum(axis=2)))
+            parts.append(own)
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
 
     def match(self, poses: Floats) -> Match:
@@ -110,6 +110,11 @@ class MatchedObjective:
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
         return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
+
+    def shares_of(self, match: Match) -> Floats:
+        """ω_l S_l (L, H), of what is predicted and found at some poses."""
+        product = (match.sampled[..., 0] * match.at.weights).sum(axis=2)
+        return np.asarray(self.weights / self.energies * product**2 / match.over.norm)
 
     def slopes(self, poses: Floats) -> Slopes:
         """Second-order models at poses (H, 4, 4)."""
