@@ -116,8 +116,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers/predicted.py",
-        "for one in data.predictions]",
-        "for one in data.predictions[:1]]",
+        "[*data.predictions, *beside]",
+        "[*data.predictions[:1], *beside]",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),
