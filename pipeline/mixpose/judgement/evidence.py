@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -126,6 +126,14 @@ class SensorMatches:
     by_world: Floats
     crowd: Floats
     count: Floats
+
+    def in_units_of(self, roots: Floats) -> SensorMatches:
+        """The same with noise of (H,) standard deviations in the place of σ_ε."""
+        r = roots[:, None, None]
+        crowd = self.crowd * roots ** self.offsets.shape[2]
+        return replace(
+            self, offsets=self.offsets / r, by_world=self.by_world / r[..., None], crowd=crowd
+        )
 
 
 class Odds(NamedTuple):

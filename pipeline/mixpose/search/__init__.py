@@ -8,6 +8,7 @@ Every guess is judged on all sensors, and the best descend through narrowing blu
 from __future__ import annotations
 
 from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
+from mixpose.search.refinement import Descent, Stage
 from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
 from mixpose.search.search import search_frame
 
@@ -15,9 +16,11 @@ __all__ = [
     "LIVE",
     "THOROUGH",
     "Candidate",
+    "Descent",
     "SearchBudget",
     "SearchReport",
     "SearchResult",
     "SearchState",
+    "Stage",
     "search_frame",
 ]

@@ -43,19 +43,21 @@ def evidence(
     at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
     parts = zip(seen, at.y, at.J, at.seen, strict=True)
     matches = [_matches_of(one, y, J, visible, gate) for one, y, J, visible in parts]
-    squares, coordinates, met = np.zeros((3, len(poses)))
-    for one in matches:
-        squares += (one.offsets**2).sum(axis=(1, 2))
-        found = one.shares.sum(axis=1)
-        coordinates += one.offsets.shape[2] * found
-        met += found / np.maximum(one.weights.sum(axis=1), 1.0) / len(matches)
-    spare = np.maximum(coordinates - free.sum(), 0.0)
+    found = np.array([one.shares.sum(axis=1) for one in matches])
+    met = found / np.maximum([one.weights.sum(axis=1) for one in matches], 1.0)
+    squares = np.array([(one.offsets**2).sum(axis=(1, 2)) for one in matches])
+    sizes = np.array([[one.offsets.shape[2]] for one in matches])
+    coordinates = (sizes * found).sum(axis=0)
+    # of each sensor: what one that is covered meets by chance tells nothing of the others
+    spare = found * sizes * np.maximum(1 - free.sum() / np.maximum(coordinates, 1.0), 0.0)
     degrees = _ERRORS.typical_degrees
     variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
-    odds = odds_of(matches, variance, np.full(len(poses), 2 * body.radius), _DETECTION)
+    matches = [one.in_units_of(np.sqrt(v)) for one, v in zip(matches, variance, strict=True)]
+    ones = np.ones(len(poses))
+    odds = odds_of(matches, ones, np.full(len(poses), 2 * body.radius), _DETECTION)
     unseen = np.count_nonzero(at.faced & ~at.seen, axis=(0, 2)) * _DETECTION.log_unseen
-    return paid_by_count(odds, matches, free) + unseen, met
+    return paid_by_count(odds, matches, free) + unseen, met.mean(axis=0)
 
 
 def _matches_of(

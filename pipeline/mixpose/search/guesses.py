@@ -30,7 +30,7 @@ def kinds_of_guesses(
 ) -> list[Kind]:
     """Kinds of guesses from rays, the quickest first.
 
-    Points in space; one such point and two rays; three rays of one camera.
+    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
 
     Returns
     -------
@@ -52,6 +52,8 @@ def kinds_of_guesses(
         kinds.append(partial(from_point_triples, found, body, budget, rng()))
         kinds.append(partial(from_point_and_rays, found, rays, gates, few, budget))
     kinds += [partial(from_three_rays, each, body.means, most, budget, rng()) for each in rays]
+    if len(rays) > 1 and sum(map(len, rays)) > budget.crowded * len(body) * len(rays):
+        kinds.append(kinds.pop(1))  # of the points tried, and of the rays near them, few are right
     return kinds
 
 

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.objective import MatchedObjective, matched_objective
+from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search.budget import DescentOptions
-from mixpose.search.detections import SensorDetections
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -37,11 +36,11 @@ class Stage:
 
 
 class Descent:
-    """Refines poses on the blurred detections of all sensors, which are drawn once per blur.
+    """Refines poses on the blurred observations of all sensors, which are drawn once per blur.
 
     Parameters
     ----------
-    detections : sequence of SensorDetections
+    views : sequence of View
     body : Body
     free : (6,) bool
         Directions that may change.
@@ -50,12 +49,12 @@ class Descent:
 
     def __init__(
         self,
-        detections: Sequence[SensorDetections],
+        views: Sequence[View],
         body: Body,
         free: NDArray[np.bool_],
         options: DescentOptions,
     ) -> None:
-        self._views = [each.view for each in detections]
+        self._views = views
         self._body = body
         self._free = free
         self._options = options

@@ -96,11 +96,12 @@ class _Run:
             self._images = label_images(detections, budget.gate, budget.labels)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         self._by_evidence = bool(self._images) and all(one.rays is not None for one in detections)
-        self._descent = Descent(detections, body, constraint.free, budget.descent)
+        seen = [one.view for one in detections]
+        self._descent = Descent(seen, body, constraint.free, budget.descent)
         few = sparse(body, budget.descent_features)
         self._quick_descent = self._descent
         if few is not body:
-            self._quick_descent = Descent(detections, few, constraint.free, budget.descent)
+            self._quick_descent = Descent(seen, few, constraint.free, budget.descent)
         self._poses = np.zeros((0, 4, 4))
         self._ranks, self._met = np.zeros(0), np.zeros(0)
         self.report = SearchReport()

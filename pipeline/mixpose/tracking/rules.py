@@ -26,7 +26,8 @@ class ProposalRules:
     drawn: int = constant(
         512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
     )
-    kept: int = constant(5, "of these, starts that are fitted")
+    kept: int = constant(5, "of these, starts that descend")
+    steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(
         3.0,
         "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "

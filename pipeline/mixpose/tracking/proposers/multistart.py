@@ -1,13 +1,12 @@
 """Several starts around a prediction, for frames where one descent does not convince.
 
 With clutter or hidden features the coarsest blurs can lead astray.  Poses drawn from the
-uncertainty of the guess are scored at a medium blur, all at once, and the best of them are worth
-a descent of their own.
+uncertainty of the guess are scored at a medium blur, and the best of them descend, all at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -17,6 +16,7 @@ from mixpose.fit import blur_schedule
 from mixpose.judgement import Judged
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb
+from mixpose.search import Descent, Stage
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
 
@@ -29,9 +29,22 @@ def multistart(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
         return
     first = data.predictions[0]
     wide = np.where(data.free, np.maximum(first.uncertainty, data.start_uncertainty), 0.0)
-    for T in starts_around(data, first.T_world_object, wide):
+    starts = starts_around(data, first.T_world_object, wide)
+    narrow = wide / data.rules.proposals.narrowing
+    for T in _descended(data, starts, narrow):
         if is_doubtful(data, ranked):
-            yield Start(T, wide / data.rules.proposals.narrowing)
+            yield Start(T, narrow / data.rules.proposals.narrowing)
+
+
+def _descended(data: FrameData, starts: Sequence[Floats], uncertainty: Floats) -> Floats:
+    """Poses (K, 4, 4) that starts lead to through narrowing blurs and that meet anything."""
+    rules, sigmas = data.rules.proposals, np.array(data.sigmas)
+    levels = blur_schedule(data.views, data.body, starts[0], uncertainty)
+    stages = [Stage(tuple(level / sigmas), rules.steps, len(starts)) for level in levels]
+    descent = Descent(data.views, data.body, data.free, data.rules.search.descent)
+    poses = descent.refine(np.array(starts), stages)
+    values = descent.objective().value(poses)
+    return poses[values > data.rules.fit.near * len(data.views)]
 
 
 def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
