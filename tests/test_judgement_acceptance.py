@@ -221,3 +221,20 @@ def test_two_cameras_of_which_one_sees_half_of_the_body_cover_three_quarters(
     objective = matched_objective(views, EIGHT, [1.5, 1.5])
     found, _ = associate(objective, TRUTH, AssociationRules())
     assert [one.coverage for one in found] == pytest.approx([1.0, 0.5])
+
+
+@pytest.mark.parametrize(("behind", "kept"), [(6.0, "fine"), (8.0, "bent")])
+def test_of_one_pose_residuals_as_before_are_likelier_than_larger_ones(
+    behind: float, kept: str
+) -> None:
+    # in either order, as a pose of another place never is
+    bent = replace(SURE, surplus=20.0, proposer="bent")
+    fine = replace(SURE, surplus=0.5, log_evidence=SURE.log_evidence - behind, proposer="fine")
+    for pair in ((bent, fine), (fine, bent)):
+        ranked: list[Judged] = []
+        for one in pair:
+            insert(ranked, one, SQUARE, ALL_FREE, RULES)
+        assert [one.proposer for one in ranked] == [kept]
+    ranked = [replace(fine, T_world_object=ELSEWHERE)]
+    insert(ranked, bent, SQUARE, ALL_FREE, RULES)
+    assert [one.proposer for one in ranked] == ["bent", "fine"]

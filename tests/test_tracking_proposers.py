@@ -27,6 +27,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
 from mixpose.tracking.proposers.merged_pair import merged_pair
+from mixpose.tracking.proposers.narrowed import narrowed
 
 Floats = NDArray[np.float64]
 
@@ -206,3 +207,56 @@ def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:
     # without noise the middle of two images is the image of both to far less than a pixel
     assert rotation_angle_deg(estimate.T_world_object, T) < 0.02
     assert rotation_angle_deg(bent.T_world_object, T) > 0.05
+
+
+def followed_to_cut_spots(
+    cameras: list[PinholeCamera], tracker: Tracker
+) -> tuple[Estimate, Floats]:
+    """A frame in which one of four spots in each camera is 1 px off, after six that are fine."""
+    step, track = np.array([0.3, -0.2, 0.1, 0.002, -0.001, 0.003]), tracker.begin()
+    for k in range(6):
+        T = perturb(TRUTH, k * step)
+        seen = detect(cameras, EIGHT, T, noise=0.03, seed=100 + k)
+        track, _ = tracker.advance(track, k, k / 30, seen)
+    T, rng, views = perturb(TRUTH, 6 * step), np.random.default_rng(1), []
+    for k, camera in enumerate(cameras):
+        y = camera.project(transform(T, EIGHT.means))[0] + rng.normal(0, 0.03, (8, 2))
+        y, off = y[:4] if k == 0 else y[2:6], rng.normal(size=2)
+        y[3 - k] += off / np.linalg.norm(off)
+        views.append(view_of(str(k), camera, y))
+    return tracker.advance(track, 6, 6 / 30, views)[1], T
+
+
+def test_cut_spots_are_left_behind_where_the_noise_is_known(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    estimate, T = followed_to_cut_spots(pinhole_cameras, tracker)
+    bent, _ = followed_to_cut_spots(pinhole_cameras, without(tracker, "narrowed"))
+    assert estimate.T_world_object is not None
+    assert bent.T_world_object is not None
+    assert estimate.proposer == "narrowed"
+    # six spots of 0.03 px leave 0.03 degrees; two that are 1 px off bend it by half a degree
+    assert rotation_angle_deg(estimate.T_world_object, T) < 0.1
+    assert rotation_angle_deg(bent.T_world_object, T) > 0.3
+
+
+def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # all spots of one camera are 1 px lower, which no pose makes up for, as where it is out of
+    # step: what the other sees alone is no better for it
+    tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
+    track = tracker.begin()
+    for k in range(6):
+        seen = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.03, seed=k)
+        track, _ = tracker.advance(track, k, k / 30, seen)
+    views = []
+    for k, camera in enumerate(pinhole_cameras):
+        y = camera.project(transform(TRUTH, EIGHT.means))[0]
+        views.append(view_of(str(k), camera, y + np.array([0.0, 1.0 * k])))
+    data = tracker.data(track, 6, 6 / 30, views)
+    likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
+    judged = likelihood.judge(likelihood.fit(start), start)
+    assert judged.surplus > 1
+    assert list(narrowed(data, likelihood, judged)) == []

@@ -12,6 +12,7 @@ from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
+from mixpose.tracking.proposers.narrowed import narrowed
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import without_sensor
@@ -92,6 +93,7 @@ SWITCHES = (
     Switch("no searched", without_proposer(searched)),
     Switch("no mirrored", without_proposer(mirrored)),
     Switch("no merged_pair", without_refinement(merged_pair)),
+    Switch("no narrowed", without_refinement(narrowed)),
     Switch("no without_sensor", without_refinement(without_sensor)),
     Switch("nothing merged", ruled("judgement.association", merged=False)),
     Switch("misses free", free_misses),

@@ -292,6 +292,13 @@ _JUDGE = (
         "a symmetric body jumps between poses that look the same",
     ),
     Mutant(
+        "judgement-any-noise-as-likely",
+        "judgement/acceptance.py",
+        "more = rules.unlike *",
+        "more = 0.0 *",
+        "a bent pose is likelier than one that leaves out the spots that are off",
+    ),
+    Mutant(
         "judgement-most-turned-twin",
         "judgement/judge.py",
         "alike[int(np.argmax(traces))]",

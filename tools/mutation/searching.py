@@ -90,6 +90,22 @@ _PROPOSALS = (
         (_PROPOSERS,),
     ),
     Mutant(
+        "tracking-narrow-fits-begin-wide",
+        "tracking/likelihood.py",
+        "blur=start.blur,",
+        "blur=1.0,",
+        "spots that are cut bend the pose although the noise is known",
+        (_PROPOSERS,),
+    ),
+    Mutant(
+        "tracking-narrow-fits-choose-a-sensor",
+        "tracking/proposers/narrowed.py",
+        "> len(offsets) / 2:",
+        "> len(offsets):",
+        "of sensors that are out of step the one that is right by itself is believed",
+        (_PROPOSERS,),
+    ),
+    Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers/stepped_aside.py",
         "yield Start(poses[1 + k], close, T_moved=data.moves_alike(T))",

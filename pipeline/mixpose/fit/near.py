@@ -122,6 +122,7 @@ def fit_near(
     finest: MatchedObjective | None = None,
     begun: Ascent[Floats] | None = None,
     climbed: list[Climbed] | None = None,
+    blur: float = 1.0,
     noise: Sequence[Noise] | None = None,
     beside: float = 0.0,
     errors: ErrorRules = ErrorRules(),
@@ -147,6 +148,8 @@ def fit_near(
     climbed : list of Climbed or None
         Fits to the same views and with the same noise; this one is added.  Where its ascent ends
         at σ_ε where one of theirs did, theirs is returned, the very same.
+    blur : float
+        In σ_ε, where the start is as close as that: what is coarser is left out.
     noise : sequence of Noise or None
         What is known of each view's noise, in σ_ε; None: nothing.
     beside : float
@@ -159,22 +162,23 @@ def fit_near(
     if options.objective != "matched":
         finest = None
     else:
-        finest = finest or matched_objective(views, body, [v.observation.sigma for v in views])
+        sigmas = [blur * view.observation.sigma for view in views]
+        finest = finest if finest and blur == 1 else matched_objective(views, body, sigmas)
     if finest and ascent is None and not has_likelihood(views):
         here = finest.linearise(T_start)
-        if here.value >= rules.near * len(views):
+        if blur < 1 or here.value >= rules.near * len(views):
             ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
     if ascent is None:
         ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
     at_sigma = ascent
-    if climbed is None or not finest or has_likelihood(views):
+    if climbed is None or not finest or has_likelihood(views) or blur < 1:
         climbed = []
     for one in climbed:
         if one.begins_at(at_sigma, rules):
             return one.fit
     if finest and any(view.observation.cell is None for view in views):
         known = noise or [Noise()] * len(views)
-        ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules)
+        ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules, blur)
     T, is_freed = ascent.state, False
     if finest and has_likelihood(views):
         T, is_freed = believed(finest, T, NormalPrior(T_start, uncertainty, free), rules.misfit)
@@ -247,11 +251,12 @@ def _to_the_noise(
     beside: float,
     errors: ErrorRules,
     rules: FitRules,
+    blur: float = 1.0,
 ) -> Ascent[Floats]:
-    """The ascent from σ_ε on, while offsets that are no noise of the detections move the pose."""
+    """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
     known = np.array([(one.squares, one.degrees) for one in noise]).T
     sigmas = np.array([view.observation.sigma for view in objective.views])
-    blurs, count = np.ones(len(sigmas)), int(free.sum())
+    blurs, count = np.full(len(sigmas), blur), int(free.sum())
     likeliest, best = -np.inf, ascent
     while True:
         met = _met(objective, ascent, sigmas, beside, errors)

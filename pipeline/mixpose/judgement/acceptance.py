@@ -54,6 +54,11 @@ class AcceptanceRules:
     as_evident: float = constant(
         0.01, "log odds by which the later of two poses that are one may be behind: it says more"
     )
+    unlike: float = constant(
+        6.9,
+        "log odds by which a pose may be behind one that is the same but for residuals larger than "
+        "those before let chance make them: one frame of 1000",
+    )
     listed: float = constant(0.001, "belief from which a pose stands among the hypotheses")
     widest_turn_deg: float = constant(
         15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
@@ -199,7 +204,9 @@ def insert(
     """Keep a list of distinct poses, the most evident first."""
     for k, old in enumerate(ranked):
         if _alike(old, new, body, free, rules):
-            if new.log_evidence > old.log_evidence - rules.as_evident:
+            # residuals as before are likelier than larger ones of fewer spots that are off
+            more = rules.unlike * ((new.surplus > 1) - int(old.surplus > 1))
+            if new.log_evidence > old.log_evidence + more - rules.as_evident:
                 ranked[k] = new
             break
     else:

@@ -68,6 +68,8 @@ class Judged:
         Of what was climbed, at the pose.
     lasting : (6, 6) float64
         Of the covariance, what lasts from frame to frame.
+    surplus : float
+        How many times larger its residuals are than those before let chance make them.
     bent : (6, 6) float64
         Covariance of the pose where features are off by all that the body's spreads let them be;
         zero of a body that is exact.
@@ -86,6 +88,7 @@ class Judged:
     proposer: str = ""
     value: float = 0.0
     lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    surplus: float = 0.0
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
 
@@ -186,6 +189,7 @@ def _judged(
         residuals=noise.remembered,
         associations=tuple(found),
         value=value,
+        surplus=noise.surplus,
         bent=bent,
     )
 

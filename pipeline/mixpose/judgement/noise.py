@@ -120,12 +120,15 @@ class FrameNoise:
         Of it, what lasts from frame to frame and leaves velocities alone.
     remembered : Residuals
         For the next frame.
+    surplus : float
+        How many times larger residuals are than those before them let chance make them.
     """
 
     variances: Floats
     covariance: Floats
     lasting: Floats
     remembered: Residuals
+    surplus: float
 
 
 def noises_of(
@@ -159,12 +162,15 @@ class _Level(NamedTuple):
         Squares and degrees of freedom that are remembered.
     degrees : float
         Of freedom, of all that was seen.
+    surplus : float
+        As `FrameNoise` has it.
     """
 
     seen: Floats
     scale: Floats
     told: Floats
     degrees: float
+    surplus: float
 
 
 def _level(
@@ -184,7 +190,7 @@ def _level(
     degrees = float(sums[1].sum())
     typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
     variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
-    return _Level(seen.variances, variances, told, degrees)
+    return _Level(seen.variances, variances, told, degrees, surplus)
 
 
 def _frame_noise(
@@ -214,7 +220,7 @@ def _frame_noise(
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
     kept = lasting.kept(before.lasting, model.fields)
     remembered = Residuals({**before.noise, **noise}, moments, kept)
-    return FrameNoise(level.seen, covariance, steady, remembered)
+    return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
 
 
 def joined_offsets(associations: Sequence[Association]) -> Offsets:

@@ -67,6 +67,8 @@ class Start:
         Sensors that are not to take part, and why.
     T_moved : (4, 4) float64 or None
         A pose that has moved as this one must have, and was as likely before the frame.
+    blur : float
+        In σ_ε, from which the fit goes on to narrower ones.
     """
 
     T_world_object: Floats
@@ -74,6 +76,7 @@ class Start:
     prediction: Prediction | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     T_moved: Floats | None = None
+    blur: float = 1.0
 
 
 class Likelihood(Protocol):
@@ -307,7 +310,8 @@ class MatchedLikelihood:
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
         climbed = self.climbed.setdefault(frozenset(start.left_out), [])
         timed, begun = is_timed(data.views), None
-        if data.begun and data.predictions and start.prediction is data.predictions[0]:
+        is_first = data.predictions and start.prediction is data.predictions[0]
+        if data.begun and is_first and start.blur == 1:
             begun = data.begun.ascent
             if data.begun.fit is not None:
                 return data.begun.fit
@@ -325,6 +329,7 @@ class MatchedLikelihood:
                 finest=seen.finest,
                 begun=begun,
                 climbed=None if timed else climbed,
+                blur=start.blur,
                 noise=seen.noise,
                 beside=max(beside, given),
                 errors=seen.rules.judgement.noise.errors,

@@ -41,6 +41,9 @@ class ProposalRules:
         "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
         "been met anywhere: five features by two cameras, where three always lie alike",
     )
+    blurs: tuple[float, ...] = constant(
+        (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
+    )
     believed: int = constant(
         3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
     )

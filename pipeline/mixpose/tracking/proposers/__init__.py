@@ -14,6 +14,7 @@ from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
+from mixpose.tracking.proposers.narrowed import narrowed
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
 from mixpose.tracking.proposers.stepped_aside import stepped_aside
@@ -41,4 +42,4 @@ class Refinement(Protocol):
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, stepped_aside, mirrored)
-REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, narrowed)
