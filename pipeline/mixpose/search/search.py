@@ -102,6 +102,9 @@ class _Run:
         self._quick_descent = self._descent
         if few is not body:
             self._quick_descent = Descent(seen, few, constraint.free, budget.descent)
+        plan = budget.descent_plan if self._by_evidence else budget.wide_plan
+        self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
+        self._explainable = sum(min(image.count, len(body)) for image in self._images)
         self._poses = np.zeros((0, 4, 4))
         self._ranks, self._met = np.zeros(0), np.zeros(0)
         self.report = SearchReport()
@@ -185,8 +188,7 @@ class _Run:
         """
         if len(self._detections) > 1 and self._is_beyond_doubt():
             best = self._poses[self._ranks.argmax()]
-            explainable = sum(min(image.count, len(self._body)) for image in self._images)
-            explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
+            explained = int(self._count(self._body, best[None])[0]) / max(self._explainable, 1)
             return max(self._coverage(), explained) >= self._budget.sufficient
         return self._coverage() >= self._budget.convincing
 
@@ -205,11 +207,8 @@ class _Run:
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
-        budget, count = self._budget, len(self._detections)
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        plan = budget.descent_plan if self._by_evidence else budget.wide_plan
-        stages = [Stage((factor,) * count, steps, budget.survivors) for factor, steps in plan]
-        return self._quick_descent.refine(guesses, stages) if len(guesses) else guesses
+        return self._quick_descent.refine(guesses, self._stages) if len(guesses) else guesses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""
@@ -237,7 +236,7 @@ class _Run:
             best = float(ranks.max(initial=0.0))
             improved = best > budget.improvement * checked + 1
             checked = best if improved else checked
-            if improved and self._is_found(poses[: budget.checked]):
+            if improved and self._is_found(poses[: budget.checked], best):
                 rest = slice(budget.checked, budget.checked + budget.finalists)
                 poses, ranks = poses[rest], ranks[rest]
                 break
@@ -259,11 +258,24 @@ class _Run:
         self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
 
-    def _is_found(self, guesses: Floats) -> bool:
-        """Whether the best guesses of several cameras leave no need for others."""
-        if not self._by_evidence or len(self._detections) < 2:
+    def _is_found(self, guesses: Floats, explained: float) -> bool:
+        """Whether the best guesses of several cameras leave no need for others.
+
+        At the first blur already, unless few of their detections are explained.
+        """
+        budget, free, count = self._budget, self._constraint.free, len(self._detections)
+        if not self._by_evidence or count < 2:
             return False
-        if self._judged(guesses)[0].max() < self._budget.hopeless:
+        if explained < budget.sufficient * self._explainable and (
+            self._judged(guesses)[0].max() < budget.hopeless
+        ):
             return False
-        self._keep(self._descended(guesses))
-        return self._is_beyond_doubt() and self._is_settled()
+        self.report = replace(self.report, refined=self.report.refined + len(guesses))
+        before = self._poses, self._ranks, self._met
+        for stage in self._stages:
+            guesses = self._quick_descent.refine(guesses, [stage])
+            self._poses, self._ranks, self._met = before
+            self._keep(guesses)
+            if self._is_beyond_doubt() and self._is_settled():
+                return True
+        return False
