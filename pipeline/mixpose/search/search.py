@@ -186,11 +186,15 @@ class _Run:
         Where the evidence of several cameras is beyond doubt, only a pose that explains most of
         the detections could still be better.
         """
-        if len(self._detections) > 1 and self._is_beyond_doubt():
-            best = self._poses[self._ranks.argmax()]
-            explained = int(self._count(self._body, best[None])[0]) / max(self._explainable, 1)
-            return max(self._coverage(), explained) >= self._budget.sufficient
-        return self._coverage() >= self._budget.convincing
+        budget, coverage = self._budget, self._coverage()
+        if coverage >= budget.convincing:
+            return True
+        if len(self._detections) < 2 or not self._is_beyond_doubt():
+            return False
+        best = self._poses[self._ranks.argmax()]
+        return coverage >= budget.sufficient or (
+            int(self._count(self._body, best[None])[0]) >= budget.sufficient * self._explainable
+        )
 
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
@@ -259,23 +263,13 @@ class _Run:
         return poses
 
     def _is_found(self, guesses: Floats, explained: float) -> bool:
-        """Whether the best guesses of several cameras leave no need for others.
-
-        At the first blur already, unless few of their detections are explained.
-        """
-        budget, free, count = self._budget, self._constraint.free, len(self._detections)
-        if not self._by_evidence or count < 2:
+        """Whether the best guesses of several cameras leave no need for others."""
+        budget = self._budget
+        if not self._by_evidence or len(self._detections) < 2:
             return False
         if explained < budget.sufficient * self._explainable and (
             self._judged(guesses)[0].max() < budget.hopeless
         ):
             return False
-        self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        before = self._poses, self._ranks, self._met
-        for stage in self._stages:
-            guesses = self._quick_descent.refine(guesses, [stage])
-            self._poses, self._ranks, self._met = before
-            self._keep(guesses)
-            if self._is_beyond_doubt() and self._is_settled():
-                return True
-        return False
+        self._keep(self._descended(guesses))
+        return self._is_beyond_doubt() and self._is_settled()
