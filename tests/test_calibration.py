@@ -28,7 +28,7 @@ from simulated_rigs import (
 from mixpose.calibration import CalibrationRules, Residual, Rig, SeenFrame, calibrate
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.checking import displacements
-from mixpose.calibration.choice import held_back
+from mixpose.calibration.choice import held_back_with
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import interpolate, neighbours
 from mixpose.calibration.matching import clock_of, match
@@ -61,8 +61,8 @@ def test_a_camera_off_by_2_degrees_and_20_mm_that_is_7_ms_late_is_put_right() ->
     assert (found.deviations > 0).all()
     assert found.deviations[6] < 0.1e-3
     assert found.noise == pytest.approx(0.02, rel=0.2)
-    assert found.residuals[1].held_after < 0.05 < found.residuals[1].held_before
-    assert len(found.held) == 8
+    assert found.residuals[1].held < 0.05 < found.residuals[1].before
+    assert len(found.used) == 40
 
 
 def test_marker_coordinates_2_mm_off_are_learnt_up_to_the_gauge() -> None:
@@ -124,7 +124,7 @@ def test_a_residual_that_rises_in_frames_held_back_is_told() -> None:
     found = calibrate(task_of(sensors, frames), found=alone(sensors, frames))
     assert found.certainty > 0.98  # features are 1 px apart at least, detections good to 0.05 px
     assert doubts_of(found, "mm") == []
-    rising = replace(found, residuals={1: Residual(9.0, 0.05, 9.0, 0.08)}, certainty=0.6)
+    rising = replace(found, residuals={1: Residual(9.0, 0.05, 0.08)}, certainty=0.6)
     assert [text[:8] for text in doubts_of(rising, "mm")] == ["40 % of ", "s1: the "]
 
 
@@ -225,11 +225,11 @@ def test_motion_between_frames_is_cubic() -> None:
     assert there.known.all()
 
 
-def test_every_fifth_frame_is_held_back_or_every_fifth_run() -> None:
+def test_every_fifth_frame_is_held_back_together_or_every_fifth_run() -> None:
     rules = CalibrationRules()
-    assert held_back(40, rules, runs=False).sum() == 8
-    assert held_back(4, rules, runs=False).sum() == 0
-    in_runs = np.flatnonzero(held_back(40, rules, runs=True))
+    assert np.bincount(held_back_with(40, rules, runs=False)).tolist() == [8] * 5
+    assert (held_back_with(4, rules, runs=False) == -1).all()
+    in_runs = np.flatnonzero(held_back_with(40, rules, runs=True) == 2)
     assert in_runs.tolist() == [8, 9, 10, 11, 28, 29, 30, 31]
 
 

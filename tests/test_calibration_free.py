@@ -50,7 +50,7 @@ def test_of_a_lens_what_a_small_body_tells_is_found_and_the_rest_refused() -> No
     off = found.after.sensors[1].distortion - LENS  # type: ignore[attr-defined]
     assert known.sum() >= 3
     assert (np.abs(off)[known] < 3 * told[known] + 0.02).all()  # beside what stays as it was
-    assert found.residuals[1].held_after < 0.03  # of 0.02 px in two coordinates
+    assert found.residuals[1].held < 0.03  # of 0.02 px in two coordinates
     assert all("s1:distortion" in text for text in found.refused)
 
 

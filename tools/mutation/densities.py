@@ -22,8 +22,8 @@ _ATLAS = (
     Mutant(
         "density-normalised-by-two-pi",
         "density/atlas.py",
-        "(math.sqrt(2 * np.pi) * width) ** -dimensions",
-        "(2 * np.pi * width) ** -dimensions",
+        "(math.sqrt(2 * np.pi) * w) ** -m",
+        "(2 * np.pi * w) ** -m",
         "ranges and images weigh otherwise than they should",
     ),
     Mutant(
@@ -36,8 +36,8 @@ _ATLAS = (
     Mutant(
         "density-look-up-blurs-once-more",
         "density/atlas.py",
-        "self._sigma = math.sqrt(steps_per_sigma**2 - _SPLINE)",
-        "self._sigma = steps_per_sigma",
+        "self._sigma = math.sqrt(n**2 - _SPLINE)",
+        "self._sigma = n",
         "peaks of densities are too low by what a spline blurs",
     ),
     Mutant(
@@ -57,8 +57,8 @@ _ATLAS = (
     Mutant(
         "density-pages-on-one-side-only",
         "density/atlas.py",
-        "(index[where] * (1.0 / self.plane.page) - 0.5)",
-        "(index[where] * (1.0 / self.plane.page))",
+        "self._squares_of(index - 0.5 * self.plane.page)",
+        "self._squares_of(index)",
         "a fit that goes on by a pixel draws its densities twice",
     ),
     Mutant(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.calibration.bundle import Bundle, Rows, normal_equations, rows_of, solved, stepped
 from mixpose.calibration.matching import Pairs, feature_spacing, match, nearest_distance
@@ -24,6 +25,7 @@ GaugeOf = Callable[[Rig], Floats]
 Weighted = tuple[int, Pairs, Rows, Floats]
 
 _MOST_BLURS = 40
+_UNKNOWN = 0.1  # of a parameter's squared length along directions that are not determined
 _SHARPEST = 1e-3  # of σ_ε: residuals of data without any noise
 _BLUNTEST = 2.0  # of σ_ε, which is the largest error of the extraction
 
@@ -55,6 +57,11 @@ class Adjusted:
     unknown: Floats
     weighted: tuple[tuple[Pairs, Floats, Floats], ...]
     inflation: float
+
+    @property
+    def undetermined(self) -> NDArray[np.bool_]:
+        """Parameters (G,) of which data tell nothing."""
+        return np.asarray((self.unknown**2).sum(axis=1) > _UNKNOWN)
 
     @property
     def certainty(self) -> float:

@@ -14,7 +14,6 @@ from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse
 from mixpose.sensors import Sensor
-from mixpose.threads import one_blas_thread
 from mixpose.tracking import Tracker
 
 _LEAST = 4  # detections: three leave four poses of any triangle
@@ -63,8 +62,7 @@ def hypotheses(
     pattern = PointPattern(points, np.ones(len(points)))
     views = [View(name, own, Observation(pattern, sigma))]
     tracker = Tracker.create(body, EstimatorOptions())
-    with one_blas_thread():
-        ranked = tracker.ranked(tracker.data(tracker.begin(), 0, None, views))
+    ranked = tracker.ranked(tracker.data(tracker.begin(), 0, None, views))
     best = ranked[0].log_evidence if ranked else 0.0
     kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
     kept = kept[: rules.hypotheses]

@@ -98,11 +98,13 @@ def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) 
     """Residuals and Jacobians of one sensor."""
     eye = rig.sensors[sensor]
     tau = bundle.clock.tau(rig, sensor, pairs.frame)
-    between = interpolate(bundle.clock.near, poses, pairs.frame, tau)
-    late = bool(tau.any())
-    at = poses[pairs.frame]
-    if late:
-        at = perturb(at, between.twist)
+    at, n = poses[pairs.frame], len(tau)
+    timed = any(b.sensor == sensor and b.kind in ("delay", "drift") for b in bundle.blocks)
+    rate, shares, known = np.zeros((n, 6)), np.eye(1, 4).repeat(n, axis=0), np.ones(n, np.bool_)
+    if timed or tau.any():
+        between = interpolate(bundle.clock.near, poses, pairs.frame, tau)
+        at, rate, shares = perturb(at, between.twist), between.rate, between.shares
+        known = between.known | (np.abs(tau) < 1e-9)
     arms = np.einsum("nij,nj->ni", at[:, :3, :3], rig.points[pairs.feature])
     world = arms + at[:, :3, 3]
     y, by_world, visible = eye.linearise(world)
@@ -115,19 +117,17 @@ def rows_of(bundle: Bundle, rig: Rig, poses: Floats, sensor: int, pairs: Pairs) 
         elif block.sensor != sensor:
             continue
         elif block.kind in ("delay", "drift"):
-            J = np.einsum("nmk,nk->nm", by_pose, between.rate)[..., None]
+            J = np.einsum("nmk,nk->nm", by_pose, rate)[..., None]
             if block.kind == "drift":
                 J = J * bundle.clock.since[sensor, pairs.frame][:, None, None]
             by_rig.append((block, J))
         else:
             by_rig.append((block, by_parameters(eye, block.kind, world, by_world)))
-    shares = between.shares if late else np.eye(1, 4).repeat(len(tau), axis=0)
-    known = visible & (between.known | (np.abs(tau) < 1e-9))
     nodes = bundle.clock.near.nodes[pairs.frame]
     by_held = np.zeros((*y.shape, 0))
     if sensor in bundle.errors:
         by_held = by_calibration(doubted(eye, bundle.errors[sensor]), world)
-    return Rows(pairs.y - y, by_pose, shares, nodes, by_rig, by_point, by_held, known)
+    return Rows(pairs.y - y, by_pose, shares, nodes, by_rig, by_point, by_held, known & visible)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,36 +182,26 @@ def normal_equations(
     edges = G + np.cumsum([0] + [each.by_held.shape[2] for _, _, each, _ in rows])
     Q = int(edges[-1])  # parameters that are free and that are held
     H_gg, b_g = np.zeros((Q, Q)), np.zeros(Q)
-    pieces: list[sp.csr_matrix] = []
+    W, b_p, H_pp = np.zeros((P, Q)), np.zeros(P), sp.csr_matrix((P, P))
     for (_, pairs, each, weight), start, stop in zip(rows, edges, edges[1:]):
-        n, m = each.residual.shape
         root = np.sqrt(weight)
-        A = _rig_columns(bundle, pairs, each, Q) * root[:, None, None]
-        A[:, :, start:stop] = each.by_held * root[:, None, None]
-        r = each.residual * root[:, None]
+        A = _rig_columns(bundle, pairs, each, Q)
+        A[:, :, start:stop] = each.by_held
+        A = (A * root[:, None, None]).reshape(each.residual.size, Q)
+        r = (each.residual * root[:, None]).ravel()
+        H_gg += A.T @ A
+        b_g += A.T @ r
         if P:
             B = _pose_columns(each, root, free, P)
-            flat = A.reshape(n * m, Q)
-            pieces.append(sp.hstack([sp.csr_matrix(flat), B, sp.csr_matrix(r.reshape(-1, 1))]))
-        else:
-            flat = A.reshape(n * m, Q)
-            H_gg += flat.T @ flat
-            b_g += flat.T @ r.ravel()
+            H_pp, W, b_p = H_pp + B.T @ B, W + B.T @ A, b_p + B.T @ r
     if not P:
-        none = np.zeros((0, G))
-        return Normal(H_gg[:G, :G], H_gg[:G, G:], b_g[:G], np.zeros(0), None, none)
-    J = sp.vstack(pieces).tocsc()
-    H = (J.T @ J).tocsc()
-    H_pp = H[Q : Q + P, Q : Q + P].tocsc()
+        return Normal(H_gg[:G, :G], H_gg[:G, G:], b_g[:G], b_p, None, W[:, :G])
     diagonal = H_pp.diagonal()
     floor = 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-30)
-    H_pp = H_pp + sp.diags(damping * diagonal + floor)
-    factor = splu(H_pp.tocsc())
-    W = H[Q : Q + P, :Q].toarray()
-    b_p = H[Q : Q + P, -1].toarray()[:, 0]
+    factor = splu((H_pp + sp.diags(damping * diagonal + floor)).tocsc())
     X = factor.solve(np.column_stack([W[:, :G], b_p]))
-    S = H[:Q, :G].toarray() - W.T @ X[:, :-1]
-    b = H[:G, -1].toarray()[:, 0] - W[:, :G].T @ X[:, -1]
+    S = H_gg[:, :G] - W.T @ X[:, :-1]
+    b = b_g[:G] - W[:, :G].T @ X[:, -1]
     return Normal((S[:G] + S[:G].T) / 2, S[G:].T, b, b_p, factor, W[:, :G])
 
 

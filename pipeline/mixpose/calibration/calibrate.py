@@ -11,14 +11,19 @@ from numpy.typing import NDArray
 from mixpose.calibration.adjust import Adjusted, GaugeOf, adjust, moved_by_held
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.bundle import Bundle
-from mixpose.calibration.choice import held_back
+from mixpose.calibration.choice import held_back_with
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import neighbours
 from mixpose.calibration.latecomers import placed
-from mixpose.calibration.linking import mean_motion
 from mixpose.calibration.matching import clock_of
-from mixpose.calibration.residuals import explained_share, met_share, residuals_of, sights_of
+from mixpose.calibration.residuals import (
+    explained_share,
+    met_share,
+    rms,
+    sights_of,
+    squared_residuals,
+)
 from mixpose.calibration.result import Calibration, Residual
 from mixpose.calibration.rig import Block, Rig, blocks_of, centre_of
 from mixpose.calibration.rules import CalibrationRules
@@ -26,10 +31,13 @@ from mixpose.calibration.start import Start, searched, start_from_cameras, start
 from mixpose.calibration.task import Known, Progress, Task, silent
 from mixpose.errors import RecordingError
 from mixpose.records import Floats
-from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import CalibrationError, RangeSensor
+from mixpose.threads import one_blas_thread
+
+_STAGES = 8  # of a calibration, for progress
 
 
+@one_blas_thread()
 def calibrate(
     task: Task,
     rules: CalibrationRules = CalibrationRules(),
@@ -63,7 +71,8 @@ def calibrate(
             "calibrate: found the body in no frame; allowed: a recording in which `mixpose "
             "check` finds its features"
         )
-    off = best[1].noise / task.sigmas
+    run = best[1]
+    off = run.found.noise / task.sigmas
     if (off >= rules.failed).any():
         name = task.rig.names[int(np.argmax(off))]
         raise RecordingError(
@@ -71,13 +80,13 @@ def calibrate(
             "as if by chance; allowed: less than 1.9 times: a session whose sensors stand nearer "
             "to where they are, or a larger extract.sigma where detections err by that much"
         )
-    return best[1]
+    return replace(run.found, residuals=run.residuals())
 
 
 def _from_cameras(
     task: Task, known: Known, rules: CalibrationRules, progress: Progress
-) -> tuple[int, Calibration] | None:
-    """The calibration from what cameras know alone, and again without those it misplaced.
+) -> tuple[int, _Run] | None:
+    """The run from what cameras know alone, and again without those it misplaced.
 
     What these know alone may have linked them wrongly; they are placed by the poses that the others
     tell then.
@@ -85,12 +94,12 @@ def _from_cameras(
     best = _best(task, [start_from_cameras(task, known, rules)], rules, progress)
     if best is None or task.known is not None:
         return best
-    wrong = {s for s in best[1].doubtful(rules) if "pose" in task.free.get(s, ())}
+    wrong = {s for s in best[1].found.doubtful(rules) if "pose" in task.free.get(s, ())}
     if not wrong or len(wrong) + 1 > len(task.cameras):
         return best
     others = {key: one for key, one in known.items() if key[1] not in wrong}
     again = _best(task, [start_from_cameras(task, others, rules)], rules, progress)
-    return max(best, again or best, key=lambda one: float(np.nansum(one[1].explained)))
+    return max(best, again or best, key=lambda one: float(np.nansum(one[1].found.explained)))
 
 
 def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> CalibrationRules:
@@ -105,14 +114,15 @@ def _probed(task: Task, rules: CalibrationRules, progress: Progress) -> Calibrat
 
 def _best(
     task: Task, starts: Iterable[Start], rules: CalibrationRules, progress: Progress
-) -> tuple[int, Calibration] | None:
-    """Number and calibration of the first start that tells features apart, else of the best."""
-    best: tuple[tuple[bool, float], int, Calibration] | None = None
+) -> tuple[int, _Run] | None:
+    """Number and run of the first start that tells features apart, else of the best."""
+    best: tuple[tuple[bool, float], int, _Run] | None = None
     for number, start in enumerate(starts):
         if not len(start.poses):
             continue
-        one = _Run(task, start, rules, progress).result()
-        worth = (bool((one.noise < rules.failed * task.sigmas).all()), one.certainty)
+        one = _Run(task, start, rules, progress)
+        fits = bool((one.found.noise < rules.failed * task.sigmas).all())
+        worth = (fits, one.found.certainty)
         if best is None or worth > best[0]:
             best = (worth, number, one)
         if worth >= (True, rules.certain):
@@ -131,18 +141,6 @@ class _Part:
         kept = np.flatnonzero(mask)
         return _Part(tuple(self.frames[k] for k in kept), self.poses[kept])
 
-    def carried(self, before: Floats, after: Floats) -> _Part:
-        """Poses moved as those of other frames were on average: the rig carries them along."""
-        centre = from_parts(np.eye(3), before[:, :3, 3].mean(axis=0))
-        motions = inverse(centre) @ after @ inverse(before) @ centre
-        return replace(self, poses=centre @ mean_motion(motions) @ inverse(centre) @ self.poses)
-
-    def joined(self, other: _Part) -> _Part:
-        frames = self.frames + other.frames
-        order = sorted(range(len(frames)), key=lambda k: frames[k].number)
-        poses = np.concatenate([self.poses, other.poses])
-        return _Part(tuple(frames[k] for k in order), poses[order])
-
 
 def _left_out(part: _Part, good: NDArray[np.bool_]) -> list[int]:
     """Numbers of bad frames; none where all are: then no sensor was placed yet."""
@@ -150,7 +148,13 @@ def _left_out(part: _Part, good: NDArray[np.bool_]) -> list[int]:
 
 
 class _Run:
-    """One calibration: what stays the same during it."""
+    """One calibration from a start.
+
+    Attributes
+    ----------
+    found : Calibration
+        Without residuals.
+    """
 
     def __init__(
         self, task: Task, start: Start, rules: CalibrationRules, progress: Progress
@@ -166,6 +170,7 @@ class _Run:
         free = {s: kinds for s, kinds in task.free.items() if s not in start.unlinked}
         self._task = replace(task, free=free)
         self._blocks = self._laid_out()
+        self.found = self._result()
 
     def _laid_out(self) -> tuple[Block, ...]:
         return blocks_of(
@@ -176,40 +181,56 @@ class _Run:
             interval=self._interval,
         )
 
-    def result(self) -> Calibration:
-        """Do it all."""
-        task, rules = self._task, self._rules
-        everything = _Part(self._start.frames, self._start.poses)
-        mask = held_back(len(everything.poses), rules, runs=task.times_matter)
-        training = everything.only(~mask)
-        self._progress("adjusting all sensors together", 0, 4)
-        adjusted = self._adjusted(training, self._start.rig, None)
-        good = met_share(adjusted, training.frames, task) > rules.least_met
-        held = everything.only(mask).carried(training.poses, adjusted.poses)
-        bad = _left_out(training, good)
+    def _result(self) -> Calibration:
+        """The calibration, but for its residuals."""
+        rules, part = self._rules, _Part(self._start.frames, self._start.poses)
+        self._progress("adjusting all sensors together", 0, _STAGES)
+        adjusted = self._adjusted(part, self._start.rig, None)
+        good = met_share(adjusted, part.frames, self._task) > rules.least_met
+        bad = _left_out(part, good)
         if bad:
-            training = _Part(training.frames, adjusted.poses).only(good)
-            self._progress("adjusting without bad frames", 1, 4)
-            adjusted = self._adjusted(training, adjusted.rig, rules.blur * adjusted.noise * 2)
-        self._place_latecomers(training, adjusted)
-        self._progress("looking at the frames held back", 2, 4)
-        held_fit = None
-        if len(held.poses):
-            held_fit = self._posed(held, adjusted.rig)
-            good = met_share(held_fit, held.frames, task) > rules.least_met
-            bad += _left_out(held, good)
-            held = _Part(held.frames, held_fit.poses).only(good)
-            held_fit = self._posed(held, adjusted.rig, adjusted.noise) if good.any() else None
-        training = _Part(training.frames, adjusted.poses)
-        told = self._residuals(training, adjusted, held, held_fit)
-        if held_fit is not None or self._late:
-            self._progress("adjusting with all frames", 3, 4)
-            if held_fit is not None:
-                training = training.joined(_Part(held.frames, held_fit.poses))
-            training, rig = self._completed(training, adjusted.rig)
-            adjusted = self._adjusted(training, rig, rules.blur * adjusted.noise * 2)
-        numbers = tuple(f.number for f in held.frames) if held_fit is not None else ()
-        return self._told(training, adjusted, numbers, told, sorted(bad))
+            part = _Part(part.frames, adjusted.poses).only(good)
+            self._progress("adjusting without bad frames", 1, _STAGES)
+            adjusted = self._adjusted(part, adjusted.rig, self._again(adjusted))
+        part = replace(part, poses=adjusted.poses)
+        self._place_latecomers(part, adjusted)
+        if self._late:
+            self._progress("adjusting with cameras that came late", 2, _STAGES)
+            part, rig = self._completed(part, adjusted.rig)
+            adjusted = self._adjusted(part, rig, self._again(adjusted))
+            part = replace(part, poses=adjusted.poses)
+        self._part, self._best = part, adjusted
+        return self._told(part, adjusted, bad)
+
+    def residuals(self) -> dict[int, Residual]:
+        """Residuals before and after, and of every frame by a rig that was adjusted without it.
+
+        Matches are the same in all three, and poses are fitted to each rig.
+        """
+        part, best = self._part, self._best
+        folds = held_back_with(len(part.poses), self._rules, runs=self._task.times_matter)
+        sensors = range(len(self._task.rig.sensors))
+        bundle = self._bundle(part, ())
+        before = squared_residuals(bundle, self._task.rig, best)
+        after = squared_residuals(bundle, best.rig, best)
+        held: list[list[Floats]] = [[] for _ in sensors]
+        for fold in np.unique(folds[folds >= 0]):
+            self._progress("holding back a part of the frames", 3 + int(fold), _STAGES)
+            fit = self._adjusted(part.only(folds != fold), best.rig, self._again(best))
+            lost = {
+                block.sensor
+                for block in self._blocks
+                if (fit.undetermined & ~best.undetermined)[block.place].any()
+            }
+            found = squared_residuals(bundle, fit.rig, best)
+            for s in sensors:
+                if s not in lost:
+                    held[s].append(found[s][folds[best.weighted[s][0].frame] == fold])
+        return {s: Residual(rms([before[s]]), rms([after[s]]), rms(held[s])) for s in sensors}
+
+    def _again(self, adjusted: Adjusted) -> Floats:
+        """Blurs to begin with near what was adjusted before."""
+        return 2 * self._rules.blur * adjusted.noise
 
     def _place_latecomers(self, training: _Part, adjusted: Adjusted) -> None:
         """Place cameras that could not be linked by what they see alone."""
@@ -277,43 +298,10 @@ class _Run:
         gauge = self._gauge(part.poses)
         return adjust(bundle, rig, part.poses, gauge, self._task.sigmas, self._rules, blurs=blurs)
 
-    def _posed(self, part: _Part, rig: Rig, noise: Floats | None = None) -> Adjusted:
-        """Poses only, the rig as it is."""
-        bundle = self._bundle(part, ())
-        blurs = None if noise is None else 2 * self._rules.blur * noise
-        return adjust(
-            bundle,
-            rig,
-            part.poses,
-            lambda _: np.zeros((0, 0)),
-            self._task.sigmas,
-            self._rules,
-            blurs=blurs,
-            noise=noise,
-        )
-
-    def _residuals(
-        self, training: _Part, adjusted: Adjusted, held: _Part, held_fit: Adjusted | None
-    ) -> dict[int, Residual]:
-        """Residuals before and after, of frames that were calibrated from and held back."""
-        task = self._task
-        none = dict.fromkeys(range(len(task.rig.sensors)), float("nan"))
-        told = []
-        for part, fit in ((training, adjusted), (held, held_fit)):
-            if fit is None:
-                told += [none, none]
-                continue
-            bundle = self._bundle(part, ())
-            told.append(residuals_of(bundle, task.rig, fit.poses, fit))
-            told.append(residuals_of(bundle, adjusted.rig, fit.poses, fit))
-        return {s: Residual(*(each[s] for each in told)) for s in none}
-
     def _told(
         self,
         part: _Part,
         adjusted: Adjusted,
-        held: tuple[int, ...],
-        residuals: dict[int, Residual],
         bad: list[int],
     ) -> Calibration:
         task = self._task
@@ -332,10 +320,9 @@ class _Run:
             through=self._start.through,
             unlinked=tuple(s for s in self._start.unlinked if s not in self._late),
             used=tuple(numbers),
-            held=held,
-            bad=tuple(bad),
+            bad=tuple(sorted(bad)),
             recorded=len(task.frames),
-            residuals=residuals,
+            residuals={},
             noise=adjusted.noise,
             inflation=adjusted.inflation,
             certainty=adjusted.certainty,
@@ -370,5 +357,5 @@ def _determined(
         strongest = np.argsort(-np.abs(direction), kind="stable")[:3]
         parts = [labels[k] for k in strongest if abs(direction[k]) > 0.2]
         said.append(" with ".join(parts))
-    deviations[(adjusted.unknown**2).sum(axis=1) > 0.1] = np.inf
+    deviations[adjusted.undetermined] = np.inf
     return deviations, tuple(said)

@@ -31,7 +31,7 @@ class Displacement:
     turn_deviation_deg, shift_deviation : float
         One standard deviation of each.
     residual_before, residual_after : float
-        Sensor units, of the frames held back where there are any.
+        Sensor units; after, of frames that are held back where there are enough.
     moved : bool
     """
 
@@ -54,8 +54,7 @@ def displacements(found: Calibration, rules: CalibrationRules) -> tuple[Displace
         turn, shift = _apart(found.before, found.after, index, G)
         sd_turn, sd_shift = deviations[index]
         each = found.residuals[index]
-        before = each.held_before if np.isfinite(each.held_before) else each.before
-        after = each.held_after if np.isfinite(each.held_after) else each.after
+        before, after = each.before, each.held if np.isfinite(each.held) else each.after
         worse = bool(np.isfinite(before) and before > rules.worse * max(after, 1e-12))
         far = turn > rules.moved * sd_turn or shift > rules.moved * sd_shift
         told.append(

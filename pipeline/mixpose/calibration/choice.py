@@ -19,17 +19,16 @@ _FARTHEST = 2.5  # spreads from the middle: what lies beyond is as likely clutte
 _MEANS = 1e-3  # information before the first frame, of a descriptor's spread
 
 
-def held_back(count: int, rules: CalibrationRules, *, runs: bool) -> NDArray[np.bool_]:
-    """Which of `count` frames are held back: every fifth, or every fifth run of four."""
-    mask = np.zeros(count, dtype=np.bool_)
-    most = min(int(rules.held_back * count + 0.5), count - rules.least_frames)
-    if most < 1:
-        return mask
+def held_back_with(count: int, rules: CalibrationRules, *, runs: bool) -> NDArray[np.intp]:
+    """Which of `count` frames are held back together (count,): a fifth at a time; -1: never.
+
+    Every fifth frame, or every fifth run of four.
+    """
     period = round(1 / rules.held_back)
-    if runs and count >= _HELD_RUN * period:
-        return np.asarray((np.arange(count) // _HELD_RUN) % period == period // 2)
-    mask[period // 2 :: period] = True
-    return mask
+    if count - -(-count // period) < rules.least_frames:
+        return np.full(count, -1)
+    size = _HELD_RUN if runs and count >= _HELD_RUN * period else 1
+    return np.asarray((np.arange(count) // size) % period)
 
 
 def informative(

@@ -18,7 +18,6 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import TWIST_NAMES
-from mixpose.threads import one_blas_thread
 from mixpose.tracking import Tracker
 
 
@@ -48,10 +47,8 @@ def _tracked(task: Task, factor: float) -> Iterator[tuple[tuple[SeenFrame, Float
     tracker = Tracker.create(task.body, options, task.T_held, rotation_deg=turn, distance=distance)
     track = tracker.begin()
     for frame in task.frames:
-        with one_blas_thread():
-            track, estimate = tracker.advance(
-                track, frame.number, frame.time_s, _views(task, frame, factor)
-            )
+        views = _views(task, frame, factor)
+        track, estimate = tracker.advance(track, frame.number, frame.time_s, views)
         T = estimate.T_world_object
         yield None if T is None else (frame, T), estimate.status == "ok"
 

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mixpose.calibration.adjust import Adjusted
-from mixpose.calibration.bundle import Bundle, normal_equations, rows_of, solved, stepped
+from mixpose.calibration.bundle import Bundle, Rows, normal_equations, rows_of, solved, stepped
 from mixpose.calibration.frames import SeenFrame
+from mixpose.calibration.matching import Pairs
 from mixpose.calibration.result import Sights
 from mixpose.calibration.rig import Rig
 from mixpose.calibration.task import Task
@@ -16,40 +17,49 @@ from mixpose.records import Floats
 
 _MET = 0.05  # weight of a pair: 5 standard deviations off have 0.2
 _CLIMBS = 12
+_CLIMBED = 1e-6  # of the squared residuals: less gained, and poses are fitted
 
 
-def residuals_of(bundle: Bundle, rig: Rig, poses: Floats, adjusted: Adjusted) -> dict[int, float]:
-    """Root mean square residual of each sensor over the pairs that a calibration met.
+def squared_residuals(bundle: Bundle, rig: Rig, adjusted: Adjusted) -> list[Floats]:
+    """Squared residuals (n,) of each sensor's pairs under a rig; NaN of pairs that are not met.
 
-    Poses are fitted to the rig by least squares first, so that two rigs are held to the same.
+    Poses are fitted to the rig by least squares first, so that all rigs are held to the same.
 
     Parameters
     ----------
     bundle : Bundle
         Without parameters of the rig.
     rig : Rig
-    poses : (K, 4, 4) array
     adjusted : Adjusted
-        Which detection is which feature.
+        Where poses begin, and which detection is which feature.
     """
-    sensors = range(len(rig.sensors))
-    weights = [weight * (weight > _MET) for _, _, weight in adjusted.weighted]
+    poses = adjusted.poses
+    met = [weight > _MET for _, _, weight in adjusted.weighted]
+
+    def seen() -> list[tuple[int, Pairs, Rows, Floats]]:
+        rows = [rows_of(bundle, rig, poses, s, one[0]) for s, one in enumerate(adjusted.weighted)]
+        return [
+            (s, adjusted.weighted[s][0], each, met[s] * each.known / adjusted.noise[s] ** 2)
+            for s, each in enumerate(rows)
+        ]
+
+    rows, spent = seen(), np.inf
     for _ in range(_CLIMBS if bundle.pose_free.any() else 0):
-        rows = []
-        for s in sensors:
-            pairs = adjusted.weighted[s][0]
-            each = rows_of(bundle, rig, poses, s, pairs)
-            rows.append((s, pairs, each, (weights[s] > 0) * each.known / adjusted.noise[s] ** 2))
+        before, spent = spent, sum(float(w @ (e.residual**2).sum(axis=1)) for *_, e, w in rows)
+        if before - spent < _CLIMBED * spent:
+            break
         normal = normal_equations(bundle, len(poses), rows, 1e-6)
         step = solved(bundle, normal, np.zeros((0, 0)), len(poses))
         rig, poses = stepped(bundle, rig, poses, step)
-    found = {}
-    for s in sensors:
-        each = rows_of(bundle, rig, poses, s, adjusted.weighted[s][0])
-        mask = (weights[s] > 0) & each.known
-        squared = (each.residual**2).sum(axis=1)
-        found[s] = float(np.sqrt(squared[mask].mean())) if mask.any() else float("nan")
-    return found
+        rows = seen()
+    return [np.where(w > 0, (e.residual**2).sum(axis=1), np.nan) for *_, e, w in rows]
+
+
+def rms(squared: Sequence[Floats]) -> float:
+    """Root mean square of what is not NaN; NaN of nothing."""
+    flat = np.concatenate([np.zeros(0), *squared])
+    known = np.isfinite(flat)
+    return float(np.sqrt(flat[known].mean())) if known.any() else float("nan")
 
 
 def met_share(adjusted: Adjusted, frames: Sequence[SeenFrame], task: Task) -> Floats:

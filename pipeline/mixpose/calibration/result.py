@@ -21,15 +21,14 @@ class Residual:
     Attributes
     ----------
     before, after : float
-        Of the frames that were calibrated from first, with the calibration before and after.
-    held_before, held_after : float
-        Of the frames held back meanwhile.
+        With the calibration before and after.
+    held : float
+        Of every frame, with the calibration that the others tell: that of new data.
     """
 
     before: float
     after: float
-    held_before: float
-    held_after: float
+    held: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +69,8 @@ class Calibration:
         Freedoms of the rig that were removed.
     through : mapping of int to (int or None, int)
     unlinked : tuple of int
-    used, held, bad : tuple of int
-        Frame numbers: calibrated from in the end; held back until the residuals were taken, and
-        part of `used` then; left out as bad.
+    used, bad : tuple of int
+        Frame numbers: calibrated from; left out as bad.
     recorded : int
         Frames of the recording with detections.
     residuals : mapping of int to Residual
@@ -102,7 +100,6 @@ class Calibration:
     through: Mapping[int, tuple[int | None, int]]
     unlinked: tuple[int, ...]
     used: tuple[int, ...]
-    held: tuple[int, ...]
     bad: tuple[int, ...]
     recorded: int
     residuals: Mapping[int, Residual]

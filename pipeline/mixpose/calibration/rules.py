@@ -47,7 +47,9 @@ class CalibrationRules:
     shift: float = constant(0.12, "of the distance to the body, likewise: depth errs most")
     seeds: int = constant(600, "relative poses that are tried as the middle of all others")
     least_link: int = constant(2, "frames that must agree on where two sensors stand")
-    held_back: float = constant(0.2, "of the frames, whose residual is that of unseen data")
+    held_back: float = constant(
+        0.2, "of the frames at a time, each once: their residual is that of unseen data"
+    )
     least_frames: int = constant(4, "left to calibrate from, else none is held back")
     most_read: int = constant(720, "frames read: a longer recording is thinned out evenly")
     most_candidates: int = constant(

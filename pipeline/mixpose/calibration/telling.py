@@ -71,19 +71,20 @@ def doubts_of(found: Calibration, unit: str) -> list[str]:
             "fit: it may stand elsewhere"
         )
     for sensor, each in found.residuals.items():
-        if each.held_after > rules.rising * each.after:
+        if each.held > rules.rising * each.after:
             of = "px" if found.after.sensors[sensor].unit == "px" else unit
             told.append(
                 f"{found.after.names[sensor]}: the residual rises from {each.after:.3g} to "
-                f"{each.held_after:.3g} {of} in the frames held back: the others are too few or "
+                f"{each.held:.3g} {of} in the frames held back: the others are too few or "
                 "too alike; record more"
             )
     return told
 
 
 def _frames_line(found: Calibration) -> str:
-    first = len(found.used) - len(found.held)
-    parts = [f"{first} calibrated from", f"{len(found.held)} held back, then taken too"]
+    parts = [f"{len(found.used)} calibrated from"]
+    if any(np.isfinite(each.held) for each in found.residuals.values()):
+        parts.append("each held back once")
     if found.bad:
         parts.append(f"{len(found.bad)} bad")
     rest = found.recorded - len(found.used) - len(found.bad)
@@ -171,19 +172,13 @@ def _body_lines(found: Calibration, unit: str) -> list[str]:
 
 def _residual_lines(found: Calibration, unit: str) -> list[str]:
     lines = [
-        f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>22}",
-        f"{'':<20}{'':>10}{'':>10}{'before':>12}{'after':>10}",
+        f"{'residual, RMS':<20}{'before':>10}{'after':>10}{'held back':>12}",
     ]
     for sensor, each in found.residuals.items():
         of = "px" if found.after.sensors[sensor].unit == "px" else unit
         numbers = "".join(
             f"{value:>{width}.3g}" if np.isfinite(value) else f"{'–':>{width}}"
-            for value, width in (
-                (each.before, 10),
-                (each.after, 10),
-                (each.held_before, 12),
-                (each.held_after, 10),
-            )
+            for value, width in ((each.before, 10), (each.after, 10), (each.held, 12))
         )
         lines.append(f"{found.after.names[sensor]:<20}{numbers} {of}")
     return lines

@@ -10,7 +10,6 @@ from mixpose.density.extraction_error import (
     Offsets,
     Seen,
     errors_seen,
-    known_blurs,
     log_likelihood,
     pooled,
 )
@@ -35,7 +34,6 @@ __all__ = [
     "crowding",
     "errors_seen",
     "features_met",
-    "known_blurs",
     "log_likelihood",
     "matched_atlas",
     "peak",

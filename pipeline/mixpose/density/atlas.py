@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density.blur import factors, mass, reduced
-from mixpose.density.grid import remap
+from mixpose.density.grid import FAR, remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -80,66 +80,63 @@ class Atlas:
     per_unit : (L, 1, 1, 2) float64
         Cells per sensor unit; 0 for the missing coordinate of ranges.
     plane : Plane
+        Of every sensor; they lie below one another.
     """
 
     def __init__(
         self, patterns: Sequence[Pattern], sigmas: Sequence[float], steps_per_sigma: float
     ) -> None:
-        L, sigma, reach = len(patterns), np.array(sigmas), REACH * steps_per_sigma + _BESIDE
-        dimensions = np.array([_dimension(pattern) for pattern in patterns])
-        self._flat = dimensions == 1
-        self.per_unit = np.empty((L, 1, 1, 2))
-        self.per_unit[:, 0, 0, 0] = steps_per_sigma / sigma
-        self.per_unit[:, 0, 0, 1] = ~self._flat * steps_per_sigma / sigma
-        self._sigma = math.sqrt(steps_per_sigma**2 - _SPLINE)  # what is drawn, in cells
-        width = sigma * (self._sigma / steps_per_sigma)
-        self._units = np.empty((L, 1, 1, 3))
-        self._units[:, 0, 0, 0] = (math.sqrt(2 * np.pi) * width) ** -dimensions
-        self._units[:, 0, 0, 1:] = self._units[:, 0, 0, :1] / width[:, None]
-        places = [_places(pattern) * per[0, 0] for pattern, per in zip(patterns, self.per_unit)]
+        L, n, reach = len(patterns), steps_per_sigma, REACH * steps_per_sigma + _BESIDE
+        dimensions = [_dimension(pattern) for pattern in patterns]
+        self._has_flat, self._is_flat = 1 in dimensions, np.array(dimensions) == 1
+        self._sigma = math.sqrt(n**2 - _SPLINE)  # what is drawn, in cells
+        widths = [sigma * self._sigma / n for sigma in sigmas]
+        tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
+        across = [(n / sigma, (m - 1) * n / sigma) for sigma, m in zip(sigmas, dimensions)]
+        self.per_unit = np.array(across)[:, None, None]
+        units = [(top, top / w, top / w) for top, w in zip(tops, widths)]
+        self._units = np.array(units)[:, None, None]
         self._grids: dict[int, tuple[Pattern, float, float]] = {}
+        corners: dict[int, Floats] = {}
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
-                small, left = reduced(pattern, float(width[k]))
+                small, left = reduced(pattern, widths[k])
                 self._grids[k] = small, left, mass(small)
-        self.plane = Plane.of(places, self._grids, reach)
-        self._first = (self.plane.squares * np.arange(L))[:, None, None]
-        self._limit = np.array(self.plane.shape) * self.plane.page - 1e-3
-        self._detections = _detections(patterns, places, self.plane, reach)
-        self.table = np.zeros(L * self.plane.squares, dtype=np.int32)
-        self.table[self._detections.squares] = _PENDING
-        for k in self._grids:
-            (u, v), (last_u, last_v) = self.plane.squares_of(places[k] + [[-reach], [reach]])
-            plane = self.table.reshape(L, *self.plane.shape[::-1])[k]
-            plane[v : last_v + 1, u : last_u + 1] = _PENDING
-        self._most = self._detections.squares.size + len(self._grids) * self.plane.squares
-        self._columns = self._most * self.plane.side // _LARGEST + 1
+                corners[k] = _corners(pattern) * across[k]
+        detections = _Detections.of(patterns, self.per_unit)
+        self.plane = plane = Plane.of(detections.q, corners, reach)
+        self._cells = np.arange(plane.side, dtype=np.float32) * np.float32(1 / self._sigma)
+        self._lower = np.zeros((L, 1, 1, 2))
+        self._lower[:, 0, 0, 1] = plane.shape[1] * plane.page * np.arange(L)
+        self._upper = self._lower + (np.array(plane.shape) * plane.page - 1e-3)
+        self._origin = plane.origin - self._lower
+        self._detections = detections = detections.on(plane, reach, self._origin)
+        self.table = np.zeros(L * plane.squares, dtype=np.int32)
+        self.table[detections.squares] = _PENDING
+        for k, both in corners.items():
+            (u, v), (last_u, last_v) = plane.squares_of(both + np.array([[-reach], [reach]]))
+            squares = self.table.reshape(L, *plane.shape[::-1])[k]
+            squares[v : last_v + 1, u : last_u + 1] = _PENDING
+        self._most = detections.squares.size + len(corners) * plane.squares
+        self._columns = self._most * plane.side // _LARGEST + 1
         self._drawn = self._columns  # the first row is of squares without anything
-        side = self.plane.side
-        self.values = np.zeros((side, self._columns * side, 3), dtype=np.float32)
+        self.values = np.zeros((plane.side, self._columns * plane.side, 3), dtype=np.float32)
+        # from a place in the planes to one in the array, by page
+        self._shifts = np.array([(FAR, FAR)] * self._columns)
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
-        index -= self.plane.origin
-        np.maximum(index, 0.0, out=index)
-        np.minimum(index, self._limit, out=index)
-        square = (index * (1.0 / self.plane.page)).astype(np.intp)
-        squares = square[..., 0] + self.plane.shape[0] * square[..., 1] + self._first
+        index -= self._origin
+        np.maximum(index, self._lower, out=index)
+        np.minimum(index, self._upper, out=index)
+        squares = self._squares_of(index)
         number = self.table[squares]
         if number.min(initial=0) < 0:
-            if self._grids:
-                squares_to_draw = squares[number < 0]
-            else:
-                squares_to_draw = self._around(index, number < 0)
-            self._draw(np.unique(squares_to_draw))
+            pending = number < 0
+            self._draw(np.unique(squares[pending] if self._grids else self._around(index[pending])))
             number = self.table[squares]
-        corner = np.empty(index.shape)
-        np.divmod(number, self._columns, out=(corner[..., 1], corner[..., 0]), casting="unsafe")
-        corner *= self.plane.side
-        corner += 1.0
-        index -= square * self.plane.page
-        index += corner
+        index += self._shifts[number]
         maps = index.reshape(-1, 2).T
         beside = maps - np.rint(maps)
         beside *= beside
@@ -150,15 +147,18 @@ class Atlas:
         sampled = _QUARTERS @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._units)
 
-    def _around(self, index: Floats, pending: NDArray[np.bool_]) -> Indices:
-        """The four squares around places (L, H, n, 2) in cells that lie on pending ones.
+    def _squares_of(self, index: Floats) -> Indices:
+        """Squares of the table (...,) that hold places (..., 2) in cells."""
+        columns_rows = (index * (1.0 / self.plane.page)).astype(np.intp)
+        return np.asarray(columns_rows @ np.array([1, self.plane.shape[0]]))
+
+    def _around(self, index: Floats) -> Indices:
+        """The four squares around places (P, 2) in cells, those that are pending.
 
         Fits go on a little, and drawing once is cheaper than drawing twice.
         """
-        where = np.nonzero(pending)
-        corner = (index[where] * (1.0 / self.plane.page) - 0.5).astype(np.intp)
         columns = self.plane.shape[0]
-        first = self.plane.squares * where[0] + corner[:, 0] + columns * corner[:, 1]
+        first = self._squares_of(index - 0.5 * self.plane.page)
         squares = first[:, None] + np.array([0, 1, columns, columns + 1])
         return np.asarray(squares[self.table[squares] < 0])
 
@@ -178,16 +178,17 @@ class Atlas:
             room = self.values[row * side : (row + max(whole, 1)) * side]
             room = room.reshape(-1, side, columns, 3 * side).swapaxes(1, 2)
             pages = room if whole else room[:, column : column + count]
-            self.table[some] = np.arange(self._drawn, self._drawn + count)
-            sensor, square = np.divmod(some, self.plane.squares)
-            corner = np.empty((count, 2))
-            rows_columns = corner[:, 1], corner[:, 0]
-            np.divmod(square, self.plane.shape[0], out=rows_columns, casting="unsafe")
+            number = np.arange(self._drawn, self._drawn + count)
+            self.table[some] = number
+            corner = _across(some, self.plane.shape[0])
             corner *= self.plane.page
-            corner -= 1
+            corner -= 1.0
+            shifts = _across(number, columns)
+            shifts *= side
+            self._shifts[self._drawn : self._drawn + count] = shifts - corner
             self._draw_detections(corner, pages)
             for k in self._grids:
-                for i in np.flatnonzero(sensor == k).tolist():
+                for i in np.flatnonzero(some // self.plane.squares == k).tolist():
                     page = pages[i // pages.shape[1], i % pages.shape[1]]
                     page[...] = self._of_grid(k, corner[i]).reshape(page.shape)
             self._drawn += count
@@ -202,7 +203,9 @@ class Atlas:
             most = max(min(4 * rows, self._most // columns + 2), rows)
             values = np.empty((most * side, *self.values.shape[1:]), dtype=np.float32)
             values[: len(self.values)] = self.values
-            self.values = values
+            shifts = np.empty((most * columns, 2))
+            shifts[: len(self._shifts)] = self._shifts
+            self.values, self._shifts = values, shifts
 
     def _draw_detections(self, corner: Floats, pages: Singles) -> None:
         """Draw pages with corners (P, 2) in cells, the next ones, in place.
@@ -214,39 +217,54 @@ class Atlas:
         number = self.table[found.squares] - self._drawn
         of, which = np.nonzero(number >= 0)
         number = number[of, which]
-        place = np.zeros_like(number)  # among the detections of its page
-        if len(number) > len(corner):
-            order = np.argsort(number, kind="stable")
-            of, number = of[order], number[order]
-            place = np.arange(len(number)) - np.searchsorted(number, number)
+        order = np.argsort(number, kind="stable")
+        of, number = of[order], number[order]
+        place = np.arange(len(number)) - np.searchsorted(number, number)  # in its page
         most = int(place.max(initial=0)) + 1
-        away = ((found.q[of] - corner[number]) * (1 / self._sigma)).astype(np.float32)[..., None]
-        away = away - np.arange(side, dtype=np.float32) * np.float32(1 / self._sigma)
+        begin = (found.q[of] - corner[number]) * (1 / self._sigma)
+        away = begin.astype(np.float32)[..., None] - self._cells
         bells = np.exp(np.float32(-0.5) * away * away)
-        if self._flat.any():  # rows that are all alike
-            flat = self._flat[found.sensor[of]]
+        if self._has_flat:  # rows that are all alike
+            flat = self._is_flat[found.sensor[of]]
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
         bells[:, 1] *= found.share[of, None]
         slopes = bells * away
-        along_v = np.zeros((count, most, 2, side), dtype=np.float32)
-        along_u = np.zeros((count, most, 2, side, 3), dtype=np.float32)
-        along_v[number, place, 0], along_v[number, place, 1] = bells[:, 1], slopes[:, 1]
-        along_u[number, place, 0, :, 0] = along_u[number, place, 1, :, 2] = bells[:, 0]
-        along_u[number, place, 0, :, 1] = slopes[:, 0]
+        along_v = np.empty((len(number), 2, side), dtype=np.float32)
+        along_v[:, 0], along_v[:, 1] = bells[:, 1], slopes[:, 1]
+        along_u = np.zeros((len(number), 2, side, 3), dtype=np.float32)
+        along_u[:, 0, :, 0] = along_u[:, 1, :, 2] = bells[:, 0]
+        along_u[:, 0, :, 1] = slopes[:, 0]
+        if len(number) < count * most:
+            slots = most * number + place
+            along_v, along_u = (_spread(one, slots, count * most) for one in (along_v, along_u))
         rows = along_v.reshape(*pages.shape[:2], 2 * most, side).swapaxes(2, 3)
         np.matmul(rows, along_u.reshape(*pages.shape[:2], 2 * most, 3 * side), out=pages)
 
     def _of_grid(self, sensor: int, corner: Floats) -> Singles:
         """A page (side, side, 3) of grey values or a profile, which begins at a corner (2,)."""
         pattern, sigma, total = self._grids[sensor]
-        cells = corner + self.plane.origin + np.arange(self.plane.side)[:, None]
+        cells = corner + self._origin[sensor, 0, 0] + np.arange(self.plane.side)[:, None]
         u, v = (cells / self.per_unit[sensor, 0, 0, 0]).T
-        flat = bool(self._flat[sensor])
+        flat = bool(self._is_flat[sensor])
         layers = factors(pattern, sigma, u, None if flat else v, total).layers(gradient=True)
         page = np.zeros((self.plane.side, self.plane.side, 3), dtype=np.float32)
         for channel, layer in enumerate(layers[: 2 if flat else 3]):
             page[..., channel] = layer / self._units[sensor, 0, 0, channel]
         return page
+
+
+def _spread(rows: Singles, slots: Indices, count: int) -> Singles:
+    """Rows in some of several slots, and zeros in the others."""
+    spread = np.zeros((count, *rows.shape[1:]), dtype=np.float32)
+    spread[slots] = rows
+    return spread
+
+
+def _across(numbers: Indices, columns: int) -> Floats:
+    """Columns and rows (n, 2) of what is numbered row by row."""
+    found = np.empty((len(numbers), 2))
+    np.divmod(numbers, columns, out=(found[:, 1], found[:, 0]), casting="unsafe")
+    return found
 
 
 class Plane(NamedTuple):
@@ -275,26 +293,25 @@ class Plane(NamedTuple):
         return np.floor((q - self.origin) * (1.0 / self.page)).astype(np.intp)
 
     @classmethod
-    def of(cls, places: Sequence[Floats], grids: Mapping[int, object], reach: float) -> Plane:
-        """A plane that holds detections, and corners of grids, of all sensors (K, 2) in cells.
+    def of(cls, q: Floats, corners: Mapping[int, Floats], reach: float) -> Plane:
+        """A plane that holds detections (D, 2), and corners (2, 2) of grids, of all sensors.
 
-        Pages begin at whole ones from sensor coordinates 0, so that a density is the same whatever
-        is seen beside it.  There is a rim of squares with nothing.
+        In cells.  Pages begin at whole ones from sensor coordinates 0, so that a density is the
+        same whatever is seen beside it.  There is a rim of squares with nothing.
         """
-        q = np.concatenate([one for k, one in enumerate(places) if k not in grids] or places)
-        page = max(math.ceil(reach / REACH), MIN_GRID_PAGE) if grids else PAGE
-        lower, upper = q.min(axis=0), q.max(axis=0)
-        if len(grids) < len(places) and _count(lower, upper, page) > MANY_PAGES:
+        page = max(math.ceil(reach / REACH), MIN_GRID_PAGE) if corners else PAGE
+        grids = np.concatenate(list(corners.values())) if corners else q
+        lower, upper = (q if len(q) else grids).min(axis=0), (q if len(q) else grids).max(axis=0)
+        if len(q) and _count(lower, upper, page) > MANY_PAGES:
             several = math.ceil(page * math.sqrt(_count(lower, upper, page) / MANY_PAGES))
             page = min(several, math.ceil(2 * reach))
-        is_cut = len(grids) < len(places) and _count(lower, upper, page) > MAX_PAGES
+        is_cut = len(q) > 0 and _count(lower, upper, page) > MAX_PAGES
         if is_cut:
             middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
             lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
-        if grids:
-            corners = np.concatenate([places[k] for k in grids])
-            lower = np.minimum(lower, corners.min(axis=0))
-            upper = np.maximum(upper, corners.max(axis=0))
+        if corners:
+            lower = np.minimum(lower, grids.min(axis=0))
+            upper = np.maximum(upper, grids.max(axis=0))
             page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
         # half a cell is left, lest rounding puts a place on a square of the rim
         origin = page * np.floor((lower - (reach + page + 0.5)) / page)
@@ -314,7 +331,7 @@ class _Detections(NamedTuple):
     Attributes
     ----------
     q : (D, 2) float64
-        Places, in cells from the origin of the plane.
+        Places in cells, from sensor coordinates 0 or from the corner of the first plane.
     share : (D,) float32
         Of the sensor's density.
     sensor : (D,) int
@@ -326,27 +343,32 @@ class _Detections(NamedTuple):
     sensor: Indices
     squares: Indices
 
+    @classmethod
+    def of(cls, patterns: Sequence[Pattern], per_unit: Floats) -> _Detections:
+        """All detections, not on a plane yet."""
+        found = {k: one for k, one in enumerate(patterns) if isinstance(one, PointPattern)}
+        if not found:
+            none = np.zeros(0, dtype=np.intp)
+            return cls(np.zeros((0, 2)), none.astype(np.float32), none, none[:, None])
+        counts = np.array([len(one.points) for one in found.values()])
+        sensor = np.array(list(found)).repeat(counts)
+        q = np.concatenate([_in_plane(one.points) for one in found.values()])
+        weights = np.concatenate([one.weights for one in found.values()])
+        share = weights / np.bincount(sensor, weights)[sensor]
+        q *= per_unit[sensor, 0, 0]
+        return cls(q, share.astype(np.float32), sensor, sensor[:, None])
 
-def _detections(
-    patterns: Sequence[Pattern], places: Sequence[Floats], plane: Plane, reach: float
-) -> _Detections:
-    """All detections but those that are too far away for the plane."""
-    parts = [
-        (np.full(len(q), k), q, pattern.weights / pattern.weights.sum())
-        for k, (pattern, q) in enumerate(zip(patterns, places, strict=True))
-        if isinstance(pattern, PointPattern)
-    ]
-    if not parts:
-        parts = [(np.zeros(0, dtype=np.intp), np.zeros((0, 2)), np.zeros(0))]
-    sensor, q, share = (np.concatenate(column) for column in zip(*parts, strict=True))
-    first = plane.squares_of(q - reach)
-    beside = np.arange(int(2 * reach / plane.page) + 2)
-    if plane.is_cut:
-        inside = ((first >= 1) & (first < np.array(plane.shape) - len(beside))).all(axis=1)
-        sensor, q, share, first = sensor[inside], q[inside], share[inside], first[inside]
-    begin = plane.squares * sensor + first[:, 0] + plane.shape[0] * first[:, 1]
-    squares = begin[:, None] + np.add.outer(plane.shape[0] * beside, beside).ravel()
-    return _Detections(q - plane.origin, share.astype(np.float32), sensor, squares)
+    def on(self, plane: Plane, reach: float, origin: Floats) -> _Detections:
+        """The same on planes with origins (L, 1, 1, 2), but those too far away for theirs."""
+        q, share, sensor, _ = self
+        first = plane.squares_of(q - reach)
+        beside = np.arange(int(2 * reach / plane.page) + 2)
+        if plane.is_cut:
+            inside = ((first >= 1) & (first < np.array(plane.shape) - len(beside))).all(axis=1)
+            sensor, q, share, first = sensor[inside], q[inside], share[inside], first[inside]
+        begin = plane.squares * sensor + first @ np.array([1, plane.shape[0]])
+        squares = begin[:, None] + np.add.outer(plane.shape[0] * beside, beside).ravel()
+        return _Detections(q - origin[sensor, 0, 0], share, sensor, squares)
 
 
 def _dimension(pattern: Pattern) -> int:
@@ -355,13 +377,14 @@ def _dimension(pattern: Pattern) -> int:
     return len(pattern.origin)
 
 
-def _places(pattern: Pattern) -> Floats:
-    """Detections (K, 2), or the corners (2, 2) of a grid; 0 for a missing coordinate."""
-    if isinstance(pattern, PointPattern):
-        places = pattern.points
-    else:
-        size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
-        places = np.array([pattern.origin, pattern.origin + size * pattern.step])
-    if places.shape[1] == 1:
-        places = np.concatenate([places, np.zeros_like(places)], axis=1)
-    return places
+def _corners(pattern: GridPattern) -> Floats:
+    """Corners (2, 2) of a grid."""
+    size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
+    return _in_plane(np.array([pattern.origin, pattern.origin + size * pattern.step]))
+
+
+def _in_plane(places: Floats) -> Floats:
+    """Places (K, 2), with 0 for a missing coordinate."""
+    if places.shape[1] == 2:
+        return places
+    return np.concatenate([places, np.zeros_like(places)], axis=1)

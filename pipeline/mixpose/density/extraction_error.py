@@ -121,11 +121,14 @@ class Seen(NamedTuple):
         Of each sensor's noise, together with what was known.
     blurs : (L,) float64
         In σ_ε.
+    before : (L,) float64
+        Blurs by what was known of the noise before the frame.
     """
 
     own: Floats
     variances: Floats
     blurs: Floats
+    before: Floats
 
 
 def errors_seen(
@@ -143,30 +146,28 @@ def errors_seen(
         Squares and degrees of freedom of each sensor's noise so far.
     rules : ErrorRules
     """
+    before = rules.blur * np.sqrt(pooled(known, rules, rules.typical_degrees))
+    before = np.minimum(np.maximum(before, offsets.finest), 1.0)
     blurs = np.ones(len(offsets.dimensions))
     while True:
-        seen = _seen_at(blurs, offsets, free, known, rules)
+        seen = _seen_at(blurs, before, offsets, free, known, rules)
         if all((seen.blurs > 0.9 * blurs).tolist()):
             break
         blurs = np.minimum(seen.blurs, blurs)
-    blurs = known_blurs(offsets.finest, known, rules)
+    blurs = before
     if all((seen.blurs <= _ALIKE * blurs).tolist()):
         return seen
     for _ in range(_ROUNDS):
-        narrow = _seen_at(blurs, offsets, free, known, rules)
+        narrow = _seen_at(blurs, before, offsets, free, known, rules)
         if (narrow.blurs <= _ALIKE * blurs).all():
             break
         blurs = narrow.blurs
     return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))
 
 
-def known_blurs(finest: Floats, known: Floats, rules: ErrorRules = ErrorRules()) -> Floats:
-    """Blurs (L,) by what was known of the noise before a frame; arguments as of `errors_seen`."""
-    variances = pooled(known, rules, rules.typical_degrees)
-    return np.clip(rules.blur * np.sqrt(variances), finest, 1.0)
-
-
-def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules) -> Seen:
+def _seen_at(
+    blurs: Floats, before: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules
+) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
     squared, shares, sensor, dimensions, finest = offsets
     weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])
@@ -182,13 +183,14 @@ def _seen_at(blurs: Floats, offsets: Offsets, free: int, known: Floats, rules: E
         squares.append(factor * q * degrees[-1])
     most = sum(degrees)
     left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
-    own = np.array([squares, degrees]) * [[left > 0], [left]]
+    own = np.array([squares if left else [0.0] * len(squares), [one * left for one in degrees]])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
     each = dimensions * totals + _NOTHING
     wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
-    return Seen(own, variances, np.minimum(np.maximum(rules.blur * np.sqrt(wide), finest), 1.0))
+    blurs = np.minimum(np.maximum(rules.blur * np.sqrt(wide), finest), 1.0)
+    return Seen(own, variances, blurs, before)
 
 
 def log_likelihood(

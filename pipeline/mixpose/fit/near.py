@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, known_blurs, log_likelihood
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -257,9 +257,8 @@ def _to_the_noise(
         met = _met(objective, ascent, sigmas, beside, errors)
         seen = errors_seen(met.offsets, count, known, errors)
         # offsets of a bent pose hide how small the noise is
-        least = known_blurs(met.offsets.finest, known, errors)
-        variances = np.minimum(seen.variances, (least / errors.blur) ** 2)
-        end = np.minimum(np.minimum(seen.blurs, least), blurs)
+        variances = np.minimum(seen.variances, (seen.before / errors.blur) ** 2)
+        end = np.minimum(np.minimum(seen.blurs, seen.before), blurs)
         narrower = np.maximum(end, blurs / rules.schedule.ratio)
         is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
         if best is ascent and is_end:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -42,6 +43,9 @@ class EstimatorOptions:
     search: SearchName | None = None
 
 
+@lru_cache
 def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:
-    """Which of the six directions are estimated."""
-    return np.array([name in options.free for name in TWIST_NAMES])
+    """Which of the six directions are estimated, not to be written to."""
+    mask = np.array([name in options.free for name in TWIST_NAMES])
+    mask.flags.writeable = False
+    return mask

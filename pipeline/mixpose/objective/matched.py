@@ -187,8 +187,8 @@ def matched_objective(
     projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
     energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
-    variances = 2 * np.square(sigmas)
-    tops = np.array([peak(v, m) for v, m in zip(variances, projection.dimensions)])
+    variances = np.array([2 * sigma * sigma for sigma in sigmas])
+    tops = np.array([peak(*one) for one in zip(variances.tolist(), projection.dimensions.tolist())])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)

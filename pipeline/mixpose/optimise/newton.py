@@ -95,6 +95,11 @@ class _Inner(NamedTuple):
     free: NDArray[np.bool_]
     square: tuple[NDArray[Any], ...]
 
+    @classmethod
+    def of(cls, free: NDArray[np.bool_]) -> _Inner | None:
+        """None where all may change."""
+        return None if free.all() else cls(free, np.ix_(free, free))
+
 
 def ascend(
     model: Callable[[State], Model],
@@ -124,10 +129,14 @@ def ascend(
     Ascent
         The best state seen; `converged` is false when the iterations ran out.
     """
-    first = at_start or model(start)
-    return ascend_together(
-        lambda states: [model(states[0])], move, [start], free, options, [first]
-    )[0]
+    climb = _climb(move, start, at_start or model(start), _Inner.of(free), options)
+    try:
+        state = next(climb)
+        while True:
+            state = climb.send(model(state))
+    except StopIteration as end:
+        ascent: Ascent[State] = end.value
+        return ascent
 
 
 def ascend_together(
@@ -150,7 +159,7 @@ def ascend_together(
     options : NewtonOptions
     at_starts : sequence of Model
     """
-    inner = None if free.all() else _Inner(free, np.ix_(free, free))
+    inner = _Inner.of(free)
     climbs = [_climb(move, one, here, inner, options) for one, here in zip(starts, at_starts)]
     states, ends = list(starts), dict[int, Ascent[State]]()
     there: Sequence[Model | None] = [None] * len(climbs)
@@ -212,7 +221,7 @@ def _step(here: Model, inner: _Inner | None, damping: float) -> tuple[Floats, fl
     # a direction without curvature must not make the system singular
     floor = max(diagonal.tolist(), default=0.0) * 1e-12 * damping + _TINY
     A = C.copy()
-    A.flat[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
+    A.reshape(-1)[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
     partial = _solved(A, g)
     gain = float(partial @ (g - 0.5 * (C @ partial)))
     if inner is None:
