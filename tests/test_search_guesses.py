@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 import pytest
 from detections import EIGHT, TRUTH, detect, view_of
@@ -86,7 +88,8 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
     def kinds(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT, PeakOptions())
-        return [one.func.__name__ for one in kinds_of_guesses(seen, EIGHT, THOROUGH, 0)]
+        batches = [one(0) for one in kinds_of_guesses(seen, EIGHT, THOROUGH, 0)]
+        return [one.__name__ for one in batches if isinstance(one, Generator)]
 
     triples, point, rays = "from_point_triples", "from_point_and_rays", "from_three_rays"
     assert kinds(8) == [triples, point, rays, rays]
