@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from types import GeneratorType
 
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT, PeakOptions())
         batches = [one(0) for one in kinds_of_guesses(seen, EIGHT, THOROUGH, 0)]
-        return [one.__name__ for one in batches if isinstance(one, Generator)]
+        return [one.__name__ for one in batches if isinstance(one, GeneratorType)]
 
     triples, point, rays = "from_point_triples", "from_point_and_rays", "from_three_rays"
     assert kinds(8) == [triples, point, rays, rays]
