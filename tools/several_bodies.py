@@ -2,10 +2,13 @@
 
     python tools/several_bodies.py scenes [--count 200] [--frames 5] [--seed 0]
     python tools/several_bodies.py crossing [--bodies 10] [--frames 500] [--seed 0]
+    python tools/several_bodies.py parting [--count 60] [--seed 0]
 
 `scenes` makes scenes of two to six bodies of four to six markers before two cameras, with two
 hidden markers and four false ones in each view, and estimates their first frames from nothing.
 `crossing` lets identical bodies of five markers cross each other's paths before four cameras.
+`parting` has pairs of bodies that stay near each other, as limbs do, until the one of four markers
+is hidden; then it is back beside the other, or somewhere else, or gone.
 What is recorded shares nothing with the estimator but the cameras' geometry.
 """
 
@@ -36,6 +39,7 @@ Motion: TypeAlias = Callable[[int], list[Floats]]
 FOCAL, RESOLUTION, NOISE_PX = 1000.0, (1280, 1024), 0.2
 RIGHT_DEG, RIGHT_MM = 5.0, 10.0
 APART_PX = 4.0  # spots nearer than this are found as one
+PARTED = 48, 68  # frames: when a body is back, or not, and the end
 
 
 @dataclass(frozen=True)
@@ -183,6 +187,31 @@ def crossing(seed: int, count: int, frames: int) -> tuple[Setup, Motion, np.rand
     return Setup(cameras, [body], [count]), motion, rng
 
 
+def parting(seed: int) -> tuple[Setup, Motion, np.random.Generator]:
+    """Two bodies side by side in quick motion, and what becomes of the second one after a while."""
+    rng = np.random.default_rng(seed)
+    bodies = [random_body(rng, 6), random_body(rng, 4)]
+    cameras = {"left": camera_at(30, 10, 1200), "right": camera_at(-30, -10, 1200)}
+    beside = rng.uniform(100, 140) * np.array([1.0, 0.3, 0.0])
+    turns, axes = Rotation.random(2, rng=rng), rng.standard_normal((2, 3))
+    phases, swings = rng.uniform(0, 6, 4), rng.normal(0, 0.15, (PARTED[1], 6))
+    away = [-np.sign(beside) * rng.uniform(60, 150, 3), rng.uniform(-2, 2, 3)]
+
+    def motion(frame: int) -> list[Floats]:
+        along = 120 * np.sin(phases[:3] + frame * np.array([0.9, 0.5, 0.7]))
+        turned = Rotation.from_rotvec(0.5 * np.sin(phases[3] + 0.6 * frame) * axes[0])
+        first = from_parts((turned * turns[0]).as_matrix(), along)
+        swung = (Rotation.from_rotvec(swings[frame, 3:]) * turns[1]).as_matrix()
+        second = first @ from_parts(swung, beside + 60 * swings[frame, :3])
+        if frame >= PARTED[0] - 8 and (frame < PARTED[0] or seed % 3 == 2):
+            second = from_parts(np.eye(3), np.array([0.0, 0.0, 1e6]))  # out of sight
+        elif frame >= PARTED[0] and seed % 3 == 1:
+            second = from_parts(Rotation.from_rotvec(away[1]).as_matrix(), away[0] + along / 4)
+        return [first, second]
+
+    return Setup(cameras, bodies, [1, 1]), motion, rng
+
+
 def is_right(estimate: Estimate, T_true: Floats, symmetries: Floats) -> bool:
     """Whether a pose is near the true one."""
     T = estimate.T_world_object
@@ -225,6 +254,31 @@ def study_scenes(count: int, frames: int, seed: int) -> int:
             print(f"{k + 1} scenes: {said(tally)}", flush=True)
     print(f"{count} scenes of {frames} frames: {said(tally)}")
     return int(tally["wrong ok"] > 0)
+
+
+def study_parting(count: int, seed: int) -> int:
+    """What a body beside another is worth where it was, and where it is no longer."""
+    tallies: dict[str, Counter[str]] = {each: Counter() for each in ("beside", "away", "gone")}
+    for k in range(count):
+        setup, motion, rng = parting(seed + k)
+        tally = tallies[list(tallies)[(seed + k) % 3]]
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            truth = record(setup, motion, PARTED[1], folder, rng, hidden=2, false=6)
+            session = mixpose.load_session(folder / "session.toml")
+            for frame, (_, estimate) in enumerate(by_frame(session)):
+                right = is_right(estimate, truth[frame][1], np.eye(4)[None])
+                if estimate.status == "ok" and not right:
+                    tally["wrong ok"] += 1
+                    print(f"seed {seed + k}, frame {frame}: {estimate.label} is wrong and ok")
+                if frame >= PARTED[0]:
+                    tally["poses"] += 1
+                    tally["right"] += right
+                    tally[estimate.status] += 1
+                    tally["ok and right"] += right and estimate.status == "ok"
+    for what, tally in tallies.items():
+        print(f"{what} after {PARTED[0]} frames: {said(tally)}")
+    return int(any(tally["wrong ok"] for tally in tallies.values()))
 
 
 def said(tally: Counter[str]) -> str:
@@ -287,11 +341,15 @@ def main() -> int:
     crossings = studies.add_parser("crossing")
     crossings.add_argument("--bodies", type=int, default=10)
     crossings.add_argument("--frames", type=int, default=500)
-    for each in (scenes, crossings):
+    partings = studies.add_parser("parting")
+    partings.add_argument("--count", type=int, default=60)
+    for each in (scenes, crossings, partings):
         each.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     if chosen.study == "scenes":
         return study_scenes(chosen.count, chosen.frames, chosen.seed)
+    if chosen.study == "parting":
+        return study_parting(chosen.count, chosen.seed)
     return study_crossing(chosen.bodies, chosen.frames, chosen.seed)
 
 

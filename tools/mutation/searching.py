@@ -5,6 +5,7 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _PROPOSERS = "test_tracking_proposers.py"
+_SCENES = "test_several_bodies_scene.py"
 _STARTS = "test_tracking_starts.py"
 
 _PROPOSALS = (
@@ -49,6 +50,30 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
+        "tracking-companions-for-nothing",
+        "tracking/companion.py",
+        "share = 0.5 *",
+        "share = 1e-9 *",
+        "a limb that is lost is not found again by where it was beside the next one",
+        (_SCENES,),
+    ),
+    Mutant(
+        "tracking-companions-for-ever",
+        "tracking/companion.py",
+        "** misses",
+        "** 0",
+        "a body that went away is expected for ever where it was beside another",
+        (_SCENES,),
+    ),
+    Mutant(
+        "tracking-companions-in-world-axes",
+        "tracking/companion.py",
+        "turned = T_world_other[:3, :3] ** 2",
+        "turned = np.eye(3)",
+        "what is known of a body beside another does not turn with it",
+        (_SCENES,),
+    ),
+    Mutant(
         "tracking-left-out-for-free",
         "tracking/likelihood.py",
         "data.track.residuals, prior, others)",
@@ -91,8 +116,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers/predicted.py",
-        "for one in data.predictions]",
-        "for one in data.predictions[:1]]",
+        "[*data.predictions, *beside]",
+        "[*data.predictions[:1], *beside]",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),

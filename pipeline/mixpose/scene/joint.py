@@ -36,7 +36,7 @@ from mixpose.scene.ownership import (
     unmet_places,
 )
 from mixpose.scene.rules import SceneRules
-from mixpose.tracking import Track
+from mixpose.tracking import Prediction, Track
 from mixpose.tracking.likelihood import FrameData
 from mixpose.tracking.together import begun_together
 
@@ -76,6 +76,7 @@ class Joint:
         self._owners: dict[int, Owners] = {}
         self._claims: dict[int, Claims] = {}
         self._merged: dict[str, set[int]] = {}
+        self._beside: dict[int, Prediction | None] = {}
         self._shared: SharedDensities | None = None
         if self._views and all(
             isinstance(view.observation.pattern, PointPattern) for view in self._views
@@ -93,6 +94,7 @@ class Joint:
         for k in range(len(self.members)):
             if not are_alike(k, owners, self._owners[k]):
                 self._rejudge(k, left_for(k, self._views, owners))
+        self._expect(left)
 
     def _follow(self, trusted: Sequence[int]) -> None:
         """Bodies where they are expected, all at once."""
@@ -167,7 +169,9 @@ class Joint:
             self._claim(winner)
             waiting.remove(winner)
             taken = self._claims[winner]
-            self._look_at_all([k for k in waiting if self._wants(k, taken)])
+            again = [k for k in waiting if self._wants(k, taken)]
+            self._look_at_all(again)
+            self._expect([k for k in waiting if k not in again])
 
     def _look_at_all(self, some: Iterable[int]) -> None:
         """Everywhere, on what is left; identical bodies of which nothing is known look as one."""
@@ -190,23 +194,53 @@ class Joint:
         tracker = self.members[k].tracker
         left = left_for(k, self._views, owners)
         track = self.tracks[k]
+        if not start:
+            self._beside[k] = self._companion(k)
         if self._is_forgotten(k):
             track = replace(track, branches=())
-        data = tracker.data(track, self._frame, self._time_s, left.views)
+        data = self._data(k, left, track)
         if self._is_away(k):
             data = replace(data, options=replace(data.options, search="live"))
         self.ranked[k] = tracker.refitted(data, start) if start else tracker.ranked(data)
         if track is not self.tracks[k]:
-            known = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
-            data = replace(known, log=data.log)
+            data = replace(self._data(k, left), log=data.log)
         self.data[k], self._left[k], self._owners[k] = data, left, owners
 
     def _rejudge(self, k: int, left: Left) -> None:
         """The poses of a body again, by what is left for it in the end."""
-        tracker = self.members[k].tracker
-        data = tracker.data(self.tracks[k], self._frame, self._time_s, left.views)
-        self.ranked[k] = tracker.rejudged(data, self.ranked[k])
+        data = self._data(k, left)
+        self.ranked[k] = self.members[k].tracker.rejudged(data, self.ranked[k])
         self.data[k], self._left[k] = replace(data, log=self.data[k].log), left
+
+    def _data(self, k: int, left: Left, track: Track | None = None) -> FrameData:
+        """The frame as it is left for a body, and what is known before it."""
+        tracker, track = self.members[k].tracker, track or self.tracks[k]
+        data = tracker.data(track, self._frame, self._time_s, left.views)
+        return replace(data, beside=self._beside.get(k))
+
+    def _expect(self, some: Iterable[int]) -> None:
+        """Bodies that are not sure, by what was found beside them since they looked."""
+        for k in some:
+            if self.ranked[k] and not self._is_sure(k):
+                told = self._companion(k)
+                before = self._beside.get(k)
+                if told and (before is None or _width(told) < _width(before)):
+                    self._beside[k] = told
+                    self._rejudge(k, self._left[k])
+
+    def _companion(self, k: int) -> Prediction | None:
+        """Where the body is expected beside that sure one which tells most."""
+        tracker, told = self.members[k].tracker, []
+        for j in self._claims:
+            one = self.tracks[k].companions.get(self.members[j].label)
+            if one is not None and self._is_sure(j):
+                T = self.ranked[j][0].T_world_object
+                told.append(Prediction(*one.expected(T, tracker.body, tracker.rules.motion), 1.0))
+        return min(told, key=_width, default=None)
+
+    def _is_sure(self, k: int) -> bool:
+        verdict = self.members[k].tracker.verdict(self.data[k], self.ranked[k])
+        return verdict.status == "ok"
 
     def _may_share(self, data: FrameData, left: Left, places: Mapping[str, Floats]) -> bool:
         """Whether nothing that is another's lies within reach, so that all may look as one."""
@@ -241,8 +275,7 @@ class Joint:
         claims = {**self._claims, keeps: self._own_claims(keeps)}
         left = left_for(other, self._views, claimed(self._views, claims))
         tracker = self.members[other].tracker
-        data = tracker.data(self.tracks[other], self._frame, self._time_s, left.views)
-        rest = tracker.rejudged(data, self.ranked[other])
+        rest = tracker.rejudged(self._data(other, left), self.ranked[other])
         return self._evidence(keeps) + max([0.0, *(one.log_evidence for one in rest[:1])])
 
     def _is_trusted(self, k: int) -> bool:
@@ -304,3 +337,8 @@ class Joint:
             view.name: at.y[i, 0][at.seen[i, 0]][:, : view.sensor.dimension]
             for i, view in enumerate(self._views)
         }
+
+
+def _width(expected: Prediction) -> float:
+    """How little a prediction tells: the logarithm of the volume that it leaves."""
+    return float(np.log(expected.uncertainty).sum())

@@ -14,9 +14,9 @@ from mixpose.scene.identity import identify
 from mixpose.scene.joint import Joint
 from mixpose.scene.members import Member, groups
 from mixpose.scene.rules import SceneRules
-from mixpose.tracking import Track
+from mixpose.tracking import Companion, Track
 from mixpose.tracking.likelihood import FrameData
-from mixpose.tracking.recognition import TRIANGLE, is_known
+from mixpose.tracking.recognition import TRIANGLE, is_from_doubt, is_known
 
 
 class Outcome(NamedTuple):
@@ -67,18 +67,36 @@ class Scene:
                 others = (self.members, joint.data, sure, self.rules.alike)
                 if may_be_another(k, best, *others):
                     found[k] = Decided(replace(one.verdict, status="ambiguous"), one.ranked)
-        return [
+        outcomes = [
             self._outcome(k, found[k], joint.data[k], frame, time_s, views)
             for k in range(len(self.members))
         ]
+        return self._acquainted(outcomes)
 
     def _decided(self, k: int, data: FrameData, ranked: Sequence[Judged]) -> Decided:
         verdict = self.members[k].tracker.verdict(data, ranked)
-        # of a body that gives way, three markers may be three of its others
-        gives_way = verdict.status == "ok" and data.body.spread > 0
-        if gives_way and verdict.best and not is_known(data, verdict.best):
-            verdict = verdict.doubted(TRIANGLE)
+        best = verdict.best if verdict.status == "ok" else None
+        if best and not is_known(data, best):
+            # of a body that gives way, three markers may be three of its others
+            gives_way = data.body.spread > 0
+            verdict = verdict.doubted(TRIANGLE if gives_way or is_from_doubt(data, best) else "")
         return Decided(verdict, ranked)
+
+    def _acquainted(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        """The same, and where bodies are beside each other; identical ones may be exchanged."""
+        sure = {
+            member.label: one.estimate.T_world_object
+            for member, one in zip(self.members, outcomes, strict=True)
+            if member.instance is None and one.estimate.status == "ok"
+        }
+        after = []
+        for member, (track, estimate) in zip(self.members, outcomes, strict=True):
+            known, T, body = dict(track.companions), sure.get(member.label), member.tracker.body
+            for label, T_other in sure.items() if T is not None else ():
+                if label != member.label and T is not None and T_other is not None:
+                    known[label] = Companion.joined(known.get(label), T, T_other, body)
+            after.append(Outcome(replace(track, companions=known), estimate))
+        return after
 
     def _identify(
         self, group: Sequence[int], found: list[Decided], data: Mapping[int, FrameData]
@@ -112,7 +130,8 @@ class Scene:
         told = found.told or found.verdict
         estimate = tracker.estimate(frame, time_s, views, told, found.ranked)
         after = tracker.followed(data, frame, time_s, found.verdict)
-        after = replace(after, doubted=found.verdict.status != "ok")
+        doubted = found.verdict.status != "ok"
+        after = replace(after, doubted=doubted, companions=data.track.companions)
         return Outcome(after, replace(estimate, instance=member.instance))
 
 

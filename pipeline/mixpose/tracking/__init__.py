@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mixpose.tracking.companion import Companion
 from mixpose.tracking.delays import UNKNOWN_S
 from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
 from mixpose.tracking.proposers.stepped_aside import ASIDE
@@ -13,6 +14,7 @@ from mixpose.tracking.tracker import Tracker
 __all__ = [
     "ASIDE",
     "UNKNOWN_S",
+    "Companion",
     "Expectation",
     "Prediction",
     "Rules",

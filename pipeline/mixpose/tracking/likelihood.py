@@ -41,6 +41,7 @@ from mixpose.rigid import twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion
 from mixpose.tracking.association_likelihood import are_associated
+from mixpose.tracking.companion import either
 from mixpose.tracking.course import Expected, unknown
 from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion, unsure_by
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
@@ -129,6 +130,7 @@ class FrameData:
     seconds, None where it is not known.  Where views see the body in motion as of the common time,
     `still` is the frame with the sensors as they stand.
     `begun` is the climb from the first prediction, where several bodies were fitted together.
+    `beside` is where another body lets it expect that was not seen where it was expected.
     """
 
     views: Sequence[View]
@@ -144,6 +146,7 @@ class FrameData:
     log: SearchLog = field(default_factory=SearchLog)
     elapsed: float | None = None
     still: FrameData | None = None
+    beside: Prediction | None = None
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -158,15 +161,16 @@ class FrameData:
 
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
-        return prior_of(
-            T_world_object,
-            self.predictions,
-            self.body,
-            self.free,
-            self.track.misses,
-            self.rules.motion,
-            self.rules.judgement.detection,
-        )
+        rules, misses = self.rules.motion, self.track.misses
+        detection = self.rules.judgement.detection
+
+        def prior(expected: Sequence[Prediction], misses: int) -> Prior:
+            return prior_of(
+                T_world_object, expected, self.body, self.free, misses, rules, detection
+            )
+
+        own = prior(self.predictions, misses)
+        return own if self.beside is None else either(own, prior([self.beside], 0), misses, rules)
 
     def moves_alike(self, T_world_object: Floats) -> Floats | None:
         """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""

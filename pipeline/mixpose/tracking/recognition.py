@@ -30,7 +30,13 @@ def is_alone(data: FrameData, judged: Judged, sensors: int) -> bool:
     sensors : int
         With a frame, also those that saw nothing.
     """
-    if sensors < 2 or data.track.believed or sum(one.met > 0 for one in judged.associations) != 1:
+    lonely = sensors > 1 and sum(one.met > 0 for one in judged.associations) == 1
+    return lonely and is_from_doubt(data, judged)
+
+
+def is_from_doubt(data: FrameData, judged: Judged) -> bool:
+    """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
+    if data.track.believed:
         return False
     anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
     gained = data.prior(judged.T_world_object).log_density - anywhere.log_density

@@ -47,7 +47,8 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
     track = Track(residuals=data.track.residuals)
     # what explains more than this pose is met by the first guesses already
     options = replace(data.options, search="live")
-    alone = replace(data, track=track, predictions=(), log=SearchLog(), begun=None, options=options)
+    nothing = replace(data, predictions=(), beside=None, begun=None)
+    alone = replace(nothing, track=track, log=SearchLog(), options=options)
     own = _evidence(alone, Start(judged.T_world_object))
     mirror = replace(alone, body=_reflected(data.body, met >= 0))
     least = own - data.rules.search.outdone

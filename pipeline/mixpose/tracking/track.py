@@ -14,6 +14,7 @@ from mixpose.body import Body
 from mixpose.judgement import DetectionModel, Prior, Residuals, flat_prior, nearest_alike
 from mixpose.rigid import perturb, twist_between
 from mixpose.search import SearchState
+from mixpose.tracking.companion import Companion
 from mixpose.tracking.course import Course, CourseRules
 from mixpose.tracking.delays import DelayEvidence
 from mixpose.tracking.motion import MotionRules, RandomWalk
@@ -101,6 +102,8 @@ class Track:
         Whether the body was told from things that have three markers alike.
     clutter : StaticClutter
         What stayed where it was while the body was lost.
+    companions : mapping of str to Companion
+        Where it was beside other bodies, by their labels.
     """
 
     branches: tuple[Branch, ...] = ()
@@ -117,6 +120,7 @@ class Track:
     believed: int = 0
     known: bool = False
     clutter: StaticClutter = StaticClutter()
+    companions: Mapping[str, Companion] = field(default_factory=dict)
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""

@@ -12,7 +12,9 @@ from mixpose.tracking.likelihood import FrameData, Start
 
 def predicted(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
     """The predictions, always."""
-    return [Start(one.T_world_object, one.uncertainty, one) for one in data.predictions]
+    beside = [] if data.beside is None else [data.beside]
+    some = [*data.predictions, *beside]
+    return [Start(one.T_world_object, one.uncertainty, one) for one in some]
 
 
 def is_doubtful(data: FrameData, ranked: list[Judged]) -> bool:
