@@ -229,6 +229,14 @@ _REFLECTION = (
         ("test_tracking_reflection.py",),
     ),
     Mutant(
+        "tracking-bodies-nearly-flat-are-their-mirror-images",
+        "tracking/reflection.py",
+        "bool(extents[2] < _FLAT * extents[0])",
+        "bool(extents[2] < 0.9 * extents[0])",
+        "the body in a window is taken for the body",
+        ("test_tracking_reflection.py",),
+    ),
+    Mutant(
         "tracking-a-body-given-mirrored-passes",
         "tracking/reflection.py",
         "return any(_evidence(mirror, start) > own + ahead for start in starts)",
