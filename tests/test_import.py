@@ -290,6 +290,24 @@ def test_a_wrong_file_of_each_format_is_told_in_one_line(tmp_path: Path, name: s
     assert words in message
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.toml", texts.toml("cameras.")[:200], "a.toml: not TOML: "),
+        ("a.json", texts.pycalib()[:200], "a.json: not JSON: "),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0\n", "images.txt: found '2 1 0'; allowed"),
+    ],
+)
+def test_a_file_that_was_cut_off_is_told_as_what_it_is(
+    tmp_path: Path, name: str, text: str, words: str
+) -> None:
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n", encoding="utf-8")
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(SessionError) as caught:
+        gather([tmp_path / "cameras.txt", tmp_path / name], "mm", "mm")
+    assert words in str(caught.value)
+
+
 def test_several_bodies_are_imported_with_a_name_each(tmp_path: Path) -> None:
     (tmp_path / "chain.yaml").write_text(texts.kalibr(), encoding="utf-8")
     for folder, x in (("a", 5), ("b", 7)):

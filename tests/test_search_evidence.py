@@ -52,8 +52,24 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
         objective = matched_objective(views, EIGHT, [1.5] * len(views))
         for pose, log_odds in zip(poses, found, strict=True):
             judged = judge(Case(objective, pose, prior=never), ALL_FREE)
-            # the search takes one noise for all sensors, the judgement one for each: a nat at most
+            # either draws the noise of a sensor to another mean: a nat at most
             assert log_odds == pytest.approx(judged.log_evidence, abs=1.0)
+
+
+def test_what_one_camera_meets_by_chance_is_no_noise_of_the_others(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    first, second = pinhole_cameras[:2]
+    y = second.project(transform(TRUTH, EIGHT.means))[0]
+    by_chance = y + np.where(np.arange(8)[:, None] < 3, 2.0, 60.0)  # three, each 1.9 σ_ε off
+
+    def both(places: Floats) -> float:
+        views = [view_of("0", first, seen(first)), view_of("1", second, places)]
+        detections = sensor_detections(views, EIGHT, PeakOptions())
+        return float(evidence(detections, EIGHT, TRUTH[None], ALL_FREE, GATE)[0][0])
+
+    # as noise of both, squares of 10.7 σ² would make the eight exact ones worth 30 nats less
+    assert both(by_chance) > both(y + 60.0)
 
 
 def test_clutter_makes_each_detection_that_is_met_less_telling(

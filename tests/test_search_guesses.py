@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from types import GeneratorType
+
 import numpy as np
-from detections import EIGHT, TRUTH, view_of
+import pytest
+from detections import EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.alignment import align_triples
-from mixpose.search.budget import LabelOptions, PeakOptions
+from mixpose.search.budget import THOROUGH, LabelOptions, PeakOptions
 from mixpose.search.constraint import Constraint
 from mixpose.search.detections import sensor_detections
-from mixpose.search.guesses import from_slips
+from mixpose.search.from_three_rays import _problems
+from mixpose.search.guesses import from_slips, kinds_of_guesses
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.sensors import PinholeCamera
 
@@ -76,3 +80,35 @@ def test_triangles_are_brought_onto_their_images_by_the_motion_between_them() ->
                 @ from_parts(np.eye(3), -centre)
             )
             assert np.linalg.norm(transform(turn @ T, here) - there) > off
+
+
+def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    def kinds(false: int) -> list[str]:
+        views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
+        seen = sensor_detections(views, EIGHT, PeakOptions())
+        batches = [one(0) for one in kinds_of_guesses(seen, EIGHT, THOROUGH, 0)]
+        return [one.__name__ for one in batches if isinstance(one, GeneratorType)]
+
+    triples, point, rays = "from_point_triples", "from_point_and_rays", "from_three_rays"
+    assert kinds(8) == [triples, point, rays, rays]
+    assert kinds(9) == [triples, rays, rays, point]  # more than two detections for a feature
+
+
+def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
+    # 8 of 56 rays in one place: of triples drawn anywhere 1 in 500 is of them, of a ray and two
+    # of the 7 nearest to it 1 in 7
+    K = np.array([[800.0, 0, 640], [0, 800.0, 512], [0, 0, 1]])
+    camera = PinholeCamera(K, resolution=(1280, 1024))
+    y = camera.project(transform(TRUTH, EIGHT.means) + np.array([0.0, 0.0, 2000.0]))[0]
+    u, v = np.meshgrid(np.linspace(20, 1260, 8), np.linspace(20, 1000, 6))
+    far = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays = camera.rays(np.concatenate([y, far]))
+    assert rays is not None
+    rng, most = np.random.default_rng(0), 4 * THOROUGH.chunk
+    chunks = list(_problems(rays, EIGHT.means, most, THOROUGH, rng))
+    own = [float((triples < 8).all(axis=0).mean()) for triples, _ in chunks]
+    assert len(chunks) == 4  # one for each crowd and one for all
+    assert own[0] == pytest.approx(1 / 7, rel=0.1)
+    assert own[3] == pytest.approx(8 * 7 * 6 / (56 * 55 * 54), rel=0.7)

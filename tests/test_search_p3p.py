@@ -3,8 +3,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
 from mixpose.search.alignment import align_triples
+from mixpose.search.budget import SearchBudget
+from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.p3p import SIDES, depths
+from mixpose.sensors import PinholeCamera
 
 
 def random_problems(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -71,3 +75,18 @@ def test_triangles_of_which_corners_are_at_one_place_are_aligned_by_a_rotation()
         (T,) = align_triples(triangle, triangle + 10.0)
         # no direction of the plane is given, but it must be a rotation all the same
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_five_detections_of_a_body_of_36_features_are_enough_for_all_draws() -> None:
+    # 428,400 problems, more than are tried in turn: most are drawn among near ones
+    rng = np.random.default_rng(0)
+    features = rng.uniform(-100, 100, (36, 3))
+    T = from_rotation_vector([0.3, -0.2, 0.1], [10.0, -20.0, 900.0])
+    camera = PinholeCamera(np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]]))
+    near = np.argsort(np.linalg.norm(features - features[0], axis=1))[:5]
+    rays = camera.rays(camera.project(transform(T, features[near]))[0])
+    budget = SearchBudget()
+    found = list(from_three_rays(rays, features, 40_000, budget, rng))
+    # one chunk of those far apart, and four that are drawn, the last among all five
+    assert len(found) == 5
+    assert rotation_angle_deg(T, np.concatenate(found)).min() < 0.1

@@ -15,14 +15,14 @@ from mixpose.errors import SessionError
 from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search import THOROUGH, Candidate, SearchBudget, SearchState, search_frame
+from mixpose.search import LIVE, THOROUGH, Candidate, SearchBudget, SearchState, search_frame
 from mixpose.search.alignment import align_triples
 from mixpose.sensors import ParallelBeam
 from mixpose.tracking import estimate_pose
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from benchmarks.search_cases import Row, Trial, absent, errors, is_right, trial
+from benchmarks.search_cases import Row, Trial, absent, crowded_absent, errors, is_right, trial
 
 ALL = np.ones(6, dtype=np.bool_)
 
@@ -124,6 +124,15 @@ def test_poses_that_the_best_leaves_no_chance_are_no_candidates() -> None:
     result = search_frame(frame.views, frame.body, free=ALL, T_reference=None, budget=everyone)
     assert len(result.candidates) > len(evidence)
     assert result.candidates[0].evidence == evidence[0]
+
+
+def test_poses_that_no_fit_can_save_are_no_candidates() -> None:
+    # 20 markers among 40 false detections a view: the best by chance has some -27 nats
+    frame = crowded_absent(20, 40, 0)
+    result = search_frame(frame.views, frame.body, free=ALL, T_reference=None, budget=LIVE)
+    first, *others = [one.evidence for one in result.candidates]
+    assert first < THOROUGH.hopeless
+    assert others == []
 
 
 def test_a_false_detection_beside_a_hidden_feature_does_not_draw_what_was_found() -> None:

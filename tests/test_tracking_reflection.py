@@ -14,6 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.reflection import _is_flat
 
 Floats = NDArray[np.float64]
 
@@ -85,3 +86,16 @@ def test_a_body_few_of_whose_markers_are_seen_beside_false_ones_is_not_its_mirro
     views = detect(pinhole_cameras, BODY, TRUTH, noise=0.2, hidden=1, false=3)
     tracker = Tracker.create(BODY, EstimatorOptions())
     assert tracker.advance(tracker.begin(), 0, None, views)[1].status == "ok"
+
+
+def test_a_body_in_a_plane_is_its_own_mirror_image() -> None:
+    along = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    places = np.random.default_rng(1).uniform(-80, 80, (7, 2)) @ along[:2] + 20.0
+
+    def body(points: Floats) -> Body:
+        return Body("plane", tuple(PointFeature(point) for point in points))
+
+    # what rounding leaves is 1e-15 of its size; a marker 10 um before it is worth a look
+    assert _is_flat(body(places))
+    assert not _is_flat(body(places + 0.01 * np.eye(7)[:, :1] * along[2]))
+    assert _is_flat(body(places[:2]))

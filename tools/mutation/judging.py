@@ -103,6 +103,14 @@ _EVIDENCE = (
         "of a rig of many cameras a body with a covered marker is lost",
     ),
     Mutant(
+        "judgement-blind-cameras-miss-each-feature",
+        "judgement/evidence.py",
+        "< detection.log_blind\n",
+        "< -np.inf\n",
+        "a body that one of several cameras does not see at all is never sure",
+        ("test_judgement_evidence.py",),
+    ),
+    Mutant(
         "judgement-misses-are-free",
         "judgement/evidence.py",
         "return math.log(1 - self.probability)",

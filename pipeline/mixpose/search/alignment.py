@@ -69,7 +69,7 @@ def _frames(triangles: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Cross products of vectors (3, K)."""
+    """Cross products of vectors (3, ...)."""
     return np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )

@@ -74,7 +74,7 @@ def _problems(
         crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]
         yield (
             _drawn(near_rays, min(crowd, M), budget.chunk, rng),
-            _drawn(near_features, min(crowd // 2, n), budget.chunk, rng),
+            _drawn(near_features, min(max(crowd // 2, 3), n), budget.chunk, rng),
         )
 
 

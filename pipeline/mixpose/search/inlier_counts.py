@@ -15,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.search.alignment import cross
 from mixpose.search.budget import LabelOptions
 from mixpose.search.detections import SensorDetections
 from mixpose.sensors import Rays
@@ -133,9 +134,9 @@ def _axes(directions: Floats) -> Floats:
     """Two axes across the middle of rays, and the middle itself (3, 3)."""
     middle = directions.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
-    side = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
+    side = cross(middle, np.eye(3)[np.abs(middle).argmin()])
     side /= np.linalg.norm(side)
-    return np.array([side, np.cross(middle, side), middle])
+    return np.array([side, cross(middle, side), middle])
 
 
 def _drawn(places: Floats, radii: Floats, columns: int, rows: int) -> tuple[Integers, Integers]:

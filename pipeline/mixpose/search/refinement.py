@@ -74,18 +74,18 @@ class Descent:
         Returns
         -------
         (K, 4, 4) array
-            The poses left, best first: by the cosine between observed and predicted densities,
-            summed over sensors.
+            The poses left.  Where they are too many, the best: by the cosine between observed and
+            predicted densities, summed over sensors.
         """
         for stage in stages:
             objective = self.objective(stage.factors)
             for _ in range(stage.steps):
                 poses = self._stepped(objective, poses)
-            # a sum of shares k/n, not of their squares: what counts is how many features are met
-            values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
-            order = np.argsort(-values, kind="stable")
-            order = order[unlike(self._body, poses[order], self._options.same)]
-            poses = poses[order[: stage.survivors]]
+            if len(poses) > stage.survivors:
+                # of shares k/n, not of their squares: what counts is how many features are met
+                values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
+                poses = poses[np.argsort(-values, kind="stable")]
+            poses = poses[unlike(self._body, poses, self._options.same)[: stage.survivors]]
         return poses
 
     def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:

@@ -102,6 +102,9 @@ class _Run:
         self._quick_descent = self._descent
         if few is not body:
             self._quick_descent = Descent(seen, few, constraint.free, budget.descent)
+        plan = budget.descent_plan if self._by_evidence else budget.wide_plan
+        self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
+        self._explainable = sum(min(image.count, len(body)) for image in self._images)
         self._poses = np.zeros((0, 4, 4))
         self._ranks, self._met = np.zeros(0), np.zeros(0)
         self.report = SearchReport()
@@ -183,12 +186,15 @@ class _Run:
         Where the evidence of several cameras is beyond doubt, only a pose that explains most of
         the detections could still be better.
         """
-        if len(self._detections) > 1 and self._is_beyond_doubt():
-            best = self._poses[self._ranks.argmax()]
-            explainable = sum(min(image.count, len(self._body)) for image in self._images)
-            explained = int(self._count(self._body, best[None])[0]) / max(explainable, 1)
-            return max(self._coverage(), explained) >= self._budget.sufficient
-        return self._coverage() >= self._budget.convincing
+        budget, coverage = self._budget, self._coverage()
+        if coverage >= budget.convincing:
+            return True
+        if len(self._detections) < 2 or not self._is_beyond_doubt():
+            return False
+        best = self._poses[self._ranks.argmax()]
+        return coverage >= budget.sufficient or (
+            int(self._count(self._body, best[None])[0]) >= budget.sufficient * self._explainable
+        )
 
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
@@ -205,11 +211,8 @@ class _Run:
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
-        budget, count = self._budget, len(self._detections)
         self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        plan = budget.descent_plan if self._by_evidence else budget.wide_plan
-        stages = [Stage((factor,) * count, steps, budget.survivors) for factor, steps in plan]
-        return self._quick_descent.refine(guesses, stages) if len(guesses) else guesses
+        return self._quick_descent.refine(guesses, self._stages) if len(guesses) else guesses
 
     def _blunt(self) -> Floats:
         """Refined poses of all orientations on blurred densities."""
@@ -237,7 +240,7 @@ class _Run:
             best = float(ranks.max(initial=0.0))
             improved = best > budget.improvement * checked + 1
             checked = best if improved else checked
-            if improved and self._is_found(poses[: budget.checked]):
+            if improved and self._is_found(poses[: budget.checked], best):
                 rest = slice(budget.checked, budget.checked + budget.finalists)
                 poses, ranks = poses[rest], ranks[rest]
                 break
@@ -259,11 +262,14 @@ class _Run:
         self.report = replace(self.report, tested=self.report.tested + len(poses))
         return poses
 
-    def _is_found(self, guesses: Floats) -> bool:
+    def _is_found(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras leave no need for others."""
+        budget = self._budget
         if not self._by_evidence or len(self._detections) < 2:
             return False
-        if self._judged(guesses)[0].max() < self._budget.hopeless:
+        if explained < budget.sufficient * self._explainable and (
+            self._judged(guesses)[0].max() < budget.hopeless
+        ):
             return False
         self._keep(self._descended(guesses))
         return self._is_beyond_doubt() and self._is_settled()

@@ -10,6 +10,7 @@ the first frames.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -26,10 +27,12 @@ Floats: TypeAlias = NDArray[np.float64]
 
 MIRRORED = "it shows the body's mirror image"
 
+_FLAT = 1e-6  # thickness by length, below which no camera tells one side's markers from the other's
+
 
 def is_reflection(data: FrameData, judged: Judged) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
-    if not data.body.is_exact or not judged.associations:
+    if not data.body.is_exact or not judged.associations or _is_flat(data.body):
         return False
     ahead, met = data.rules.acceptance.standing_out, _met(judged, data.body)
     # of these the mirror image may meet more than the body
@@ -55,6 +58,13 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
     found = [one for one in candidates_of(mirror) if one.evidence > least]
     starts = starts_at(mirror, found)
     return any(_evidence(mirror, start) > own + ahead for start in starts)
+
+
+@lru_cache(maxsize=16)
+def _is_flat(body: Body) -> bool:
+    """Whether a turn brings the body onto its mirror image."""
+    extents = np.linalg.svd(body.means - body.means.mean(axis=0), compute_uv=False)
+    return len(extents) < 3 or bool(extents[2] < _FLAT * extents[0])
 
 
 def _is_by_chance(data: FrameData, judged: Judged) -> bool:

@@ -87,13 +87,17 @@ def read_rigs(paths: Sequence[Path], *, also: str = "") -> list[Rig]:
         formats.setdefault(format_found.name, (format_found, []))[1].append(content)
     rigs: list[Rig] = []
     for each, contents in formats.values():
-        with in_file(contents[0].name):
+        with in_file(_names_of(contents)):
             groups = each.groups(contents) if each.groups else [[one] for one in contents]
         for group in groups:
-            with in_file(group[0].name):
+            with in_file(_names_of(group)):
                 cameras = tuple(each.read(group, name, "pinhole") for name in each.names(group))
             rigs.append(Rig(tuple(content.name for content in group), cameras))
     return rigs
+
+
+def _names_of(contents: Sequence[Content]) -> str:
+    return " and ".join(content.name for content in contents)
 
 
 def format_of(content: Content, also: str = "") -> Format:

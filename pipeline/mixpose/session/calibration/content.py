@@ -12,6 +12,7 @@ from typing import Any
 from mixpose.session.calibration.yaml_text import parse_yaml
 from mixpose.session.messages import BadKeyError, in_file
 from mixpose.session.text_files import as_text, read_bytes
+from mixpose.session.toml_text import parse_toml
 
 # how a NumPy array, an archive of them, and a pickle of Python begin
 _NO_TEXT = (b"\x93NUMPY", b"PK\x03\x04", b"\x80")
@@ -47,14 +48,23 @@ class Content:
         Raises
         ------
         BadKeyError
-            If it is neither.
+            If it is neither; by its name's ending, why it is no TOML or JSON.
         """
+        no_json = ""
         if self.text.lstrip().startswith("{"):
             try:
                 return json.loads(self.text)
-            except (ValueError, RecursionError):
-                pass  # YAML allows braces too, and says where it fails
-        return parse_yaml(self.text)
+            except (ValueError, RecursionError) as error:
+                no_json = f"not JSON: {error}"  # YAML allows braces too
+        try:
+            return parse_yaml(self.text)
+        except BadKeyError:
+            ending = Path(self.name).suffix.lower()
+            if ending == ".toml":
+                parse_toml(self.text)
+            if ending == ".json" and no_json:
+                raise BadKeyError(no_json) from None
+            raise
 
     @cached_property
     def mapping(self) -> dict[Any, Any]:

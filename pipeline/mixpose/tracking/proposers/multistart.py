@@ -37,14 +37,15 @@ def multistart(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
 
 
 def _descended(data: FrameData, starts: Sequence[Floats], uncertainty: Floats) -> Floats:
-    """Poses (K, 4, 4) that starts lead to through narrowing blurs and that meet anything."""
+    """Poses (K, 4, 4) that starts lead to and that meet anything, best first."""
     rules, sigmas = data.rules.proposals, np.array(data.sigmas)
     levels = blur_schedule(data.views, data.body, starts[0], uncertainty)
     stages = [Stage(tuple(level / sigmas), rules.steps, len(starts)) for level in levels]
     descent = Descent(data.views, data.body, data.free, data.rules.search.descent)
     poses = descent.refine(np.array(starts), stages)
     values = descent.objective().value(poses)
-    return poses[values > data.rules.fit.near * len(data.views)]
+    order = np.argsort(-values, kind="stable")
+    return poses[order[values[order] > data.rules.fit.near * len(data.views)]]
 
 
 def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
