@@ -38,7 +38,7 @@ _NEAR = (
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "if here.value >= rules.near * len(views):",
+        "if blur < 1 or here.value >= rules.near * len(views):",
         "if here.value >= 0.0:",
         "a start some widths off is never corrected",
     ),

@@ -285,7 +285,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-worse-twin-kept",
         "judgement/acceptance.py",
-        "if new.log_evidence > old.log_evidence - rules.as_evident:",
+        "if new.log_evidence > old.log_evidence + more - rules.as_evident:",
         "if new.log_evidence < old.log_evidence:",
         "of two fits that are one pose the worse is told",
     ),

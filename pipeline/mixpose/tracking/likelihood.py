@@ -28,13 +28,7 @@ from mixpose.judgement import (
     judge,
     nearest_alike,
 )
-from mixpose.objective import (
-    MatchedObjective,
-    View,
-    in_image,
-    matched_objective,
-    project_body,
-)
+from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.optimise import Ascent
 from mixpose.records import SensorReport
 from mixpose.rigid import twist_between
@@ -68,7 +62,7 @@ class Start:
     T_moved : (4, 4) float64 or None
         A pose that has moved as this one must have, and was as likely before the frame.
     blur : float
-        In σ_ε, from which the fit goes on to narrower ones.
+        In σ_ε, that the fit begins at.
     """
 
     T_world_object: Floats
@@ -310,12 +304,10 @@ class MatchedLikelihood:
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
         climbed = self.climbed.setdefault(frozenset(start.left_out), [])
         timed, begun = is_timed(data.views), None
-        is_first = data.predictions and start.prediction is data.predictions[0]
-        if data.begun and is_first and start.blur == 1:
+        if data.begun and data.predictions and start.prediction is data.predictions[0]:
             begun = data.begun.ascent
             if data.begun.fit is not None:
                 return data.begun.fit
-
         given = data.given(start.T_world_object) if self.knows_detections else 0.0
 
         def climb(seen: FrameData, T_start: Floats, beside: float = 0.0) -> Fit:

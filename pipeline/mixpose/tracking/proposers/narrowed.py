@@ -31,7 +31,7 @@ def narrowed(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterabl
     narrowest = errors.blur * float(np.sqrt(variances.max()))
     for one in data.predictions:
         for blur in [blur for blur in data.rules.proposals.blurs if blur > narrowest]:
-            start = Start(one.T_world_object, one.uncertainty, one, blur=blur)
+            start = Start(one.T_world_object, one.uncertainty, blur=blur)
             found = likelihood.judge(likelihood.fit(start), start)
             if _agree(found, largest):
                 yield Start(found.T_world_object)
