@@ -68,7 +68,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-companions-for-nothing",
         "tracking/companion.py",
-        "share = 0.5 *",
+        "share = rules.beside *",
         "share = 1e-9 *",
         "a limb that is lost is not found again by where it was beside the next one",
         (_SCENES,),

@@ -78,7 +78,7 @@ def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
     Either may hold, the other body the less the longer this one was away.  As both are densities
     of poses, no more of the poses made by chance are believed than without the other body.
     """
-    share = 0.5 * (1 - rules.surprise) ** misses
+    share = rules.beside * (1 - rules.surprise) ** misses
     mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
     spread = own.spread if mine > theirs else beside.spread
     return Prior(float(np.logaddexp(mine, theirs)), spread)

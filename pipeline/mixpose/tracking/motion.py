@@ -32,7 +32,9 @@ class MotionRules:
     widening: float = constant(1.5, "of the uncertainty, per frame without a pose")
     widest: float = constant(4.0, "the most it widens by, but for a tenth per further frame")
     unknown_rotation_deg: float = constant(
-        30.0, "ranges: from one frame to the next, before any motion was seen"
+        30.0,
+        "from one frame to the next, before any motion was seen (ranges); of a body about where it "
+        "was beside another one, which counts as `known_from` frames",
     )
     unknown_distance: float = constant(1.0, "the same, of the body's radius")
     guess_weight: float = constant(
@@ -47,6 +49,11 @@ class MotionRules:
     )
     surprise: float = constant(
         0.02, "chance per frame that the body is somewhere else than predicted"
+    )
+    beside: float = constant(
+        0.5,
+        "weight of where another body lets a lost one be expected, against its own track: nobody "
+        "knows how often they part; a wrong one costs half of the odds",
     )
     start_rotation_deg: float = constant(5.0, "uncertainty of a [start] that states none")
     start_distance: float = constant(0.1, "the same, of the body's radius: 6° at the rim")
