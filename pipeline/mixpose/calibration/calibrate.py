@@ -188,10 +188,11 @@ class _Run:
         adjusted = self._adjusted(part, self._start.rig, None)
         good = met_share(adjusted, part.frames, self._task) > rules.least_met
         bad = _left_out(part, good)
-        if bad:
-            part = _Part(part.frames, adjusted.poses).only(good)
-            self._progress("adjusting without bad frames", 1, _STAGES)
-            adjusted = self._adjusted(part, adjusted.rig, self._again(adjusted))
+        part = replace(part, poses=adjusted.poses)
+        part = part.only(good) if bad else part
+        # from wider blurs, as features that crowd let the noise that is learnt first be too small
+        self._progress("adjusting again, without bad frames", 1, _STAGES)
+        adjusted = self._adjusted(part, adjusted.rig, self._again(adjusted))
         part = replace(part, poses=adjusted.poses)
         self._place_latecomers(part, adjusted)
         if self._late:
