@@ -141,7 +141,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "rarity[:, None] - _costs(one, variance, spreads)",
+        "rarity[:, None] - _costs(one, spreads)",
         "rarity[:, None]",
         "a pose that meets features loosely is as good as one that meets them",
     ),

@@ -12,6 +12,7 @@ from mixpose.density.extraction_error import (
     errors_seen,
     log_likelihood,
     pooled,
+    sums_of,
 )
 from mixpose.density.features_met import (
     AssociationRules,
@@ -47,5 +48,6 @@ __all__ = [
     "pooled",
     "render",
     "self_overlap",
+    "sums_of",
     "surplus",
 ]

@@ -88,7 +88,7 @@ class Atlas:
     ) -> None:
         L, n, reach = len(patterns), steps_per_sigma, REACH * steps_per_sigma + _BESIDE
         dimensions = [_dimension(pattern) for pattern in patterns]
-        self._has_flat, self._is_flat = 1 in dimensions, np.array(dimensions) == 1
+        self._is_flat = np.array(dimensions) == 1
         self._sigma = math.sqrt(n**2 - _SPLINE)  # what is drawn, in cells
         widths = [sigma * self._sigma / n for sigma in sigmas]
         tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
@@ -121,7 +121,7 @@ class Atlas:
         self._columns = self._most * plane.side // _LARGEST + 1
         self._drawn = self._columns  # the first row is of squares without anything
         self.values = np.zeros((plane.side, self._columns * plane.side, 3), dtype=np.float32)
-        # from a place in the planes to one in the array, by page
+        # from a place in the planes to one in the array, by page; from nothing out of the array
         self._shifts = np.array([(FAR, FAR)] * self._columns)
 
     def look_up(self, y: Floats) -> Floats:
@@ -224,7 +224,7 @@ class Atlas:
         begin = (found.q[of] - corner[number]) * (1 / self._sigma)
         away = begin.astype(np.float32)[..., None] - self._cells
         bells = np.exp(np.float32(-0.5) * away * away)
-        if self._has_flat:  # rows that are all alike
+        if self._is_flat.any():  # rows that are all alike
             flat = self._is_flat[found.sensor[of]]
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
         bells[:, 1] *= found.share[of, None]
@@ -301,7 +301,8 @@ class Plane(NamedTuple):
         """
         page = max(math.ceil(reach / REACH), MIN_GRID_PAGE) if corners else PAGE
         grids = np.concatenate(list(corners.values())) if corners else q
-        lower, upper = (q if len(q) else grids).min(axis=0), (q if len(q) else grids).max(axis=0)
+        places = q if len(q) else grids
+        lower, upper = places.min(axis=0), places.max(axis=0)
         if len(q) and _count(lower, upper, page) > MANY_PAGES:
             several = math.ceil(page * math.sqrt(_count(lower, upper, page) / MANY_PAGES))
             page = min(several, math.ceil(2 * reach))

@@ -14,6 +14,7 @@ what is known upwards, and the likelier noise counts.  Lengths are in σ_ε of t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -85,6 +86,11 @@ class Noise:
     def joined(self, other: Noise) -> Noise:
         """Together with another one."""
         return Noise(self.squares + other.squares, self.degrees + other.degrees)
+
+
+def sums_of(noises: Sequence[Noise]) -> Floats:
+    """Squares and degrees of freedom (2, L) of the noise of L sensors."""
+    return np.array([(one.squares, one.degrees) for one in noises]).T
 
 
 class Offsets(NamedTuple):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood
+from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood, sums_of
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.misfitting_body import believed
@@ -254,7 +254,7 @@ def _to_the_noise(
     blur: float = 1.0,
 ) -> Ascent[Floats]:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
-    known = np.array([(one.squares, one.degrees) for one in noise]).T
+    known = sums_of(noise)
     sigmas = np.array([view.observation.sigma for view in objective.views])
     blurs, count = np.full(len(sigmas), blur), int(free.sum())
     likeliest, best = -np.inf, ascent

@@ -204,8 +204,8 @@ def insert(
     """Keep a list of distinct poses, the most evident first."""
     for k, old in enumerate(ranked):
         if _alike(old, new, body, free, rules):
-            # residuals as before are likelier than larger ones of fewer spots that are off
-            more = rules.unlike * ((new.surplus > 1) - int(old.surplus > 1))
+            # residuals as before are likelier than larger ones, though more spots are off for them
+            more = rules.unlike * (int(new.is_unlike) - int(old.is_unlike))
             if new.log_evidence > old.log_evidence + more - rules.as_evident:
                 ranked[k] = new
             break

@@ -111,11 +111,11 @@ class SensorMatches:
     shares : (H, N) float64
         How far each was met, 0 to its weight.
     offsets : (H, N, m) float64
-        Observed minus predicted places, in σ_ε; 0 where not met.
+        Observed minus predicted places, in σ_ε or units of the noise; 0 where not met.
     by_world : (H, N, m, 3) float64
-        How predicted places change as the feature moves in the world, σ_ε per length.
+        How predicted places change as the feature moves in the world, likewise, per length.
     crowd : (H,) float64
-        Observed features per σ_ε^m.
+        Observed features per m-th power of that.
     count : (H,) float64
         Number of observed features.
     """
@@ -191,7 +191,7 @@ def log_evidence(
         Covariances of features in the world, of bodies that give way.
     """
     matches = _matches_of(found, variances)
-    odds = odds_of(matches, np.ones(len(variances)), sizes, detection, spreads)
+    odds = odds_of(matches, sizes, detection, spreads)
     unseen = found.gathered("unseen").sum(axis=1) * detection.log_unseen
     odds = odds._replace(missed=odds.missed + unseen)
     # a direction that the data leave open is as uncertain as before
@@ -207,7 +207,6 @@ def log_evidence(
 
 def odds_of(
     matches: Sequence[SensorMatches],
-    variance: Floats,
     sizes: Floats,
     detection: DetectionModel,
     spreads: Floats | None = None,
@@ -217,9 +216,7 @@ def odds_of(
     Parameters
     ----------
     matches : sequence of SensorMatches
-        One per sensor.
-    variance : (H,) array
-        Of offsets, in σ_ε².
+        One per sensor, in units of its noise.
     sizes : (H,) array
         Of the body, length units.
     detection : DetectionModel
@@ -232,9 +229,9 @@ def odds_of(
     is_met = np.zeros(shape, dtype=np.bool_)
     for one in matches:
         m = one.offsets.shape[2]
-        density = one.crowd * (2 * np.pi * variance) ** (m / 2)
+        density = one.crowd * (2 * np.pi) ** (m / 2)
         rarity = np.log(detection.probability / np.maximum(density, 1e-300))
-        gain = one.shares * np.maximum(rarity[:, None] - _costs(one, variance, spreads), 0.0)
+        gain = one.shares * np.maximum(rarity[:, None] - _costs(one, spreads), 0.0)
         miss, shares = (one.weights - one.shares) * detection.log_missed, one.shares
         # what a sensor that is covered, blurred or out of step meets, it meets by chance
         is_blind = (gain + miss).sum(axis=1, keepdims=True) < detection.log_blind
@@ -255,7 +252,7 @@ def odds_of(
     together = np.nonzero(np.sum(near, axis=0) > 1)
     if detection.in_space and len(together[0]):
         given = None if spreads is None else spreads[together]
-        space, share = _in_space(matches, near, together, variance, sizes[together[0]], given)
+        space, share = _in_space(matches, near, together, sizes[together[0]], given)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
@@ -264,14 +261,13 @@ def odds_of(
     return Odds(gained.sum(axis=1), missed.sum(axis=1), coordinates.sum(axis=1))
 
 
-def _costs(one: SensorMatches, variance: Floats, spreads: Floats | None) -> Floats:
+def _costs(one: SensorMatches, spreads: Floats | None) -> Floats:
     """What offsets (H, N) cost in a sensor: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
     if spreads is None:
-        return np.asarray((one.offsets**2).sum(axis=2) / (2 * variance[:, None]))
+        return np.asarray((one.offsets**2).sum(axis=2) / 2)
     m = one.offsets.shape[2]
-    J = one.by_world / np.sqrt(variance)[:, None, None, None]
-    S = np.eye(m) + J @ spreads @ J.swapaxes(2, 3)
-    r = (one.offsets / np.sqrt(variance)[:, None, None])[..., None]
+    S = np.eye(m) + one.by_world @ spreads @ one.by_world.swapaxes(2, 3)
+    r = one.offsets[..., None]
     away = (r * np.linalg.solve(S, r)).sum(axis=(2, 3))
     return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
 
@@ -280,7 +276,6 @@ def _in_space(
     matches: Sequence[SensorMatches],
     near: Sequence[NDArray[np.bool_]],
     chosen: tuple[NDArray[np.intp], ...],
-    variance: Floats,
     sizes: Floats,
     spreads: Floats | None,
 ) -> tuple[Floats, Floats]:
@@ -295,7 +290,7 @@ def _in_space(
         if one.offsets.shape[2] != 2:
             continue
         J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
-        weighted = J * (met / variance[chosen[0]])[:, None, None]
+        weighted = J * met[:, None, None]
         A += weighted.swapaxes(1, 2) @ J
         b += (weighted.swapaxes(1, 2) @ r[..., None])[..., 0]
         share = np.maximum(share, met * one.shares[chosen])

@@ -91,6 +91,11 @@ class Judged:
     surplus: float = 0.0
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
+    @property
+    def is_unlike(self) -> bool:
+        """Whether its residuals are larger than chance makes them."""
+        return self.surplus > 1
+
 
 @dataclass(frozen=True)
 class Case:

@@ -33,7 +33,7 @@ from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled
+from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled, sums_of
 from mixpose.judgement.association import Association
 from mixpose.judgement.lasting import Lasting, LastingRules
 from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
@@ -177,8 +177,7 @@ def _level(
     associations: Sequence[Association], count: int, before: Residuals, model: NoiseModel
 ) -> _Level:
     offsets = joined_offsets(associations)
-    last = [before.noise.get(one.name, Noise()) for one in associations]
-    past = np.array([(one.squares, one.degrees) for one in last]).T
+    past = sums_of([before.noise.get(one.name, Noise()) for one in associations])
     sums = model.memory * past
     seen = errors_seen(offsets, count, sums, model.errors)
     surplus = _surplus(past, seen, model)

@@ -54,8 +54,7 @@ def evidence(
     variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
     variance /= degrees + spare
     matches = [one.in_units_of(np.sqrt(v)) for one, v in zip(matches, variance, strict=True)]
-    ones = np.ones(len(poses))
-    odds = odds_of(matches, ones, np.full(len(poses), 2 * body.radius), _DETECTION)
+    odds = odds_of(matches, np.full(len(poses), 2 * body.radius), _DETECTION)
     unseen = np.count_nonzero(at.faced & ~at.seen, axis=(0, 2)) * _DETECTION.log_unseen
     return paid_by_count(odds, matches, free) + unseen, met.mean(axis=0)
 

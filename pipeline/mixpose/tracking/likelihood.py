@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Noise, errors_seen
+from mixpose.density import Noise, errors_seen, sums_of
 from mixpose.fit import Climbed, EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
 from mixpose.judgement import (
     Association,
@@ -272,7 +272,7 @@ class FrameData:
         views = [(self.still or self).views[k] for k in chosen]
         blurs = np.ones(len(found))
         if velocity is not None:
-            known = np.array([(self.noise[k].squares, self.noise[k].degrees) for k in chosen]).T
+            known = sums_of([self.noise[k] for k in chosen])
             errors = self.rules.judgement.noise.errors
             noise = errors_seen(joined_offsets(found), int(self.free.sum()), known, errors).blurs
             pairs = zip(found, views, strict=True)

@@ -13,20 +13,19 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from mixpose.density import pooled
+from mixpose.density import pooled, sums_of
 from mixpose.judgement import Judged
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 
 
 def narrowed(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
     """The predictions at narrow blurs, where residuals are larger than chance makes them."""
-    if judged.surplus <= 1 or not likelihood.knows_detections:
+    if not judged.is_unlike or not likelihood.knows_detections:
         return
     if any(view.observation.cell is not None for view in data.views):
         return
     errors = data.rules.judgement.noise.errors
-    known = np.array([(one.squares, one.degrees) for one in data.noise]).T
-    variances = pooled(known, errors, errors.typical_degrees)
+    variances = pooled(sums_of(data.noise), errors, errors.typical_degrees)
     largest = {view.name: errors.outlying**2 * v for view, v in zip(data.views, variances)}
     narrowest = errors.blur * float(np.sqrt(variances.max()))
     for one in data.predictions:
