@@ -49,9 +49,6 @@ MIN_GRID_TILE = 18
 MOST_OWN = 128
 """Places that have tiles of their own: those of more are often on pages that are drawn already."""
 
-MOST_PAIRS = 20_000
-"""The same, of places and detections: a page is tested for the detections on it once only."""
-
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
 _AT_ONCE = 300_000  # cells or pairs that are worked on together: they stay in the cache
@@ -109,8 +106,7 @@ class Atlas:
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
-        count = index.size // 2
-        if self._grids or count > MOST_OWN or count * self._most > MOST_PAIRS:
+        if self._grids or index.size > 2 * MOST_OWN:
             self._to_pages(index)
         else:
             self._to_own_tiles(index)
