@@ -2,47 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TypeAlias
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.body import Body
 from mixpose.density import AssociationRules, ErrorRules, crowding
 from mixpose.judgement import DetectionModel, SensorMatches, odds_of, paid_by_count
 from mixpose.objective import project_body
+from mixpose.records import Floats
 from mixpose.search.detections import SensorDetections
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.search.problem import SearchProblem
 
 _DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
-def evidence(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    poses: Floats,
-    free: NDArray[np.bool_],
-    gate: float,
-) -> tuple[Floats, Floats]:
-    """Log odds (H,) of poses against clutter, paid by count, and shares (H,) of the body met.
+def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count, and shares of the body met.
 
-    Parameters
-    ----------
-    detections : sequence of SensorDetections
-        Sensors without detections (range profiles) do not take part.
-    body : Body
-    poses : (H, 4, 4) array
-    free : (6,) bool
-    gate : float
-        Within which a detection is met, in σ_ε.
+    Sensors without detections (range profiles) do not take part.
     """
-    seen = [one for one in detections if len(one.points)]
+    body, free = problem.body, problem.free
+    seen = [one for one in problem.detections if len(one.points)]
     at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
     parts = zip(seen, at.y, at.J, at.seen, strict=True)
-    matches = [_matches_of(one, y, J, visible, gate) for one, y, J, visible in parts]
+    matches = [_matches_of(problem.reach(one), one, y, J, visible) for one, y, J, visible in parts]
     found = np.array([one.shares.sum(axis=1) for one in matches])
     met = found / np.maximum([one.weights.sum(axis=1) for one in matches], 1.0)
     squares = np.array([(one.offsets**2).sum(axis=(1, 2)) for one in matches])
@@ -60,13 +43,13 @@ def evidence(
 
 
 def _matches_of(
-    seen: SensorDetections, y: Floats, J: Floats, visible: NDArray[np.bool_], gate: float
+    reach: float, seen: SensorDetections, y: Floats, J: Floats, visible: NDArray[np.bool_]
 ) -> SensorMatches:
     """What a sensor has at places (H, n, 2), with the Jacobians (H, n, 2, 6) by the pose."""
     points, sigma, m = seen.points, seen.sigma, seen.points.shape[1]
     y = y[..., :m]
     pose, feature = np.nonzero(visible)
-    away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=gate * sigma)
+    away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=reach)
     # a detection is met by the nearest of the features to which it is the nearest
     near = np.flatnonzero(np.isfinite(away))
     key = pose[near] * len(points) + nearest[near]
