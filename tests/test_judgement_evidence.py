@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.judgement import Association, DetectionModel, Prior
+from mixpose.judgement import Association, DetectionModel, Matches, Prior
 from mixpose.judgement.evidence import log_evidence
 from mixpose.judgement.noise import information_of
-from mixpose.judgement.stacked import Stacked
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +48,7 @@ def odds_at(
 ) -> float:
     """Of one pose."""
     variances, sizes = np.full((1, len(found)), S2), np.array([size])
-    stacked = Stacked.of([found])
+    stacked = Matches.of([found])
     at_S2 = information[None] / S2
     odds = log_evidence(stacked, variances, FREE, [prior], sizes, model, at_S2, spreads)
     return float(odds[0])
@@ -198,7 +197,7 @@ def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
 
 
 def test_features_that_may_be_off_tell_less_of_the_pose() -> None:
-    both = Stacked.of([two_cameras_at_right_angles()])
+    both = Matches.of([two_cameras_at_right_angles()])
     variances, spreads = np.full((1, 2), S2), np.zeros((1, 6, 3, 3))
     exact = information_of(both, variances)
     np.testing.assert_allclose(information_of(both, variances, spreads), exact)
@@ -214,6 +213,6 @@ def test_information_is_that_of_least_squares() -> None:
     shares = np.array([1.0, 1.0, 0.5, 1.0, 0.0, 1.0])
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))
     np.testing.assert_allclose(
-        information_of(Stacked.of([[replace(SIX, shares=shares)]]), np.array([[S2]]))[0],
+        information_of(Matches.of([[replace(SIX, shares=shares)]]), np.array([[S2]]))[0],
         expected / S2,
     )

@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import Noise
-from mixpose.judgement import Association, NoiseModel, Residuals
+from mixpose.judgement import Association, Matches, NoiseModel, Residuals
 from mixpose.judgement.noise import FrameNoise, noises_of
-from mixpose.judgement.stacked import Stacked
 
 Floats = NDArray[np.float64]
 
@@ -29,7 +28,7 @@ def noise_of(
     model: NoiseModel,
 ) -> FrameNoise:
     """The noise of one frame."""
-    return noises_of(Stacked.of([associations]), free, [before], model)[0]
+    return noises_of([associations], Matches.of([associations]), free, [before], model)[0]
 
 
 def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Association:

@@ -29,13 +29,13 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "_level(associations, int(free.sum()), known, model)",
-        "_level(associations, 0, known, model)",
+        "_level(*one, int(free.sum()), model)",
+        "_level(*one, 0, model)",
         "noise seems smaller than it is",
     ),
     Mutant(
         "judgement-information-in-sigmas",
-        "judgement/stacked.py",
+        "judgement/association.py",
         "= one.J / one.sigma",
         "= one.J",
         "covariances depend on the unit of a sensor",
@@ -43,8 +43,8 @@ _NOISE = (
     Mutant(
         "judgement-unknown-noise-is-sigma",
         "judgement/noise.py",
-        "typical = 0.0 if degrees >= 1 else model.errors.typical_degrees",
-        "typical = 0.0",
+        "0.0 if degrees >= 1 else rules.typical_degrees",
+        "0.0",
         "three features in one camera have an exact pose",
     ),
 )
@@ -53,8 +53,8 @@ _FIELDS = (
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "np.tensordot(shares.variances * factors, frame.parts, 1)",
-        "shares.variances[0] * factors[0] * frame.parts[0]",
+        "np.tensordot(variances * factors, frame.parts, 1)",
+        "variances[0] * factors[0] * frame.parts[0]",
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(
@@ -120,15 +120,15 @@ _EVIDENCE = (
     Mutant(
         "judgement-out-of-view-is-free",
         "judgement/evidence.py",
-        'found.gathered("unseen").sum(axis=1) * detection.log_unseen',
-        "0.0",
+        "unseen = found.unseen.sum(axis=1) * detection.log_unseen",
+        "unseen = 0.0",
         "a pose gains by moving features out of the picture",
     ),
     Mutant(
         "judgement-clutter-of-any-density",
         "judgement/evidence.py",
-        "density = one.crowd *",
-        "density = 1e-6 *",
+        "np.maximum(crowd * (2",
+        "np.maximum(1e-6 * (2",
         "poses in clutter are as sure as poses without",
     ),
     Mutant(
@@ -141,8 +141,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/evidence.py",
-        "rarity[:, None] - _costs(one, spreads)",
-        "rarity[:, None]",
+        "rarity[..., None] - costs",
+        "rarity[..., None]",
         "a pose that meets features loosely is as good as one that meets them",
     ),
     Mutant(
@@ -169,8 +169,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-a-point-in-space-counts-for-each-camera",
         "judgement/evidence.py",
-        "together = np.nonzero(np.sum(near, axis=0) > 1)",
-        "together = np.nonzero(np.sum(near, axis=0) > 9)",
+        "together = np.nonzero(near.sum(axis=1) > 1)",
+        "together = np.nonzero(near.sum(axis=1) > 9)",
         "screws that all cameras see pass for the body",
     ),
     Mutant(

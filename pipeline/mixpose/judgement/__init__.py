@@ -11,12 +11,11 @@ from mixpose.judgement.acceptance import (
     is_possible,
     is_sure,
 )
-from mixpose.judgement.association import Association, associate
+from mixpose.judgement.association import Association, Matches, associate
 from mixpose.judgement.contradiction import APART, contradict, is_far_off
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,
-    SensorMatches,
     flat_prior,
     odds_of,
     paid_by_count,
@@ -41,10 +40,10 @@ __all__ = [
     "DetectionModel",
     "Judged",
     "JudgementRules",
+    "Matches",
     "NoiseModel",
     "Prior",
     "Residuals",
-    "SensorMatches",
     "Verdict",
     "associate",
     "beliefs",

@@ -1,8 +1,9 @@
-"""A pose against one sensor: which features were met, and how closely."""
+"""Poses against sensors: which features were met, and how closely."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -132,6 +133,72 @@ class Association:
         if self.met == 0:
             return None
         return self.sigma * math.sqrt(self.squares / self.met)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """What L sensors have at the N features of a body at K poses, which are worked on at once.
+
+    Every feature has a place, also where a sensor does not have it in view, and every sensor M
+    coordinates; what is not there has no share, no Jacobian and no offset.
+
+    Attributes
+    ----------
+    dimensions : (L,) int
+        Coordinates of each sensor.
+    weights : (K, L, N) float64
+        Of the features in view; 0 of the others.
+    shares : (K, L, N) float64
+        How far each was met, 0 to its weight.
+    places : (K, L, N, M) float64
+        Where they are predicted, sensor units.
+    offsets : (K, L, N, M) float64
+        Observed minus predicted place, in σ_ε.
+    J : (K, L, N, M, 6) float64
+        Jacobian of the predicted places by the pose, in σ_ε; its first three columns are by the
+        place of the feature in the world.
+    crowd : (K, L) float64
+        Observed features per m-th power of σ_ε.
+    count : (K, L) float64
+        Number of observed features.
+    unseen : (K, L) float64
+        Sum of the weights of the features that face a sensor outside its view.
+    """
+
+    dimensions: NDArray[np.intp]
+    weights: Floats
+    shares: Floats
+    places: Floats
+    offsets: Floats
+    J: Floats
+    crowd: Floats
+    count: Floats
+    unseen: Floats
+
+    @classmethod
+    def of(cls, each: Sequence[Sequence[Association]]) -> Matches:
+        """Put the associations of K poses with the same L sensors side by side."""
+        dimensions = np.array([one.J.shape[1] for one in each[0]])
+        all_of_them = [one for found in each for one in found]
+        most = 1 + max(int(one.features.max(initial=0)) for one in all_of_them)
+        shape = len(each), len(dimensions), most
+        weights, shares = np.zeros((2, *shape))
+        places, offsets = np.zeros((2, *shape, int(dimensions.max())))
+        J = np.zeros((*places.shape, 6))
+        for k, found in enumerate(each):
+            for i, one in enumerate(found):
+                n, m = one.offsets.shape
+                at = k, i, one.features
+                weights[at] = one.expected / max(n, 1)
+                shares[at] = one.shares
+                places[(*at, slice(m))] = one.places
+                offsets[(*at, slice(m))] = one.offsets / one.sigma
+                J[(*at, slice(m))] = one.J / one.sigma
+        whole = [
+            (one.crowd * one.sigma ** one.J.shape[1], one.count, one.unseen) for one in all_of_them
+        ]
+        crowd, count, unseen = np.array(whole).reshape(*shape[:2], 3).transpose(2, 0, 1)
+        return cls(dimensions, weights, shares, places, offsets, J, crowd, count, unseen)
 
 
 def associate(

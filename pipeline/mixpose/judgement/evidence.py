@@ -33,7 +33,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -42,7 +42,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.stacked import Stacked
+from mixpose.judgement.association import Matches
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -100,52 +100,16 @@ class Prior:
     spread: Floats
 
 
-@dataclass(frozen=True)
-class SensorMatches:
-    """What one sensor has at the N features of a body at H poses.
-
-    Attributes
-    ----------
-    weights : (H, N) float64
-        Of the features in view; 0 of the others.
-    shares : (H, N) float64
-        How far each was met, 0 to its weight.
-    offsets : (H, N, m) float64
-        Observed minus predicted places, in σ_ε or units of the noise; 0 where not met.
-    by_world : (H, N, m, 3) float64
-        How predicted places change as the feature moves in the world, likewise, per length.
-    crowd : (H,) float64
-        Observed features per m-th power of that.
-    count : (H,) float64
-        Number of observed features.
-    """
-
-    weights: Floats
-    shares: Floats
-    offsets: Floats
-    by_world: Floats
-    crowd: Floats
-    count: Floats
-
-    def in_units_of(self, roots: Floats) -> SensorMatches:
-        """The same with noise of (H,) standard deviations in the place of σ_ε."""
-        r = roots[:, None, None]
-        crowd = self.crowd * roots ** self.offsets.shape[2]
-        return replace(
-            self, offsets=self.offsets / r, by_world=self.by_world / r[..., None], crowd=crowd
-        )
-
-
 class Odds(NamedTuple):
-    """Evidence of H poses before they pay for having been chosen, each (H,).
+    """Evidence of K poses before they pay for having been chosen.
 
     Attributes
     ----------
-    gained : (H,) float64
+    gained : (K,) float64
         Of the features that are met.
-    missed : (H,) float64
-        Of those that are not; negative.
-    coordinates : (H,) float64
+    missed : (K,) float64
+        Of those that are not, and of those out of view; negative.
+    coordinates : (K,) float64
         Number of coordinates that tell anything: three for a point in space.
     """
 
@@ -164,7 +128,7 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 
 
 def log_evidence(
-    found: Stacked,
+    found: Matches,
     variances: Floats,
     free: NDArray[np.bool_],
     priors: Sequence[Prior],
@@ -177,23 +141,15 @@ def log_evidence(
 
     Parameters
     ----------
-    found : Stacked
+    found : Matches
         Of all sensors that saw something.
-    variances : (K, L) array
-        Of the noise of each, in σ_ε².
+    variances, sizes, detection, spreads
+        As `odds_of` has them.
     free : (6,) bool
     priors : sequence of Prior
-    sizes : (K,) array
-        Of the bodies, length units.
-    detection : DetectionModel
     information : (K, 6, 6) array
-    spreads : (K, N, 3, 3) array or None
-        Covariances of features in the world, of bodies that give way.
     """
-    matches = _matches_of(found, variances)
-    odds = odds_of(matches, sizes, detection, spreads)
-    unseen = found.gathered("unseen").sum(axis=1) * detection.log_unseen
-    odds = odds._replace(missed=odds.missed + unseen)
+    odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     wide = np.array([prior.spread for prior in priors])[:, free]
     inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
@@ -201,149 +157,119 @@ def log_evidence(
     log_densities = np.array([prior.log_density for prior in priors])
     evidence = odds.gained + odds.missed + laplace + log_densities
     if detection.by_count:
-        evidence = np.maximum(evidence, paid_by_count(odds, matches, free))
+        evidence = np.maximum(evidence, paid_by_count(odds, found, free))
     return np.where(found.shares.any(axis=(1, 2)), evidence, -np.inf)
 
 
 def odds_of(
-    matches: Sequence[SensorMatches],
+    found: Matches,
+    variances: Floats,
     sizes: Floats,
     detection: DetectionModel,
     spreads: Floats | None = None,
 ) -> Odds:
-    """Odds of H poses against clutter, as if they had not been chosen to fit.
+    """Odds of K poses against clutter, as if they had not been chosen to fit.
 
     Parameters
     ----------
-    matches : sequence of SensorMatches
-        One per sensor, in units of its noise.
-    sizes : (H,) array
+    found : Matches
+    variances : (K, L) array
+        Of the noise of each sensor, in σ_ε².
+    sizes : (K,) array
         Of the body, length units.
     detection : DetectionModel
-    spreads : (H, N, 3, 3) array or None
+    spreads : (K, N, 3, 3) array or None
         Covariances of features in the world, of a body that gives way; None: it does not.
     """
-    shape = matches[0].weights.shape
-    gained, missed, coordinates = np.zeros((3, *shape))
-    near: list[NDArray[np.bool_]] = []
-    is_met = np.zeros(shape, dtype=np.bool_)
-    for one in matches:
-        m = one.offsets.shape[2]
-        density = one.crowd * (2 * np.pi) ** (m / 2)
-        rarity = np.log(detection.probability / np.maximum(density, 1e-300))
-        gain = one.shares * np.maximum(rarity[:, None] - _costs(one, spreads), 0.0)
-        miss, shares = (one.weights - one.shares) * detection.log_missed, one.shares
-        # what a sensor that is covered, blurred or out of step meets, it meets by chance
-        is_blind = (gain + miss).sum(axis=1, keepdims=True) < detection.log_blind
-        if is_blind.any():
-            even = one.weights / np.maximum(one.weights.sum(axis=1, keepdims=True), 1.0)
-            miss = np.where(is_blind, even * detection.log_blind, miss)
-            gain, shares = np.where(is_blind, 0.0, gain), np.where(is_blind, 0.0, shares)
-        gained += gain
-        missed += miss
-        coordinates += m * shares
-        is_met |= shares > 0
-        # a detection that chance puts as near is not the feature's
-        near.append((gain > 0) & (m == 2))
+    roots, m = np.sqrt(variances), found.dimensions
+    crowd = found.crowd * roots**m
+    rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
+    costs = _costs(found, roots, spreads)
+    gained = found.shares * np.maximum(rarity[..., None] - costs, 0.0)
+    missed = (found.weights - found.shares) * detection.log_missed
+    # what a sensor that is covered, blurred or out of step meets, it meets by chance
+    is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
+    even = found.weights / np.maximum(found.weights.sum(axis=2, keepdims=True), 1.0)
+    missed = np.where(is_blind, even * detection.log_blind, missed).sum(axis=1)
+    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
+    # a detection that chance puts as near is not the feature's
+    near = (gained > 0) & (m == 2)[:, None]
+    gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
     # a feature that no sensor sees is covered: cameras do not miss it one by one
-    covered = ~is_met
-    most = detection.log_covered * np.max([one.weights for one in matches], axis=0)
-    missed[covered] = np.maximum(missed, most)[covered]
-    together = np.nonzero(np.sum(near, axis=0) > 1)
+    most = detection.log_covered * found.weights.max(axis=1)
+    missed = np.where((shares > 0).any(axis=1), missed, np.maximum(missed, most))
+    together = np.nonzero(near.sum(axis=1) > 1)
     if detection.in_space and len(together[0]):
-        given = None if spreads is None else spreads[together]
-        space, share = _in_space(matches, near, together, sizes[together[0]], given)
+        space, share = _in_space(found, roots, crowd, near, together, sizes, spreads)
         likelier = space < (gained + missed)[together]
         pose, feature = (index[likelier] for index in together)
         gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
         most = 3 * share[likelier]
         coordinates[pose, feature] = np.minimum(coordinates[pose, feature], most)
-    return Odds(gained.sum(axis=1), missed.sum(axis=1), coordinates.sum(axis=1))
+    unseen = found.unseen.sum(axis=1) * detection.log_unseen
+    return Odds(gained.sum(axis=1), missed.sum(axis=1) + unseen, coordinates.sum(axis=1))
 
 
-def _costs(one: SensorMatches, spreads: Floats | None) -> Floats:
-    """What offsets (H, N) cost in a sensor: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
+def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
+    """What offsets (K, L, N) cost: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
+    offsets = found.offsets / roots[..., None, None]
     if spreads is None:
-        return np.asarray((one.offsets**2).sum(axis=2) / 2)
-    m = one.offsets.shape[2]
-    S = np.eye(m) + one.by_world @ spreads @ one.by_world.swapaxes(2, 3)
-    r = one.offsets[..., None]
-    away = (r * np.linalg.solve(S, r)).sum(axis=(2, 3))
+        return np.asarray((offsets**2).sum(axis=3) / 2)
+    by_world = found.J[..., :3] / roots[..., None, None, None]
+    S = np.eye(offsets.shape[3]) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
+    r = offsets[..., None]
+    away = (r * np.linalg.solve(S, r)).sum(axis=(3, 4))
     return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
 
 
 def _in_space(
-    matches: Sequence[SensorMatches],
-    near: Sequence[NDArray[np.bool_]],
+    found: Matches,
+    roots: Floats,
+    crowd: Floats,
+    near: NDArray[np.bool_],
     chosen: tuple[NDArray[np.intp], ...],
     sizes: Floats,
     spreads: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """What features met by several cameras say if clutter are points in space (K,), and shares.
+    """What features met by several cameras say if clutter are points in space (C,), and shares.
 
     A clutter point lies where the cameras see it; only that it lies at the feature tells.
     """
-    A = np.eye(3) / sizes[:, None, None] ** 2
-    b, share = np.zeros((len(A), 3)), np.zeros(len(A))
-    log_rarity = np.full(len(A), -np.inf)
-    for one, is_near in zip(matches, near, strict=True):
-        if one.offsets.shape[2] != 2:
-            continue
-        J, r, met = one.by_world[chosen], one.offsets[chosen], is_near[chosen]
-        weighted = J * met[:, None, None]
-        A += weighted.swapaxes(1, 2) @ J
-        b += (weighted.swapaxes(1, 2) @ r[..., None])[..., 0]
-        share = np.maximum(share, met * one.shares[chosen])
-        # detections per area, of which each has a depth
-        across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(1, 2)), 1e-300))
-        rarity = -np.log(np.maximum(one.crowd[chosen[0]], 1e-300)) - across + np.log(sizes)
-        log_rarity = np.maximum(log_rarity, np.where(met, rarity, -np.inf))
-    place = np.linalg.solve(A, b[..., None])
+    pose, feature = chosen
+    at, sizes, roots = (pose, slice(None), feature), sizes[pose], roots[pose][..., None]
+    met, J, r = near[at], found.J[at][..., :3] / roots[..., None], found.offsets[at] / roots
+    rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
+    A = np.eye(3) / sizes[:, None, None] ** 2 + rows @ rows.swapaxes(1, 2)
+    place = np.linalg.solve(A, rows @ r.reshape(len(pose), -1, 1))
+    share = (met * found.shares[at]).max(axis=1)
+    # detections per area, of which each has a depth
+    across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(2, 3)), 1e-300))
+    rarity = np.log(sizes)[:, None] - np.log(np.maximum(crowd[pose], 1e-300)) - across
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
-        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads, A))
+        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads[chosen], A))
     away = (place * (A @ place)).sum(axis=(1, 2))
     tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
+    log_rarity = np.where(met, rarity, -np.inf).max(axis=1)
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
 
 
-def paid_by_count(odds: Odds, matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> Floats:
-    """Evidence (H,) of poses that pay for their freedom by the features that fix them."""
+def paid_by_count(odds: Odds, found: Matches, free: NDArray[np.bool_]) -> Floats:
+    """Evidence (K,) of poses that pay for their freedom by the features that fix them."""
     spare = 1.0 - int(free.sum()) / np.maximum(odds.coordinates, 1.0)
     return np.asarray(
-        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(matches, free)
+        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(found, free)
     )
 
 
-def _log_choices(matches: Sequence[SensorMatches], free: NDArray[np.bool_]) -> Floats:
-    """Logarithm (H,) of the number of ways to fix a pose by observed features."""
-    expected = np.array([one.weights.sum(axis=1) for one in matches])
-    counts = np.array([one.count for one in matches])
-    pins = -(-int(free.sum()) // max(one.offsets.shape[2] for one in matches))
-    observed = np.maximum((counts * (expected > 0)).sum(axis=0), pins)
-    features = np.maximum(expected.max(axis=0), pins)
+def _log_choices(found: Matches, free: NDArray[np.bool_]) -> Floats:
+    """Logarithm (K,) of the number of ways to fix a pose by observed features."""
+    expected = found.weights.sum(axis=2)
+    pins = -(-int(free.sum()) // int(found.dimensions.max()))
+    observed = np.maximum((found.count * (expected > 0)).sum(axis=1), pins)
+    features = np.maximum(expected.max(axis=1), pins)
     ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
     assigned = gammaln(features + 1) - gammaln(features - pins + 1)
     return np.asarray(ways + assigned + math.log(2))
-
-
-def _matches_of(found: Stacked, variances: Floats) -> list[SensorMatches]:
-    """Associations of K poses, whose noise stands in the place of σ_ε: their variance is 1."""
-    roots = np.sqrt(variances)
-    offsets = found.offsets / roots[..., None, None]
-    by_world = found.J[..., :3] / roots[..., None, None, None]
-    crowds, sigmas, counts = (found.gathered(name) for name in ("crowd", "sigma", "count"))
-    crowds = crowds * (roots * sigmas) ** found.dimensions
-    return [
-        SensorMatches(
-            found.weights[:, i],
-            found.shares[:, i],
-            offsets[:, i, :, :m],
-            by_world[:, i, :, :m],
-            crowds[:, i],
-            counts[:, i],
-        )
-        for i, m in enumerate(found.dimensions.tolist())
-    ]
 
 
 def _log_det(A: Floats) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import AssociationRules
-from mixpose.judgement.association import Association, associate
+from mixpose.judgement.association import Association, Matches, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.moments import inverses
 from mixpose.judgement.noise import (
@@ -22,7 +22,6 @@ from mixpose.judgement.noise import (
     information_of,
     noises_of,
 )
-from mixpose.judgement.stacked import Stacked
 from mixpose.objective import MatchedObjective
 from mixpose.records import SensorReport
 
@@ -143,14 +142,14 @@ def judge_together(
         associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
     ]
     found = [associations for associations, _ in pairs]
-    stacked = Stacked.of(found)
-    noises = noises_of(stacked, free, [one.before for one in cases], rules.noise)
+    matches = Matches.of(found)
+    noises = noises_of(found, matches, free, [one.before for one in cases], rules.noise)
     variances = np.array([noise.variances for noise in noises])
     bodies = [one.objective.projection.body for one in cases]
-    whole, widened = stacked, variances
+    whole, widened = matches, variances
     blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
     if any(blind):
-        whole = Stacked.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
+        whole = Matches.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
         widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
     priors = [
         one.prior or flat_prior(body, free, rules.detection)
@@ -158,12 +157,12 @@ def judge_together(
     ]
     sizes = np.array([2 * body.radius for body in bodies])
     beside = whole, widened, free, priors, sizes, rules.detection
-    evidence = log_evidence(*beside, information_of(stacked, variances))
-    spreads = _spreads(cases, stacked.weights.shape[2])
+    evidence = log_evidence(*beside, information_of(matches, variances))
+    spreads = _spreads(cases, matches.weights.shape[2])
     bent = np.zeros((len(cases), 6, 6))
     if spreads is not None:
         # rigid as a rule, and bent now and then: as often the one as the other
-        information = information_of(stacked, variances, spreads)
+        information = information_of(matches, variances, spreads)
         at_all = spreads.any(axis=(1, 2, 3))
         both = np.logaddexp(evidence, log_evidence(*beside, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)

@@ -5,13 +5,14 @@ The formulae stand in `noise`; here they are worked out for K frames at once.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.judgement.association import Association, Matches
 from mixpose.judgement.lasting import Lasting
-from mixpose.judgement.stacked import Stacked
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -55,8 +56,10 @@ class Frame(NamedTuple):
         How calibrations do that are off by a standard deviation in one thing each.
     rest : (R, 1 + q) float64
         Weighted residuals, and what a pose leaves of the fields that may last.
-    fields : list of (R, n) float64
-        Those that change, of each kind.
+    fields : (R, q) float64
+        Those that change.
+    kinds : (q, 2) float64
+        Which of them are offsets, and which turn, scale and shear: 1 or 0.
     """
 
     moments: Moments
@@ -65,24 +68,32 @@ class Frame(NamedTuple):
     by_fields: Floats
     by_calibration: Floats
     rest: Floats
-    fields: list[Floats]
+    fields: Floats
+    kinds: Floats
 
     def without(self, sizes: Floats) -> Moments:
         """Moments of what is left where fields of sizes (q,) are taken off."""
-        left = self.rest[:, 0] - self.rest[:, 1:] @ sizes
-        seen = [float(left @ left), *(float(((P.T @ left) ** 2).sum()) for P in self.fields)]
-        expected = self.moments.expected
-        return Moments(np.array([*seen, self.moments.seen[3]]) * expected.any(), expected)
+        left, expected = self.rest[:, 0] - self.rest[:, 1:] @ sizes, self.moments.expected
+        by_fields = (left @ self.fields) ** 2 @ self.kinds
+        seen = np.array([left @ left, *by_fields, self.moments.seen[3]])
+        return Moments(seen * expected.any(), expected)
 
 
 def frames_of(
-    found: Stacked, variances: Floats, free: NDArray[np.bool_], outlying: float
+    each: Sequence[Sequence[Association]],
+    found: Matches,
+    variances: Floats,
+    free: NDArray[np.bool_],
+    outlying: float,
 ) -> list[Frame]:
     """What K frames show.
 
     Parameters
     ----------
-    found : Stacked
+    each : sequence of sequence of Association
+        By frame and sensor.
+    found : Matches
+        The same.
     variances : (K, L) array
         Of the noise of each sensor, in σ_ε².
     free : (6,) bool
@@ -92,161 +103,135 @@ def frames_of(
     squared = (found.offsets * found.offsets).sum(axis=3)
     clear = squared <= outlying**2 * variances[..., None]
     shares = np.where(clear, found.shares, 0.0)
-    roots, axes = np.sqrt(shares), np.arange(found.J.shape[3]) < found.dimensions[:, None]
-    scale = (roots / np.sqrt(variances)[..., None])[..., None]
-    count, frames = int(free.sum()), len(shares)
+    noise, frames = np.sqrt(variances), len(shares)
+    scale = (np.sqrt(shares) / noise[..., None])[..., None]
     rows = scale[..., None] * found.J
-    shift = _in_noise(rows[..., :3], found)
-    r = (scale * found.offsets).reshape(frames, -1, 1)
-    J = rows[..., free].reshape(frames, -1, count)
-    P = _fields(found.places, shares, roots, axes)
-    split = P[0].shape[2]
-    fields = np.concatenate(P, axis=2)
+    r, J = (scale * found.offsets).reshape(frames, -1, 1), rows[..., free]
+    doubts = [_doubts(*one) for one in zip(each, scale, J, strict=True)]
+    J = J.reshape(frames, -1, J.shape[4])
+    fields, kinds = _fields(found.places, shares, found.dimensions)
     inverse = inverses(J.swapaxes(1, 2) @ J)
     drawn = inverse @ (J.swapaxes(1, 2) @ fields)
     left = fields - J @ drawn
     information, vector = left.swapaxes(1, 2) @ left, (left.swapaxes(1, 2) @ r)[..., 0]
-    markers = _of_markers(shift, J, r, left, split, inverse)
-    kinds = slice(split), slice(split, None)
-    degrees = (shares * found.dimensions[:, None]).sum(axis=(1, 2)) - count
-    of_errors = (r * r).sum(axis=(1, 2)), degrees
-    by_fields = (fields.swapaxes(1, 2) @ r)[..., 0] ** 2
-    moments = _moments(of_errors, by_fields, information, kinds, markers)
-    of_fields = [drawn[..., kind] @ drawn[..., kind].swapaxes(1, 2) for kind in kinds]
-    parts = np.stack([inverse, *of_fields, markers.part], axis=1)
-    sizes = _sizes(np.sqrt(variances), axes)
+    markers = _of_markers(_in_noise(rows[..., :3], found), J, r, left, inverse)
+    of_fields = (drawn[:, None] * kinds.T[:, None]) @ drawn.swapaxes(1, 2)[:, None]
+    parts = np.concatenate([inverse[:, None], of_fields, markers.part[:, None]], axis=1)
+    degrees = (shares * found.dimensions[:, None]).sum(axis=(1, 2)) - J.shape[2]
+    moments = _moments(r, degrees, fields, information, kinds, markers)
+    # the noise of the sensor that each field is of
+    sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)
     information /= sizes[:, :, None] * sizes[:, None]
-    names = tuple(one.name for one in found.each[0])
-    doubts = _doubts(found, scale, J, inverse)
+    names = tuple(one.name for one in each[0])
     return [
         Frame(
             moments[k] if degrees[k] > 0 else Moments(),
             parts[k],
             Lasting(names, information[k], vector[k] / sizes[k]),
             drawn[k] / sizes[k],
-            doubts[k],
+            inverse[k] @ doubts[k],
             np.hstack([r[k], left[k] / sizes[k]]),
-            [one[k] for one in P],
+            fields[k],
+            kinds,
         )
         for k in range(frames)
     ]
 
 
-def _moments(
-    of_errors: tuple[Floats, Floats],
-    by_fields: Floats,
-    information: Floats,
-    kinds: tuple[slice, slice],
-    markers: _OfMarkers,
-) -> list[Moments]:
-    """Moments of K frames, of errors (K,), of fields of two kinds (K, q), and of markers."""
-    frames = len(information)
-    seen, expected = np.zeros((frames, 4)), np.zeros((frames, 4, 4))
-    seen[:, 0], expected[:, 0, 0] = of_errors
-    seen[:, 3] = markers.squares
-    expected[:, 0, 3] = expected[:, 3, 0] = markers.once
-    expected[:, 3, 1:] = expected[:, 1:, 3] = markers.K
-    for i, a in enumerate(kinds):
-        seen[:, 1 + i] = by_fields[:, a].sum(axis=1)
-        own = information[:, a, a].trace(axis1=1, axis2=2)
-        expected[:, 0, 1 + i] = expected[:, 1 + i, 0] = own
-        for j, b in enumerate(kinds):
-            expected[:, 1 + i, 1 + j] = (information[:, a, b] ** 2).sum(axis=(1, 2))
-    return [Moments(*pair) for pair in zip(seen, expected)]
+def _fields(places: Floats, shares: Floats, dimensions: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """What all features of a sensor have in common (K, R, q), by the roots of their shares.
 
-
-def _in_noise(shift: Floats, found: Stacked) -> Floats:
-    """How features move with the body (K, L, N, M, 3), by the root mean square in view."""
-    counts = np.array([[len(one.features) for one in each] for each in found.each])
-    sizes = 3 * counts @ found.dimensions
-    roots = np.sqrt((shift * shift).sum(axis=(1, 2, 3, 4)) / np.maximum(sizes, 1))
-    return np.asarray(shift / np.maximum(roots, LEAST)[:, None, None, None, None])
-
-
-def _sizes(roots: Floats, axes: NDArray[np.bool_]) -> Floats:
-    """The noise (K, L) of the sensor that each field is of (K, q)."""
-    most = axes.shape[1]
-    return np.concatenate([np.repeat(roots, most, axis=1), np.repeat(roots, most**2, axis=1)], 1)
-
-
-def _fields(
-    places: Floats, shares: Floats, roots: Floats, axes: NDArray[np.bool_]
-) -> tuple[Floats, Floats]:
-    """What all features of a sensor have in common, with the roots of their shares.
-
-    Offsets, and what turns, scales and shears; sensors have columns of their own.
+    Along each coordinate an offset, and what turns, scales and shears; sensors have columns of
+    their own.  The kinds are those of a `Frame`.
     """
     frames, sensors, n, most = places.shape
     total = np.maximum(shares.sum(axis=2), LEAST)[..., None]
     away = places - ((shares[:, :, None] @ places)[:, :, 0] / total)[:, :, None]
     spread = (shares[..., None] * away * away).sum(axis=(2, 3))
-    size = np.sqrt(spread / (axes.sum(axis=1) * total[..., 0]))
-    away *= (roots / np.maximum(size, LEAST)[..., None])[..., None]
-    own = np.arange(sensors)
-    shifts = np.zeros((frames, sensors, n, most, sensors, most))
-    slants = np.zeros((frames, sensors, n, most, sensors, most, most))
-    for i in np.flatnonzero(axes.any(axis=0)).tolist():
-        there = own[axes[:, i]]
-        shifts[:, there, :, i, there, i] = roots[:, there].swapaxes(0, 1)
-        slants[:, there, :, i, there, :, i] = away[:, there].swapaxes(0, 1)
-    rows = frames, sensors * n * most, -1
-    return shifts.reshape(rows), slants.reshape(rows)
+    size = np.sqrt(spread / (dimensions * total[..., 0]))
+    away /= np.maximum(size, LEAST)[..., None, None]
+    by_feature = np.concatenate([np.ones((*away.shape[:3], 1)), away], axis=3)
+    by_feature *= np.sqrt(shares)[..., None]
+    axes = np.arange(most) < dimensions[:, None]
+    own = np.einsum("lk,ij,li->likj", np.eye(sensors), np.eye(most), axes)
+    fields = by_feature[:, :, :, None, None, None] * own[:, None, ..., None]
+    kinds = np.tile(np.repeat(np.eye(2), [1, most], axis=0), (sensors * most, 1))
+    return fields.reshape(frames, sensors * n * most, -1), kinds
 
 
 class _OfMarkers(NamedTuple):
-    """K_3k (K, 3), tr K_33, |P_3ᵀWr|², and the covariance that a unit variance makes."""
+    """K_3k for each field (K, q), tr K_33 and |K_33|² (K,), |P_3ᵀWr|² (K,), and their part."""
 
-    K: Floats
+    by_fields: Floats
     once: Floats
+    own: Floats
     squares: Floats
     part: Floats
 
 
-def _of_markers(
-    shift: Floats, J: Floats, r: Floats, left: Floats, split: int, inverse: Floats
-) -> _OfMarkers:
-    """Moments of what markers are off by, of which P_3 has three columns each: one by one.
-
-    `shift` is how features move with the body, in units in which their images move by the noise;
-    the first columns of `left` are fields of the first kind.
-    """
+def _of_markers(shift: Floats, J: Floats, r: Floats, left: Floats, inverse: Floats) -> _OfMarkers:
+    """Moments of what markers are off by, of which P_3 has three columns each: one by one."""
     frames, sensors, n, most, _ = shift.shape
     columns = np.concatenate([J, r, shift.reshape(frames, -1, 3), left], axis=2)
     columns = columns.reshape(frames, sensors, n, most, -1)
     by_marker = (frames, n, sensors * most, -1)
-    columns = columns.transpose(0, 2, 1, 3, 4).reshape(by_marker)
-    own = shift.transpose(0, 2, 1, 3, 4).reshape(by_marker).swapaxes(2, 3) @ columns
+    columns = columns.swapaxes(1, 2).reshape(by_marker)
+    own = shift.swapaxes(1, 2).reshape(by_marker).swapaxes(2, 3) @ columns
     count = J.shape[2]
-    widths = np.cumsum([count, 1, 3, split])
-    by_pose, by_rest, by_shift, *by_fields = np.split(own, widths, axis=3)
+    by_pose, by_rest, by_shift, by_fields = np.split(own, [count, count + 1, count + 4], axis=3)
     taken, flat = by_pose @ inverse[:, None], by_pose.reshape(frames, -1, count)
     drawn = inverse @ flat.swapaxes(1, 2)
     spread = drawn @ flat
     within = by_shift - 2 * taken @ by_pose.swapaxes(2, 3)
     K = (within * by_shift).sum(axis=(1, 2, 3)) + (spread * spread.swapaxes(1, 2)).sum(axis=(1, 2))
+    once = by_shift.sum(axis=1).trace(axis1=1, axis2=2) - (taken * by_pose).sum(axis=(1, 2, 3))
+    # the part is not less than nothing where a direction is hardly determined
+    part = drawn @ drawn.swapaxes(1, 2)
     return _OfMarkers(
-        np.stack([*((one * one).sum(axis=(1, 2, 3)) for one in by_fields), K], axis=1),
-        by_shift.sum(axis=1).trace(axis1=1, axis2=2) - (taken * by_pose).sum(axis=(1, 2, 3)),
-        (by_rest * by_rest).sum(axis=(1, 2, 3)),
-        drawn
-        @ drawn.swapaxes(1, 2),  # not less than nothing where a direction is hardly determined
+        (by_fields**2).sum(axis=(1, 2)), once, K, (by_rest**2).sum(axis=(1, 2, 3)), part
     )
 
 
-def _doubts(found: Stacked, scale: Floats, J: Floats, inverse: Floats) -> list[Floats]:
-    """How calibrations that are off move each pose (k, K)."""
-    moved = []
-    rows = J.reshape(*found.J.shape[:4], -1)
-    for k, each in enumerate(found.each):
-        doubts = [np.zeros((J.shape[2], 0))]
-        for i, one in enumerate(each):
-            if one.by_calibration is None:
-                continue
-            m = found.dimensions[i]
-            own = (scale[k, i, one.features, :, None] / one.sigma) * one.by_calibration
-            doubts.append(np.einsum("nmc,nmq->cq", rows[k, i, one.features, :m], own))
-        moved.append(inverse[k] @ np.hstack(doubts))
-    return moved
+def _moments(
+    r: Floats,
+    degrees: Floats,
+    fields: Floats,
+    information: Floats,
+    kinds: Floats,
+    markers: _OfMarkers,
+) -> list[Moments]:
+    """Moments of K frames."""
+    seen, expected = np.zeros((len(r), 4)), np.zeros((len(r), 4, 4))
+    seen[:, 0], expected[:, 0, 0] = (r * r).sum(axis=(1, 2)), degrees
+    seen[:, 1:3] = (fields.swapaxes(1, 2) @ r)[..., 0] ** 2 @ kinds
+    seen[:, 3] = markers.squares
+    once = information.diagonal(axis1=1, axis2=2) @ kinds
+    expected[:, 0, 1:] = expected[:, 1:, 0] = np.column_stack([once, markers.once])
+    expected[:, 1:3, 1:3] = kinds.T @ information**2 @ kinds
+    both = np.column_stack([markers.by_fields @ kinds, markers.own])
+    expected[:, 3, 1:] = expected[:, 1:, 3] = both
+    return [Moments(*pair) for pair in zip(seen, expected, strict=True)]
+
+
+def _in_noise(shift: Floats, found: Matches) -> Floats:
+    """How features move with the body (K, L, N, M, 3), by the root mean square in view."""
+    sizes = 3 * np.count_nonzero(found.weights, axis=2) @ found.dimensions
+    roots = np.sqrt((shift * shift).sum(axis=(1, 2, 3, 4)) / np.maximum(sizes, 1))
+    return np.asarray(shift / np.maximum(roots, LEAST)[:, None, None, None, None])
+
+
+def _doubts(each: Sequence[Association], scale: Floats, J: Floats) -> Floats:
+    """How calibrations that are off pull at a pose (k, K)."""
+    pulls = [
+        np.einsum(
+            "nmc,nmq->cq",
+            J[i, one.features, : one.J.shape[1]],
+            scale[i, one.features, :, None] / one.sigma * one.by_calibration,
+        )
+        for i, one in enumerate(each)
+        if one.by_calibration is not None
+    ]
+    return np.hstack([np.zeros((J.shape[3], 0)), *pulls])
 
 
 def inverses(information: Floats) -> Floats:

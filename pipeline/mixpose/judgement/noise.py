@@ -34,10 +34,9 @@ from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
 from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled, sums_of
-from mixpose.judgement.association import Association
+from mixpose.judgement.association import Association, Matches
 from mixpose.judgement.lasting import Lasting, LastingRules
 from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
-from mixpose.judgement.stacked import Stacked
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -132,71 +131,58 @@ class FrameNoise:
 
 
 def noises_of(
-    found: Stacked, free: NDArray[np.bool_], before: Sequence[Residuals], model: NoiseModel
+    each: Sequence[Sequence[Association]],
+    found: Matches,
+    free: NDArray[np.bool_],
+    before: Sequence[Residuals],
+    model: NoiseModel,
 ) -> list[FrameNoise]:
     """The noise of K frames, from the residuals of each and from those before it.
 
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    levels = [
-        _level(associations, int(free.sum()), known, model)
-        for associations, known in zip(found.each, before, strict=True)
-    ]
-    variances = np.array([one.scale for one in levels])
-    frames = frames_of(found, variances, free, model.errors.outlying)
-    parts = zip(found.each, levels, frames, before, strict=True)
-    return [_frame_noise(*each, free, model) for each in parts]
+    pairs = list(zip(each, before, strict=True))
+    levels = [_level(*one, int(free.sum()), model) for one in pairs]
+    scales = np.array([one.scale for one in levels])
+    frames = frames_of(each, found, scales, free, model.errors.outlying)
+    parts = zip(pairs, levels, frames, strict=True)
+    return [_frame_noise(*pair, level, frame, free, model) for pair, level, frame in parts]
 
 
 class _Level(NamedTuple):
-    """How large residuals are, sensor by sensor.
+    """How large residuals are, sensor by sensor."""
 
-    Attributes
-    ----------
-    seen : (L,) float64
-        Variances as offsets show them.
-    scale : (L,) float64
-        The same, drawn to that of all sensors, which residuals are measured in.
-    told : (2, L) float64
-        Squares and degrees of freedom that are remembered.
-    degrees : float
-        Of freedom, of all that was seen.
-    surplus : float
-        As `FrameNoise` has it.
-    """
-
-    seen: Floats
-    scale: Floats
-    told: Floats
-    degrees: float
-    surplus: float
+    seen: Floats  # (L,) variances as offsets show them
+    scale: Floats  # (L,) the same, drawn to that of all sensors, which residuals are measured in
+    told: Floats  # (2, L) squares and degrees of freedom that are remembered
+    degrees: float  # of freedom, of all that was seen
+    surplus: float  # as `FrameNoise` has it
 
 
 def _level(
-    associations: Sequence[Association], count: int, before: Residuals, model: NoiseModel
+    associations: Sequence[Association], before: Residuals, count: int, model: NoiseModel
 ) -> _Level:
-    offsets = joined_offsets(associations)
+    offsets, rules = joined_offsets(associations), model.errors
     past = sums_of([before.noise.get(one.name, Noise()) for one in associations])
     sums = model.memory * past
-    seen = errors_seen(offsets, count, sums, model.errors)
+    seen = errors_seen(offsets, count, sums, rules)
     surplus = _surplus(past, seen, model)
     told = sums + seen.own / [[max(surplus, 1.0)], [1.0]]
     if surplus > 1:
         sums = np.zeros_like(past)
-        seen = errors_seen(offsets, count, sums, model.errors)
+        seen = errors_seen(offsets, count, sums, rules)
     sums = sums + seen.own
     degrees = float(sums[1].sum())
-    typical = 0.0 if degrees >= 1 else model.errors.typical_degrees
-    variances = np.maximum(pooled(sums, model.errors, typical), model.smallest**2)
-    return _Level(seen.variances, variances, told, degrees, surplus)
+    scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
+    return _Level(seen.variances, np.maximum(scale, model.smallest**2), told, degrees, surplus)
 
 
 def _frame_noise(
     associations: Sequence[Association],
+    before: Residuals,
     level: _Level,
     frame: Frame,
-    before: Residuals,
     free: NDArray[np.bool_],
     model: NoiseModel,
 ) -> FrameNoise:
@@ -205,13 +191,12 @@ def _frame_noise(
     own = frame.moments if sizes is None else frame.without(sizes.mean)
     moments = before.moments.joined(own, model.memory)
     met = float(np.mean([one.met for one in associations]))
-    shares = _shares(moments, own, met, model)
+    variances, of_fields = _shares(moments, own, met, model)
     # fields last: a further frame shows no more of them
-    degrees = np.array([level.degrees, *shares.degrees])
-    factors = model.enlargement(int(free.sum()), degrees)
-    covariance, steady = np.zeros((6, 6)), np.zeros((6, 6))
-    inner = np.tensordot(shares.variances * factors, frame.parts, 1)
+    factors = model.enlargement(int(free.sum()), np.array([level.degrees, *of_fields]))
+    inner = np.tensordot(variances * factors, frame.parts, 1)
     inner += frame.by_calibration @ frame.by_calibration.T
+    covariance, steady = np.zeros((2, 6, 6))
     if sizes is not None:
         steady[np.ix_(free, free)] = frame.by_fields @ sizes.moments @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
@@ -243,15 +228,11 @@ def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:
     return ratio / float(fdtri(degrees, known, model.by_chance))
 
 
-class _Shares(NamedTuple):
-    """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter."""
+def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> tuple[Floats, Floats]:
+    """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter.
 
-    variances: Floats
-    degrees: Floats
-
-
-def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _Shares:
-    """What moments say; each sensor meets so many features, of a frame that has its own moments."""
+    Each sensor meets so many features, of a frame that has its own moments.
+    """
     weights = model.lasting_fields * np.array([met, met**2])
     # markers are where they are said to be, as surely as so many frames tell
     of_markers = model.lasting_fields * own.expected[3, 3] + LEAST
@@ -264,19 +245,20 @@ def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> _S
     variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
     taken = np.array([weights[0], weights[0], model.lasting_fields * own.expected[0, 3] + LEAST])
     once, squared = own.expected[0, 1:] + taken, own.expected.diagonal()[1:] + believed[1:]
-    return _Shares(variances, once**2 / np.maximum(squared, LEAST))
+    return variances, once**2 / np.maximum(squared, LEAST)
 
 
-def information_of(found: Stacked, variances: Floats, spreads: Floats | None = None) -> Floats:
+def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
     """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε².
 
     What features tell that are off by `spreads` (K, N, 3, 3) in the world is less.
     """
     frames, sensors, n, m, _ = found.J.shape
     weights = (found.shares / variances[..., None])[..., None, None]
-    by_feature = frames, n, sensors * m, 6
-    J = found.J.transpose(0, 2, 1, 3, 4).reshape(by_feature)
-    weighted = (weights * found.J).transpose(0, 2, 1, 3, 4).reshape(by_feature)
+    J, weighted = (
+        one.swapaxes(1, 2).reshape(frames, n, sensors * m, 6)
+        for one in (found.J, weights * found.J)
+    )
     information = weighted.swapaxes(2, 3) @ J
     if spreads is not None:
         place = information[..., :3, :3]

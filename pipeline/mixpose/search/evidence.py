@@ -3,84 +3,74 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.body import Body
 from mixpose.density import AssociationRules, ErrorRules, crowding
-from mixpose.judgement import DetectionModel, SensorMatches, odds_of, paid_by_count
-from mixpose.objective import project_body
+from mixpose.judgement import DetectionModel, Matches, odds_of, paid_by_count
+from mixpose.objective import Projected, project_body
+from mixpose.records import Floats
 from mixpose.search.detections import SensorDetections
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.search.problem import SearchProblem
 
 _DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
-def evidence(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    poses: Floats,
-    free: NDArray[np.bool_],
-    gate: float,
-) -> tuple[Floats, Floats]:
-    """Log odds (H,) of poses against clutter, paid by count, and shares (H,) of the body met.
+def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count, and shares of the body met.
 
-    Parameters
-    ----------
-    detections : sequence of SensorDetections
-        Sensors without detections (range profiles) do not take part.
-    body : Body
-    poses : (H, 4, 4) array
-    free : (6,) bool
-    gate : float
-        Within which a detection is met, in σ_ε.
+    Sensors without detections (range profiles) do not take part.
     """
-    seen = [one for one in detections if len(one.points)]
+    body, free = problem.body, problem.free
+    seen = [one for one in problem.detections if len(one.points)]
     at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
-    parts = zip(seen, at.y, at.J, at.seen, strict=True)
-    matches = [_matches_of(one, y, J, visible, gate) for one, y, J, visible in parts]
-    found = np.array([one.shares.sum(axis=1) for one in matches])
-    met = found / np.maximum([one.weights.sum(axis=1) for one in matches], 1.0)
-    squares = np.array([(one.offsets**2).sum(axis=(1, 2)) for one in matches])
-    sizes = np.array([[one.offsets.shape[2]] for one in matches])
-    coordinates = (sizes * found).sum(axis=0)
+    found = _matches_of(seen, at, problem.budget.gate)
+    met = found.shares.sum(axis=2)
+    coordinates = (met @ found.dimensions)[:, None]
     # of each sensor: what one that is covered meets by chance tells nothing of the others
-    spare = found * sizes * np.maximum(1 - free.sum() / np.maximum(coordinates, 1.0), 0.0)
+    spare = met * found.dimensions * np.maximum(1 - free.sum() / np.maximum(coordinates, 1.0), 0.0)
+    squares = np.where(spare > 0, (found.offsets**2).sum(axis=(2, 3)), 0.0)
     degrees = _ERRORS.typical_degrees
-    variance = degrees * _ERRORS.typical**2 + np.where(spare > 0, squares, 0.0)
-    variance /= degrees + spare
-    matches = [one.in_units_of(np.sqrt(v)) for one, v in zip(matches, variance, strict=True)]
-    odds = odds_of(matches, np.full(len(poses), 2 * body.radius), _DETECTION)
-    unseen = np.count_nonzero(at.faced & ~at.seen, axis=(0, 2)) * _DETECTION.log_unseen
-    return paid_by_count(odds, matches, free) + unseen, met.mean(axis=0)
+    variances = (degrees * _ERRORS.typical**2 + squares) / (degrees + spare)
+    odds = odds_of(found, variances, np.full(len(poses), 2 * body.radius), _DETECTION)
+    shares = met / np.maximum(found.weights.sum(axis=2), 1.0)
+    return paid_by_count(odds, found, free), shares.mean(axis=1)
 
 
-def _matches_of(
-    seen: SensorDetections, y: Floats, J: Floats, visible: NDArray[np.bool_], gate: float
-) -> SensorMatches:
-    """What a sensor has at places (H, n, 2), with the Jacobians (H, n, 2, 6) by the pose."""
-    points, sigma, m = seen.points, seen.sigma, seen.points.shape[1]
-    y = y[..., :m]
-    pose, feature = np.nonzero(visible)
-    away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=gate * sigma)
-    # a detection is met by the nearest of the features to which it is the nearest
-    near = np.flatnonzero(np.isfinite(away))
-    key = pose[near] * len(points) + nearest[near]
-    order = np.lexsort((away[near], key))
-    first = near[order[np.unique(key[order], return_index=True)[1]]]
-    pose, feature, found = pose[first], feature[first], points[nearest[first]]
-    shares, offsets = np.zeros(visible.shape), np.zeros(y.shape)
-    shares[pose, feature] = 1.0
-    offsets[pose, feature] = (found - y[pose, feature]) / sigma
-    empty = ~visible.any(axis=1)
-    lower = np.where(visible[..., None], y, np.inf).min(axis=1)
-    upper = np.where(visible[..., None], y, -np.inf).max(axis=1)
-    lower[empty], upper[empty] = 0.0, 0.0
-    weights, by_world = visible.astype(np.float64), J[..., :m, :3] / sigma
-    crowd = crowding(points, lower, upper, _ASSOCIATION.min_region * sigma) * sigma**m
-    count = np.full(len(y), float(len(points)))
-    return SensorMatches(weights, shares, offsets, by_world, crowd, count)
+def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) -> Matches:
+    """What sensors have at the places where they are predicted to see the body."""
+    sigmas = np.array([one.sigma for one in seen])[:, None, None, None]
+    shares, offsets = np.zeros(at.seen.shape), np.zeros(at.y.shape)
+    crowd = []
+    for k, one in enumerate(seen):
+        points, m = one.points, one.points.shape[1]
+        y, visible = at.y[k, ..., :m], at.seen[k]
+        pose, feature = np.nonzero(visible)
+        reach = gate * one.sigma
+        away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=reach)
+        # a detection is met by the nearest of the features to which it is the nearest
+        near = np.flatnonzero(np.isfinite(away))
+        key = pose[near] * len(points) + nearest[near]
+        order = np.lexsort((away[near], key))
+        first = near[order[np.unique(key[order], return_index=True)[1]]]
+        pose, feature, found = pose[first], feature[first], points[nearest[first]]
+        shares[k, pose, feature] = 1.0
+        offsets[k, pose, feature, :m] = (found - y[pose, feature]) / one.sigma
+        empty = ~visible.any(axis=1)
+        lower = np.where(visible[..., None], y, np.inf).min(axis=1)
+        upper = np.where(visible[..., None], y, -np.inf).max(axis=1)
+        lower[empty], upper[empty] = 0.0, 0.0
+        smallest = _ASSOCIATION.min_region * one.sigma
+        crowd.append(crowding(points, lower, upper, smallest) * one.sigma**m)
+    return Matches(
+        dimensions=np.array([one.points.shape[1] for one in seen]),
+        weights=at.seen.swapaxes(0, 1).astype(np.float64),
+        shares=shares.swapaxes(0, 1),
+        places=at.y.swapaxes(0, 1),
+        offsets=offsets.swapaxes(0, 1),
+        J=(at.J / sigmas[..., None]).swapaxes(0, 1),
+        crowd=np.stack(crowd, axis=1),
+        count=np.tile([float(len(one.points)) for one in seen], (len(shares[0]), 1)),
+        unseen=np.count_nonzero(at.faced & ~at.seen, axis=2).T,
+    )
