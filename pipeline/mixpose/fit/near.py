@@ -21,9 +21,8 @@ from mixpose.constants import constant
 from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood, sums_of
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
-from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import NormalPrior, has_likelihood
+from mixpose.fit.prior import NormalPrior, believed, has_likelihood
 from mixpose.objective import (
     MatchedObjective,
     Objective,

@@ -22,18 +22,10 @@ _LEAST_EIGENVALUE = 1e-14  # of an information matrix of diagonal 1: float64 tel
 
 
 class Moments(NamedTuple):
-    """Sums over frames, from which the variances of independent errors and of fields follow.
+    """Sums over frames, from which the variances of independent errors and of fields follow."""
 
-    Attributes
-    ----------
-    seen : (4,) float64
-        rᵀWr and |P_kᵀWr|².
-    expected : (4, 4) float64
-        Of these, by unit variances of each kind.
-    """
-
-    seen: Floats = np.zeros(4)
-    expected: Floats = np.zeros((4, 4))
+    seen: Floats = np.zeros(4)  # rᵀWr and |P_kᵀWr|²
+    expected: Floats = np.zeros((4, 4))  # of these, by unit variances of each kind
 
     def joined(self, other: Moments, memory: float) -> Moments:
         """Add those of another frame."""
@@ -41,35 +33,16 @@ class Moments(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What one frame shows.
-
-    Attributes
-    ----------
-    moments : Moments
-    parts : (4, k, k) float64
-        Covariances that unit variances of each kind make.
-    lasting : Lasting
-        What it says of fields that last.
-    by_fields : (k, q) float64
-        How these move the pose.
-    by_calibration : (k, K) float64
-        How calibrations do that are off by a standard deviation in one thing each.
-    rest : (R, 1 + q) float64
-        Weighted residuals, and what a pose leaves of the fields that may last.
-    fields : (R, q) float64
-        Those that change.
-    kinds : (q, 2) float64
-        Which of them are offsets, and which turn, scale and shear: 1 or 0.
-    """
+    """What one frame shows."""
 
     moments: Moments
-    parts: Floats
-    lasting: Lasting
-    by_fields: Floats
-    by_calibration: Floats
-    rest: Floats
-    fields: Floats
-    kinds: Floats
+    parts: Floats  # (4, k, k) covariances that unit variances of each kind make
+    lasting: Lasting  # what it says of fields that last
+    by_fields: Floats  # (k, q) how these move the pose
+    by_calibration: Floats  # (k, K) how calibrations do, off by a deviation in one thing each
+    rest: Floats  # (R, 1 + q) weighted residuals, and what a pose leaves of fields that may last
+    fields: Floats  # (R, q) those that change
+    kinds: Floats  # (q, 2) which of them are offsets, and which turn, scale and shear: 1 or 0
 
     def without(self, sizes: Floats) -> Moments:
         """Moments of what is left where fields of sizes (q,) are taken off."""
@@ -86,19 +59,9 @@ def frames_of(
     free: NDArray[np.bool_],
     outlying: float,
 ) -> list[Frame]:
-    """What K frames show.
+    """What K frames show, associated by frame and sensor, for noise (K, L) in σ_ε².
 
-    Parameters
-    ----------
-    each : sequence of sequence of Association
-        By frame and sensor.
-    found : Matches
-        The same.
-    variances : (K, L) array
-        Of the noise of each sensor, in σ_ε².
-    free : (6,) bool
-    outlying : float
-        Standard deviations of the noise beyond which detections are left out.
+    Detections are left out that are farther off than `outlying` standard deviations of the noise.
     """
     squared = (found.offsets * found.offsets).sum(axis=3)
     clear = squared <= outlying**2 * variances[..., None]
