@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
+from mixpose.records import Floats
 
-Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
 _NOTHING = 1e-12
@@ -88,26 +88,13 @@ def sums_of(noises: Sequence[Noise]) -> Floats:
 
 
 class Offsets(NamedTuple):
-    """Offsets of K features in L sensors.
+    """Offsets of K features in L sensors."""
 
-    Attributes
-    ----------
-    squared : (K,) float64
-        In σ_ε².
-    shares : (K,) float64
-        How far each feature was met.
-    sensor : (K,) int
-    dimensions : (L,) int
-        Coordinates of each sensor.
-    finest : (L,) float64
-        Narrowest blur of each sensor, in σ_ε.
-    """
-
-    squared: Floats
-    shares: Floats
-    sensor: Indices
-    dimensions: Indices
-    finest: Floats
+    squared: Floats  # (K,) in σ_ε²
+    shares: Floats  # (K,) how far each feature was met
+    sensor: Indices  # (K,)
+    dimensions: Indices  # (L,) coordinates of each sensor
+    finest: Floats  # (L,) narrowest blur of each sensor, in σ_ε
 
 
 class Seen(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.density.observation import Observation
 from mixpose.density.overlap import peak
-from mixpose.records import GridPattern, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, GridPattern, PointPattern
 
 _ALIKE = 0.01  # of a height: features are told apart from a seventh of C's deviation on
 

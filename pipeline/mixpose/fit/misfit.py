@@ -23,10 +23,10 @@ from mixpose.constants import constant
 from mixpose.density import peak
 from mixpose.objective import Quadratic, pose_jacobian
 from mixpose.optimise import NewtonOptions, ascend
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
 
-Floats: TypeAlias = NDArray[np.float64]
 Labels: TypeAlias = tuple[tuple[int, ...], ...]
 
 _STEPS = 30  # peaks two widths apart, the least, draw each other by 0.4 of a step: 0.4³⁰ = 1e-12

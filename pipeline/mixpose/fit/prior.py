@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,9 +27,8 @@ from mixpose.objective import (
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform, twist_between
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _DRAWN = 1e-6  # of the energy: a part in a thousand of heights, which drawing may be off by

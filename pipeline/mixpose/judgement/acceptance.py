@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +17,6 @@ from mixpose.judgement.judge import Judged, beliefs, nearest_alike
 from mixpose.judgement.noise import NoiseModel
 from mixpose.records import Status
 from mixpose.rigid import rotation_angle_deg, twist_between
-
-Floats: TypeAlias = NDArray[np.float64]
 
 APART = "two sensors contradict each other"
 
@@ -99,23 +96,12 @@ class AcceptanceRules:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The decision about a frame.
-
-    Attributes
-    ----------
-    status : {"ok", "ambiguous", "lost"}
-    best : Judged or None
-        None where the frame is lost.
-    kept : list of (Judged, float)
-        Poses worth telling with their beliefs, best first.
-    doubt : str
-        Why a frame is ambiguous, other than for its rivals.
-    """
+    """The decision about a frame."""
 
     status: Status
-    best: Judged | None
-    kept: list[tuple[Judged, float]]
-    doubt: str = ""
+    best: Judged | None  # None where the frame is lost
+    kept: list[tuple[Judged, float]]  # poses worth telling with their beliefs, best first
+    doubt: str = ""  # why a frame is ambiguous, other than for its rivals
 
     def doubted(self, doubt: str) -> Verdict:
         """The same, ambiguous for a reason; no reason leaves it as it is."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,7 @@ from scipy.special import gammaln
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.association import Matches
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -68,19 +67,10 @@ class DetectionModel:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a pose before its frame.
+    """What is known of a pose before its frame."""
 
-    Attributes
-    ----------
-    log_density : float
-        Logarithm of the probability density of the pose, per length and radian of each free
-        direction.
-    spread : (6,) float64
-        How uncertain each direction is; matters where the data leave one open.
-    """
-
-    log_density: float
-    spread: Floats
+    log_density: float  # of its probability, per length and radian of each free direction
+    spread: Floats  # (6,) how uncertain it is; matters where the data leave a direction open
 
 
 class Odds(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,7 @@ from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_ev
 from mixpose.judgement.moments import inverses
 from mixpose.judgement.noise import NoiseModel, Residuals, information_of, noises_of
 from mixpose.objective import MatchedObjective
-from mixpose.records import SensorReport
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, SensorReport
 
 
 @dataclass(frozen=True)
@@ -92,26 +89,13 @@ class Judged:
 
 @dataclass(frozen=True)
 class Case:
-    """A pose that is to be judged, and what was known before.
+    """A pose that is to be judged, and what was known before."""
 
-    Attributes
-    ----------
-    objective : MatchedObjective
-        At σ_ε of every sensor.
-    T_world_object : (4, 4) float64
-    before : Residuals
-        Of the frames before.
-    prior : Prior or None
-        What was known of the pose; None: nothing.
-    unmet : sequence of Association
-        Other sensors, which count as if they had met nothing.
-    """
-
-    objective: MatchedObjective
-    T_world_object: Floats
-    before: Residuals = Residuals()
-    prior: Prior | None = None
-    unmet: Sequence[Association] = ()
+    objective: MatchedObjective  # at σ_ε of every sensor
+    T_world_object: Floats  # (4, 4)
+    before: Residuals = Residuals()  # of the frames before
+    prior: Prior | None = None  # what was known of the pose; None: nothing
+    unmet: Sequence[Association] = ()  # other sensors, which count as if they had met nothing
 
 
 def judge(case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()) -> Judged:

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from mixpose.constants import constant
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -51,18 +48,15 @@ class Lasting:
     information: Floats
     vector: Floats
 
-    def after(self, before: Sequence[Lasting], rules: LastingRules) -> Lasting:
-        """What a frame says, with what the same sensors showed before it."""
+    def after(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
+        """What a frame says, with what the same sensors showed before it, then what others did."""
+        information, vector = self.information, self.vector
+        others = [one for one in before if one.names != self.names]
         for one in before:
             if one.names == self.names and len(one.vector) == len(self.vector):
-                information = rules.memory * one.information + self.information
-                return Lasting(self.names, information, rules.memory * one.vector + self.vector)
-        return self
-
-    def kept(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
-        """With what was seen by others."""
-        others = [one for one in before if one.names != self.names]
-        return (self, *others[: rules.rigs - 1])
+                information = rules.memory * one.information + information
+                vector = rules.memory * one.vector + vector
+        return (Lasting(self.names, information, vector), *others[: rules.rigs - 1])
 
     def sizes(self, rules: LastingRules) -> tuple[Floats, Floats] | None:
         """Fields γ̂ (q,) in σ_ε and their second moments (q, q); None where there may be none."""

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, poole
 from mixpose.judgement.association import Association, Matches
 from mixpose.judgement.lasting import Lasting, LastingRules
 from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 _LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
 
@@ -159,7 +158,7 @@ def _frame_noise(
     model: NoiseModel,
 ) -> FrameNoise:
     lasting = frame.lasting.after(before.lasting, model.fields)
-    sizes = lasting.sizes(model.fields)
+    sizes = lasting[0].sizes(model.fields)
     own = frame.moments if sizes is None else frame.without(sizes[0])
     moments = before.moments.joined(own, model.memory)
     met = float(np.mean([one.met for one in associations]))
@@ -174,8 +173,7 @@ def _frame_noise(
     covariance[np.ix_(free, free)] = inner
     covariance += steady
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
-    kept = lasting.kept(before.lasting, model.fields)
-    remembered = Residuals({**before.noise, **noise}, moments, kept)
+    remembered = Residuals({**before.noise, **noise}, moments, lasting)
     return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
 
 
