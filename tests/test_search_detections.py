@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+from detections import ALL_FREE
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
@@ -8,9 +9,10 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.budget import LabelOptions, PeakOptions
+from mixpose.search.budget import PeakOptions
 from mixpose.search.detections import peaks, sensor_detections
 from mixpose.search.inlier_counts import count_inliers, label_images
+from mixpose.search.problem import SearchProblem
 from mixpose.search.spread import spread_rotations, spread_turns
 from mixpose.sensors import PinholeCamera
 
@@ -29,11 +31,12 @@ def test_features_that_share_a_detection_count_once(
     paper_body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:
     views = seen_by(pinhole_cameras, paper_body)
-    images = label_images(sensor_detections(views, paper_body, PeakOptions()), 3.0, LabelOptions())
+    detections = sensor_detections(views, paper_body, PeakOptions())
+    images = label_images(SearchProblem(detections, paper_body, ALL_FREE, np.eye(4)))
     collapsed = TRUTH.copy()
     # far behind its place the whole body falls within one disk
     collapsed[:3, 3] = [50.0, 4e6, 40.0]
-    counts, _ = count_inliers(images, paper_body.means, None, np.array([TRUTH, collapsed]), 100_000)
+    counts, _ = count_inliers(images, paper_body, np.array([TRUTH, collapsed]), 100_000)
     assert counts[:, 0].tolist() == [6, 6]
     assert counts[0, 1] <= 1
 

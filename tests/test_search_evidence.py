@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.judgement import Case, Prior, judge
-from mixpose.objective import matched_objective
+from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search.budget import PeakOptions
 from mixpose.search.detections import sensor_detections
 from mixpose.search.evidence import evidence
+from mixpose.search.problem import SearchProblem
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
-
-GATE = 3.0
 
 
 def seen(camera: PinholeCamera, count: int = 8) -> Floats:
@@ -27,8 +26,16 @@ def seen(camera: PinholeCamera, count: int = 8) -> Floats:
 
 
 def evidence_of(camera: PinholeCamera, points: Floats, body: Body = EIGHT) -> float:
-    detections = sensor_detections([view_of("0", camera, points)], body, PeakOptions())
-    return float(evidence(detections, body, TRUTH[None], ALL_FREE, GATE)[0][0])
+    return evidence_in([view_of("0", camera, points)], body)
+
+
+def evidence_in(views: list[View], body: Body = EIGHT) -> float:
+    return float(evidence(problem(views, body), TRUTH[None])[0][0])
+
+
+def problem(views: list[View], body: Body = EIGHT) -> SearchProblem:
+    detections = sensor_detections(views, body, PeakOptions())
+    return SearchProblem(detections, body, ALL_FREE, np.eye(4))
 
 
 def spread_out(camera: PinholeCamera, count: int, away_from: Floats) -> Floats:
@@ -46,9 +53,7 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
     for hidden, false in ((0, 0), (2, 6)):
         views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
         poses = perturb(TRUTH, np.array([np.zeros(6), [0.3, -0.2, 0.2, 0.002, 0.0, -0.003]]))
-        found, _ = evidence(
-            sensor_detections(views, EIGHT, PeakOptions()), EIGHT, poses, ALL_FREE, GATE
-        )
+        found, _ = evidence(problem(views), poses)
         objective = matched_objective(views, EIGHT, [1.5] * len(views))
         for pose, log_odds in zip(poses, found, strict=True):
             judged = judge(Case(objective, pose, prior=never), ALL_FREE)
@@ -64,9 +69,7 @@ def test_what_one_camera_meets_by_chance_is_no_noise_of_the_others(
     by_chance = y + np.where(np.arange(8)[:, None] < 3, 2.0, 60.0)  # three, each 1.9 σ_ε off
 
     def both(places: Floats) -> float:
-        views = [view_of("0", first, seen(first)), view_of("1", second, places)]
-        detections = sensor_detections(views, EIGHT, PeakOptions())
-        return float(evidence(detections, EIGHT, TRUTH[None], ALL_FREE, GATE)[0][0])
+        return evidence_in([view_of("0", first, seen(first)), view_of("1", second, places)])
 
     # as noise of both, squares of 10.7 σ² would make the eight exact ones worth 30 nats less
     assert both(by_chance) > both(y + 60.0)

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from types import GeneratorType
-
 import numpy as np
 import pytest
-from detections import EIGHT, TRUTH, detect, view_of
+from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.alignment import align_triples
-from mixpose.search.budget import THOROUGH, LabelOptions, PeakOptions
-from mixpose.search.constraint import Constraint
+from mixpose.search.budget import THOROUGH, PeakOptions, SearchBudget
 from mixpose.search.detections import sensor_detections
-from mixpose.search.from_three_rays import _problems
+from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.guesses import from_slips, kinds_of_guesses
 from mixpose.search.inlier_counts import count_inliers, label_images
+from mixpose.search.problem import SearchProblem
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -37,7 +35,7 @@ def test_a_slipped_pose_is_put_back_by_the_way_from_a_feature_to_another() -> No
 def test_directions_that_are_held_stay_where_the_reference_has_them() -> None:
     free = np.array([True, False, False, False, False, True])
     pose = perturb(TRUTH, np.array([5.0, 7.0, -3.0, 0.0, 0.0, 0.2]))
-    (allowed,) = Constraint(free, TRUTH).apply(pose[None])
+    (allowed,) = SearchProblem([], EIGHT, free, TRUTH).allowed(pose[None])
     expected = np.array([5.0, 0, 0, 0, 0, 0.2])
     np.testing.assert_allclose(twist_between(TRUTH, allowed), expected, atol=1e-9)
 
@@ -48,13 +46,14 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
     camera = pinhole_cameras[0]
     y = camera.project(transform(TRUTH, EIGHT.means))[0]
     detections = sensor_detections([view_of("0", camera, y)], EIGHT, PeakOptions())
-    images = label_images(detections, 3.0, LabelOptions())
+    images = label_images(SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4)))
     towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     normals[5:] *= -1
-    counts, _ = count_inliers(images, EIGHT.means, normals, TRUTH[None], 1000)
+    faced = Body("eight", EIGHT.features, normals)
+    counts, _ = count_inliers(images, faced, TRUTH[None], 1000)
     assert counts.tolist() == [[5.0]]
-    counts, _ = count_inliers(images, EIGHT.means, None, TRUTH[None], 1000)
+    counts, _ = count_inliers(images, EIGHT, TRUTH[None], 1000)
     assert counts.tolist() == [[8.0]]
 
 
@@ -88,10 +87,10 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
     def kinds(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT, PeakOptions())
-        batches = [one(0) for one in kinds_of_guesses(seen, EIGHT, THOROUGH, 0)]
-        return [one.__name__ for one in batches if isinstance(one, GeneratorType)]
+        problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
+        return [one.name for one in kinds_of_guesses(problem)]
 
-    triples, point, rays = "from_point_triples", "from_point_and_rays", "from_three_rays"
+    triples, point, rays = "point triples", "point and rays", "three rays"
     assert kinds(8) == [triples, point, rays, rays]
     assert kinds(9) == [triples, rays, rays, point]  # more than two detections for a feature
 
@@ -106,8 +105,9 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     far = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = camera.rays(np.concatenate([y, far]))
     assert rays is not None
-    rng, most = np.random.default_rng(0), 4 * THOROUGH.chunk
-    chunks = list(_problems(rays, EIGHT.means, most, THOROUGH, rng))
+    budget = SearchBudget(max_problems=4 * THOROUGH.chunk)
+    kind = from_three_rays(SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget), rays)
+    chunks = list(kind.batches)
     own = [float((triples < 8).all(axis=0).mean()) for triples, _ in chunks]
     assert len(chunks) == 4  # one for each crowd and one for all
     assert own[0] == pytest.approx(1 / 7, rel=0.1)

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import numpy as np
+from detections import ALL_FREE
 from scipy.spatial.transform import Rotation
 
+from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
 from mixpose.search.alignment import align_triples
 from mixpose.search.budget import SearchBudget
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.p3p import SIDES, depths
+from mixpose.search.problem import SearchProblem
 from mixpose.sensors import PinholeCamera
 
 
@@ -85,8 +88,10 @@ def test_five_detections_of_a_body_of_36_features_are_enough_for_all_draws() -> 
     camera = PinholeCamera(np.array([[800.0, 0, 320], [0, 800, 256], [0, 0, 1]]))
     near = np.argsort(np.linalg.norm(features - features[0], axis=1))[:5]
     rays = camera.rays(camera.project(transform(T, features[near]))[0])
-    budget = SearchBudget()
-    found = list(from_three_rays(rays, features, 40_000, budget, rng))
+    body = Body("36", tuple(PointFeature(one) for one in features))
+    budget = SearchBudget(max_problems=40_000)
+    kind = from_three_rays(SearchProblem([], body, ALL_FREE, np.eye(4), budget), rays)
+    found = [kind.poses(batch) for batch in kind.batches]
     # one chunk of those far apart, and four that are drawn, the last among all five
     assert len(found) == 5
     assert rotation_angle_deg(T, np.concatenate(found)).min() < 0.1

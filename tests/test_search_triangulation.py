@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from detections import ALL_FREE
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
@@ -17,6 +18,7 @@ from mixpose.search.from_point_triples import (
     feature_triangles,
     from_point_triples,
 )
+from mixpose.search.problem import SearchProblem
 from mixpose.search.triangulation import triangulate
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
 
@@ -62,7 +64,8 @@ def test_three_points_in_space_give_the_pose() -> None:
     rays = [camera.rays(camera.project(world[:4])[0]) for camera in cameras("parallel")]
     found = triangulate([each for each in rays if each is not None], [0.1, 0.1], 0.02)
     body = Body("six", tuple(PointFeature(point) for point in features))
-    guesses = np.concatenate(list(from_point_triples(found, body, SearchBudget(), rng)))
+    kind = from_point_triples(SearchProblem([], body, ALL_FREE, np.eye(4)), found)
+    guesses = np.concatenate([kind.poses(batch) for batch in kind.batches])
     error = np.abs(guesses - T).max(axis=(1, 2))
     assert error.min() < 1e-6
 
@@ -91,7 +94,9 @@ def test_points_that_more_cameras_confirm_come_first() -> None:
     body = Body("five", tuple(PointFeature(point) for point in points))
     detections = sensor_detections(views, body, PeakOptions())
     rays = [each.rays for each in detections if each.rays is not None]
-    found = by_promise(triangulate(rays, [3.0] * 3, 0.02), detections, 3.0, 10)
+    budget = SearchBudget(max_points=10)
+    problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget)
+    found = by_promise(problem, triangulate(rays, [3.0] * 3, 0.02))
     off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)
     # 40 false detections a view leave a point by chance that three confirm now and then
     assert np.sum(off < 0.1) >= 4

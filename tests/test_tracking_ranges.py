@@ -28,10 +28,10 @@ from mixpose.tracking.association_likelihood import (
     RangeRules,
     _summed,
     are_associated,
+    noise_ratio,
     sum_associations,
 )
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.range_posterior import noise_ratio
 
 Floats = NDArray[np.float64]
 

@@ -31,8 +31,7 @@ from mixpose.rigid import (
     transform,
     twist_between,
 )
-from mixpose.search import SearchBudget, SearchReport, SearchState
-from mixpose.search.result import SearchResult
+from mixpose.search import SearchBudget, SearchReport, SearchResult, SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
@@ -153,7 +152,7 @@ def test_the_search_is_told_what_the_session_says(
     assert not list(searched(data, []))
     assert asked["seed"] == 7
     assert asked["budget"] is budgets[live]
-    assert asked["state"] == (before if live else None)
+    assert asked["state"] == (before if live else SearchState())
     assert asked["free"].tolist() == [True, True, False, False, False, True]
     np.testing.assert_allclose(asked["T_reference"], TRUTH)
     assert data.log.state == stopped

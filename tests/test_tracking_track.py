@@ -37,12 +37,13 @@ def moved(frame: float) -> Floats:
 
 def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
     found = [Found(T, 1.0 / len(places)) for T in places]
-    return follow(track, EIGHT, found, frame, time_s, Residuals(), {}, RULES)
+    return follow(track, EIGHT, found, frame, time_s, RULES)
 
 
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
     predictions = [Prediction(TRUTH, NARROW, 1.0)]
-    prior = prior_of(T, predictions, body, ALL_FREE, misses, RULES, MODEL)
+    anywhere = flat_prior(body, ALL_FREE, MODEL)
+    prior = prior_of(T, predictions, body, ALL_FREE, misses, RULES, anywhere)
     return prior.log_density, prior.spread
 
 
@@ -109,7 +110,8 @@ def test_one_detection_where_a_feature_is_predicted_is_no_pose(
     y = pinhole_cameras[0].project(transform(TRUTH, EIGHT.means))[0]
     views = [view_of("0", pinhole_cameras[0], y[:1])]
     predictions = [Prediction(TRUTH, NARROW, 1.0)]
-    prior = prior_of(TRUTH, predictions, EIGHT, ALL_FREE, 0, RULES, MODEL)
+    anywhere = flat_prior(EIGHT, ALL_FREE, MODEL)
+    prior = prior_of(TRUTH, predictions, EIGHT, ALL_FREE, 0, RULES, anywhere)
     judged = judge(Case(matched_objective(views, EIGHT, [1.5]), TRUTH, prior=prior), ALL_FREE)
     # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
     assert judged.log_evidence < 7 * np.log(0.25) + 10

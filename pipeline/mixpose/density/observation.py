@@ -70,9 +70,7 @@ class Observation:
     @property
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
-        if isinstance(self.pattern, PointPattern):
-            return int(self.pattern.points.shape[1])
-        return len(self.pattern.origin)
+        return self.pattern.dimension
 
     @property
     def cell(self) -> float | None:

@@ -56,7 +56,7 @@ def may_be_another(
             there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
             own = data[j]
             seen = replace(own, views=data[k].views, begun=None)
-            found = other.tracker.refitted(seen, [there])
+            found = other.tracker.again(seen, [there], fitted=True)
             if found and found[0].log_evidence > limit:
                 return True
     return False

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from mixpose.judgement import flat_prior
 from mixpose.tracking.likelihood import FrameData
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -101,9 +100,8 @@ def _likelihoods(
 
 def _surprise(data: FrameData) -> float:
     """Log density of a pose that is where nothing was predicted."""
-    anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
     chance = min(data.rules.motion.surprise * (1 + data.track.misses), 1.0)
-    return float(np.log(chance)) + anywhere.log_density
+    return float(np.log(chance)) + data.anywhere.log_density
 
 
 def _may_be(T: Floats, T_predicted: Floats, uncertainty: Floats) -> bool:

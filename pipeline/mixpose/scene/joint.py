@@ -201,7 +201,7 @@ class Joint:
         data = self._data(k, left, track)
         if self._is_away(k):
             data = replace(data, options=replace(data.options, search="live"))
-        self.ranked[k] = tracker.refitted(data, start) if start else tracker.ranked(data)
+        self.ranked[k] = tracker.again(data, start, fitted=True) if start else tracker.ranked(data)
         if track is not self.tracks[k]:
             data = replace(self._data(k, left), log=data.log)
         self.data[k], self._left[k], self._owners[k] = data, left, owners
@@ -209,7 +209,7 @@ class Joint:
     def _rejudge(self, k: int, left: Left) -> None:
         """The poses of a body again, by what is left for it in the end."""
         data = self._data(k, left)
-        self.ranked[k] = self.members[k].tracker.rejudged(data, self.ranked[k])
+        self.ranked[k] = self.members[k].tracker.again(data, self.ranked[k], fitted=False)
         self.data[k], self._left[k] = replace(data, log=self.data[k].log), left
 
     def _data(self, k: int, left: Left, track: Track | None = None) -> FrameData:
@@ -275,7 +275,7 @@ class Joint:
         claims = {**self._claims, keeps: self._own_claims(keeps)}
         left = left_for(other, self._views, claimed(self._views, claims))
         tracker = self.members[other].tracker
-        rest = tracker.rejudged(self._data(other, left), self.ranked[other])
+        rest = tracker.again(self._data(other, left), self.ranked[other], fitted=False)
         return self._evidence(keeps) + max([0.0, *(one.log_evidence for one in rest[:1])])
 
     def _is_trusted(self, k: int) -> bool:

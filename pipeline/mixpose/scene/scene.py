@@ -128,8 +128,8 @@ class Scene:
     ) -> Outcome:
         member, tracker = self.members[k], self.members[k].tracker
         told = found.told or found.verdict
-        estimate = tracker.estimate(frame, time_s, views, told, found.ranked)
-        after = tracker.followed(data, frame, time_s, found.verdict)
+        estimate = tracker.estimate(data, views, told, found.ranked)
+        after = tracker.followed(data, found.verdict)
         doubted = found.verdict.status != "ok"
         after = replace(after, doubted=doubted, companions=data.track.companions)
         return Outcome(after, replace(estimate, instance=member.instance))

@@ -8,8 +8,8 @@ Every guess is judged on all sensors, and the best descend through narrowing blu
 from __future__ import annotations
 
 from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
+from mixpose.search.problem import Candidate, SearchReport, SearchResult, SearchState
 from mixpose.search.refinement import Descent, Stage
-from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
 from mixpose.search.search import search_frame
 
 __all__ = [

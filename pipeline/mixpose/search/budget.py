@@ -27,7 +27,7 @@ class LabelOptions:
     """How finely detections are drawn to be counted."""
 
     cells: float = constant(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
-    max_pages: int = constant(1_000_000, "of 16² cells per camera; larger planes get coarser")
+    max_cells: int = constant(16_000_000, "per camera; larger planes get coarser")
     min_cosine: float = constant(0.1, "to the middle of the rays: at 84° a ray misses the plane")
 
 
@@ -47,8 +47,8 @@ class DescentOptions:
 class SearchBudget:
     """Limits and thresholds of one search."""
 
-    max_guesses: int | None = constant(
-        None, "guesses of one search, counted and not timed, so that results repeat; None: thorough"
+    max_guesses: float = constant(
+        np.inf, "guesses of one search, counted and not timed, so that results repeat"
     )
     gate: float = constant(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
     max_points: int = constant(1000, "triangulated points kept, the most promising first")

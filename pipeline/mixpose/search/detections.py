@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -13,11 +12,9 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import GridPattern, PointPattern
+from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.search.budget import PeakOptions
 from mixpose.sensors import Rays
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mixpose.body import Body
 from mixpose.density import AssociationRules, ErrorRules, crowding
 from mixpose.judgement import DetectionModel, Matches, odds_of, paid_by_count
 from mixpose.objective import Projected, project_body
+from mixpose.records import Floats
 from mixpose.search.detections import SensorDetections
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.search.problem import SearchProblem
 
 _DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
-def evidence(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    poses: Floats,
-    free: NDArray[np.bool_],
-    gate: float,
-) -> tuple[Floats, Floats]:
-    """Log odds (H,) of poses against clutter, paid by count, and shares (H,) of the body met.
+def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count, and shares of the body met.
 
-    Parameters
-    ----------
-    detections : sequence of SensorDetections
-        Sensors without detections (range profiles) do not take part.
-    body : Body
-    poses : (H, 4, 4) array
-    free : (6,) bool
-    gate : float
-        Within which a detection is met, in σ_ε.
+    Sensors without detections (range profiles) do not take part.
     """
-    seen = [one for one in detections if len(one.points)]
+    body, free = problem.body, problem.free
+    seen = [one for one in problem.detections if len(one.points)]
     at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
-    found = _matches_of(seen, at, gate)
+    found = _matches_of(seen, at, problem.budget.gate)
     met = found.shares.sum(axis=2)
     coordinates = (met @ found.dimensions)[:, None]
     # of each sensor: what one that is covered meets by chance tells nothing of the others

@@ -7,117 +7,81 @@ they are on the body.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mixpose.records import Floats
 from mixpose.search.alignment import align_triples
-from mixpose.search.budget import SearchBudget
-from mixpose.search.triangulation import TriangulatedPoints
-from mixpose.sensors import Rays
-
-Floats: TypeAlias = NDArray[np.float64]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.spread import far_apart
+from mixpose.search.triangulation import Indices, TriangulatedPoints
 
 
-@dataclass(frozen=True)
-class _NearRays:
-    """Rays of all cameras that pass a point, the nearest, without those that made it."""
-
-    origins: Floats
-    directions: Floats
-    along: Floats  # where they pass the point
-    across: Floats  # how far from it
-    error: Floats  # length by which a place on the ray may be off
-    central: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class _Places:
+class _Places(NamedTuple):
     """Where features may be: on a ray, at the right distance from the point."""
 
     points: Floats
     feature: Indices
     ray: Indices
-    error: Floats
+    error: Floats  # length by which a place on the ray may be off
 
 
-def from_point_and_rays(
-    found: TriangulatedPoints,
-    rays: Sequence[Rays],
-    gates: Sequence[float],
-    features: Floats,
-    budget: SearchBudget,
-    skipped: int = 0,
-) -> Iterator[Floats]:
-    """Poses (K, 4, 4) with one point in space as each feature, point by point.
-
-    Parameters
-    ----------
-    found : TriangulatedPoints
-        Most promising first.
-    rays : sequence of Rays
-        One per camera.
-    gates : sequence of float
-        Largest error of a detection per camera, in px.
-    features : (n, 3) array
-        Of the body.
-    budget : SearchBudget
-    skipped : int
-        Points left out, as they were tried before.
-    """
+def from_point_and_rays(problem: SearchProblem, found: TriangulatedPoints) -> Kind:
+    """Poses with one point in space as each feature, point by point, the most promising first."""
+    budget, means = problem.budget, problem.body.means
+    features = means[far_apart(means, budget.subsample)]
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-    for p in range(skipped, min(len(found), budget.max_ray_points)):
-        near = _rays_near(found, p, rays, gates, budget.max_rays)
+
+    def poses(p: int) -> Floats:
         body, world = [], []
-        for i in range(len(features)):
-            places = _places(found.points[p], near, distances[i], i)
+        for i, places in enumerate(_places(problem, found, p, distances)):
             a, b = _agreeing(places, distances, budget.max_pairs)
-            first = np.full(len(a), i)
-            body.append(features[np.stack([first, places.feature[a], places.feature[b]])])
+            corners = np.stack([np.full(len(a), i), places.feature[a], places.feature[b]])
             point = np.broadcast_to(found.points[p], (len(a), 3))
+            body.append(features[corners])
             world.append(np.stack([point, places.points[a], places.points[b]]))
         triples = [np.concatenate(each, axis=1).transpose(0, 2, 1) for each in (body, world)]
-        yield align_triples(*triples)
+        return align_triples(*triples)
+
+    return Kind("point and rays", range(min(len(found), budget.max_ray_points)), poses)
 
 
-def _rays_near(
-    found: TriangulatedPoints, p: int, rays: Sequence[Rays], gates: Sequence[float], count: int
-) -> _NearRays:
+def _places(
+    problem: SearchProblem, found: TriangulatedPoints, p: int, distances: Floats
+) -> list[_Places]:
+    """For a point as each feature, where rays cut the spheres on which the others lie.
+
+    Of the rays those that pass nearest to the point, without those that made it.
+    """
     parts = []
-    for k, each in enumerate(rays):
+    for k, (seen, rays) in enumerate(problem.cameras):
         used = found.rays[p][found.sensors[p] == k]
-        rest = each.select(np.setdiff1d(np.arange(len(each)), used))
+        rest = rays.select(np.setdiff1d(np.arange(len(rays)), used))
         away = found.points[p] - rest.origins
         along = (away * rest.directions).sum(axis=1)
         across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
-        error = gates[k] * (rest.offset + rest.slope * np.abs(along))
-        error = np.hypot(error, found.tolerance[p])
-        central = np.full(len(rest), rest.central)
-        parts.append((rest.origins, rest.directions, along, across, error, central))
-    together = [np.concatenate(column) for column in zip(*parts)]
-    nearest = np.argsort(together[3], kind="stable")[:count]
-    return _NearRays(*(column[nearest] for column in together))
-
-
-def _places(point: Floats, near: _NearRays, distances: Floats, i: int) -> _Places:
-    """Where rays cut the spheres about the point on which the other features lie."""
-    half2 = distances[None] ** 2 - near.across[:, None] ** 2
-    at_rim = np.abs(near.across[:, None] - distances[None]) <= near.error[:, None]
-    half = np.sqrt(np.maximum(half2, 0.0))
-    cuts = (half2 >= 0) | at_rim
-    cuts[:, i] = False
-    ray, feature = np.nonzero(cuts)
-    both = np.concatenate([half[ray, feature], -half[ray, feature]])
-    ray, feature = np.tile(ray, 2), np.tile(feature, 2)
-    place = near.along[ray] + both
-    ahead = ~near.central[ray] | (place > 0)
-    ray, feature, place = ray[ahead], feature[ahead], place[ahead]
-    points = near.origins[ray] + place[:, None] * near.directions[ray]
-    return _Places(points, feature, ray, near.error[ray])
+        error = problem.reach(seen) * (rest.offset + rest.slope * np.abs(along))
+        first = np.full(len(rest), 0.0 if rest.central else -np.inf)
+        parts.append((across, rest.origins, rest.directions, along, error, first))
+    across, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
+    nearest = np.argsort(across, kind="stable")[: problem.budget.max_rays]
+    origins, directions, along, error, first = (column[nearest] for column in columns)
+    across, error = across[nearest, None], np.hypot(error, found.tolerance[p])
+    places = []
+    for i, distance in enumerate(distances):
+        half2 = distance**2 - across**2
+        cuts = (half2 >= 0) | (np.abs(across - distance) <= error[:, None])
+        cuts[:, i] = False
+        ray, feature = np.nonzero(cuts)
+        half = np.sqrt(np.maximum(half2[ray, feature], 0.0))
+        ray, feature = np.tile(ray, 2), np.tile(feature, 2)
+        place = along[ray] + np.concatenate([half, -half])
+        ahead = place > first[ray]
+        ray, feature, place = ray[ahead], feature[ahead], place[ahead]
+        points = origins[ray] + place[:, None] * directions[ray]
+        places.append(_Places(points, feature, ray, error[ray]))
+    return places
 
 
 def _agreeing(places: _Places, distances: Floats, most: int) -> tuple[Indices, Indices]:

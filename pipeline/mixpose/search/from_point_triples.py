@@ -7,39 +7,28 @@ the rays pass each other most closely, are combined first (PROSAC, Chum and Mata
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import lru_cache
-from itertools import combinations, islice
-from typing import TypeAlias
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
+from mixpose.records import Floats
 from mixpose.search.alignment import align_triples
-from mixpose.search.budget import SearchBudget
-from mixpose.search.detections import SensorDetections
-from mixpose.search.triangulation import TriangulatedPoints
-
-Floats: TypeAlias = NDArray[np.float64]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.triangulation import Indices, TriangulatedPoints
 
 _SIDES = ((0, 1), (0, 2), (1, 2))
 
 
-@dataclass(frozen=True)
-class FeatureTriangles:
-    """Ordered triples of features that span a triangle.
+class FeatureTriangles(NamedTuple):
+    """Ordered triples of features that span a triangle: (K, 3) corners, and (K, 3) sides.
 
-    Attributes
-    ----------
-    corners : (K, 3) int
-    sides : (K, 3) float64
-        Lengths between corners 0 and 1, 0 and 2, 1 and 2.
-    tree : cKDTree
-        Of the sides.
+    Sides are the lengths between corners 0 and 1, 0 and 2, 1 and 2; `tree` is of them.
     """
 
     corners: Indices
@@ -49,15 +38,9 @@ class FeatureTriangles:
 
 @lru_cache(maxsize=16)
 def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTriangles:
-    """All ordered triples of a body's features, or as many at random.
+    """All ordered triples of a body's features, or `count` at random where they are more.
 
-    Parameters
-    ----------
-    body : Body
-    count : int
-        Most triangles.
-    min_height : float
-        Of a triangle, as a share of its longest side.
+    Left out are those whose height is a smaller share of the longest side than `min_height`.
     """
     n = len(body)
     if n * (n - 1) * (n - 2) <= count:
@@ -70,32 +53,16 @@ def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTrian
     return FeatureTriangles(corners, sides, cKDTree(sides.reshape(-1, 3)))
 
 
-def from_point_triples(
-    found: TriangulatedPoints,
-    body: Body,
-    budget: SearchBudget,
-    rng: np.random.Generator,
-    skipped: int = 0,
-) -> Iterator[Floats]:
-    """Poses (K, 4, 4) of triples of points, batch by batch.
-
-    Parameters
-    ----------
-    found : TriangulatedPoints
-        Most promising first.
-    body : Body
-    budget : SearchBudget
-    rng : numpy Generator
-        Draws among the triples of all points where they are too many.
-    skipped : int
-        Batches left out, as they were tried before.
-    """
+def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kind:
+    """Poses of triples of points, the most promising first."""
+    budget, body = problem.budget, problem.body
     triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
     if not len(triangles.corners) or len(found) < 3:
-        return
+        return Kind("point triples", [], np.asarray)
     longest = float(triangles.sides.max())
     bent = budget.gate * np.sqrt(2) * body.spread  # of a side between two features that give way
-    for drawn in islice(_point_triples(found, longest, budget, rng), skipped, None):
+
+    def poses(drawn: Indices) -> Floats:
         sides = _sides(found.points, drawn)
         slack = 2 * found.tolerance[drawn].max(axis=1) + bent
         possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
@@ -103,10 +70,9 @@ def from_point_triples(
         tolerance = found.tolerance[triples]
         squares = np.stack([tolerance[:, i] ** 2 + tolerance[:, j] ** 2 for i, j in _SIDES], axis=1)
         allowed = np.sqrt(squares + bent**2)
-        k = min(budget.triangles_alike, len(triangles.corners))
         away, index = triangles.tree.query(
             sides,
-            k=np.arange(1, k + 1),
+            k=np.arange(1, min(budget.triangles_alike, len(triangles.corners)) + 1),
             distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
         )
         which, rank = np.nonzero(np.isfinite(away))
@@ -115,65 +81,51 @@ def from_point_triples(
         alike = (off <= allowed[which]).all(axis=1)
         which, chosen = which[alike], chosen[alike]
         world = found.points[triples[which]].transpose(1, 2, 0)
-        features = body.means[triangles.corners[chosen]].transpose(1, 2, 0)
-        yield align_triples(features, world)
+        return align_triples(body.means[triangles.corners[chosen]].transpose(1, 2, 0), world)
+
+    return Kind("point triples", _point_triples(problem, found, longest), poses)
 
 
-def by_promise(
-    found: TriangulatedPoints, detections: Sequence[SensorDetections], gate: float, count: int
-) -> TriangulatedPoints:
-    """The points that most sensors confirm, the closest first, each place once.
-
-    Parameters
-    ----------
-    found : TriangulatedPoints
-    detections : sequence of SensorDetections
-        Of the sensors with rays.
-    gate : float
-        Largest error of a detection in σ_ε.
-    count : int
-        Most points.
-    """
-    support, error = np.zeros(len(found)), found.gap.copy()
-    if len(detections) > 2:
-        error[:] = 0.0
-        for each in detections:
-            y, seen = each.view.sensor.project(found.points)
-            reach = gate * each.sigma
-            away, _ = cKDTree(each.points).query(y, distance_upper_bound=reach)
-            met = seen & np.isfinite(away)
-            support += met
-            error += np.where(met, away / reach, 0.0)
-        error /= np.maximum(support, 1.0)
-    order = np.lexsort((error, -support))
-    if len(detections) == 2:  # every feature once
-        return found.select(order[:count])
+def by_promise(problem: SearchProblem, found: TriangulatedPoints) -> TriangulatedPoints:
+    """The points that most sensors confirm, the closest first, each place once."""
+    support, error, count = np.zeros(len(found)), found.gap, problem.budget.max_points
+    if len(problem.cameras) == 2:  # every feature once
+        return found.select(np.argsort(error, kind="stable")[:count])
+    error = np.zeros(len(found))
+    for each, _ in problem.cameras:
+        y, seen = each.view.sensor.project(found.points)
+        reach = problem.reach(each)
+        away, _ = cKDTree(each.points).query(y, distance_upper_bound=reach)
+        met = seen & np.isfinite(away)
+        support += met
+        error += np.where(met, away / reach, 0.0)
+    error /= np.maximum(support, 1.0)
     kept: list[int] = []
     left = np.ones(len(found), dtype=np.bool_)
-    for k in order:
-        if left[k]:
+    for k in np.lexsort((error, -support)):
+        if left[k] and len(kept) < count:
             kept.append(int(k))
-            if len(kept) == count:
-                break
             near = np.abs(found.points - found.points[k]).max(axis=1) <= found.tolerance[k]
             left &= ~near
     return found.select(np.array(kept, dtype=np.intp))
 
 
 def _point_triples(
-    found: TriangulatedPoints, reach: float, budget: SearchBudget, rng: np.random.Generator
+    problem: SearchProblem, found: TriangulatedPoints, reach: float
 ) -> Iterator[Indices]:
     """Batches of triples (K, 3) of points that share no ray, the most promising first."""
-    first = min(len(found), budget.max_prosac_points)
+    size = problem.budget.batch
+    rays = found.sensors * (found.rays.max(initial=0) + 1) + found.rays
+    first = min(len(found), problem.budget.max_prosac_points)
     triples = _combinations(first)
     if first < len(found):
-        triples = np.concatenate([triples, _near_triples(found.points, reach, budget, rng)])
+        triples = np.concatenate([triples, _near_triples(problem, found.points, reach)])
     end = 0
     while end < len(triples):
-        start, end = end, min(end + max(end, budget.batch), end + 8 * budget.batch)
+        start, end = end, min(end + max(end, size), end + 8 * size)
         batch = triples[start:end]
-        shared = [_share_a_ray(found, batch[:, i], batch[:, j]) for i, j in _SIDES]
-        yield batch[~np.any(shared, axis=0)]
+        six = np.sort(rays[batch].reshape(-1, 6), axis=1)
+        yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 
 
 @lru_cache(maxsize=64)
@@ -183,10 +135,9 @@ def _combinations(count: int) -> Indices:
     return triples[np.argsort(triples[:, 2], kind="stable")]
 
 
-def _near_triples(
-    points: Floats, reach: float, budget: SearchBudget, rng: np.random.Generator
-) -> Indices:
+def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indices:
     """Triples (K, 3) drawn among points (P, 3) that are within reach of the first of them."""
+    rng = problem.rng()
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
@@ -194,22 +145,12 @@ def _near_triples(
     crowded = np.flatnonzero(counts > 1)
     if not len(crowded):
         return np.zeros((0, 3), dtype=np.intp)
-    first = rng.choice(crowded, budget.random_triples)
+    first = rng.choice(crowded, problem.budget.random_triples)
     begin = (np.cumsum(counts) - counts)[first]
     second, third = (
         pairs[begin + (rng.random(len(first)) * counts[first]).astype(np.intp), 1] for _ in range(2)
     )
     return np.asarray(np.stack([first, second, third], axis=1)[second != third])
-
-
-def _share_a_ray(found: TriangulatedPoints, i: Indices, j: Indices) -> NDArray[np.bool_]:
-    """Whether points share a ray: then at most one of them is a feature."""
-    same = [
-        (found.sensors[i, a] == found.sensors[j, b]) & (found.rays[i, a] == found.rays[j, b])
-        for a in range(2)
-        for b in range(2)
-    ]
-    return np.asarray(np.any(same, axis=0))
 
 
 def _sides(points: Floats, triples: Indices) -> Floats:

@@ -5,71 +5,50 @@ Its centre is where every sensor sees the middle of its detections.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.body import Body
+from mixpose.records import Floats
 from mixpose.rigid import from_parts, transform
-from mixpose.search.budget import SearchBudget
-from mixpose.search.constraint import Constraint
-from mixpose.search.detections import SensorDetections
+from mixpose.search.problem import SearchProblem
 from mixpose.sensors import Sensor
 
-Floats: TypeAlias = NDArray[np.float64]
 
-
-def centres(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    constraint: Constraint,
-    budget: SearchBudget,
-) -> Floats:
+def centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
-    places = _starts(detections, body, constraint)
+    budget, radius = problem.budget, problem.body.radius
+    places = _starts(problem)
     for _ in range(budget.place_steps):
-        A, b, off = _equations(detections, places[:, None])
-        places = places + _solve(A, b, constraint.shifts, limit=5 * body.radius)
-    _, _, off = _equations(detections, places[:, None])
+        steps, _ = _steps(problem, places[:, None], limit=5 * radius)
+        places = places + steps
+    _, off = _steps(problem, places[:, None], limit=0.0)
     kept: list[int] = []
     for k in np.argsort(off, kind="stable"):
-        apart = [np.linalg.norm(places[k] - places[other]) for other in kept]
-        if off[k] < off.min() + body.radius and min(apart, default=np.inf) > (
-            budget.different * body.radius
-        ):
+        apart = np.linalg.norm(places[k] - places[kept], axis=1)
+        if off[k] < off.min() + radius and (apart > budget.different * radius).all():
             kept.append(int(k))
     return places[kept[: budget.max_places]]
 
 
-def place(
-    detections: Sequence[SensorDetections],
-    body: Body,
-    rotations: Floats,
-    centre: Floats,
-    constraint: Constraint,
-    steps: int,
-) -> Floats:
+def place(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats:
     """Poses (H, 4, 4) of assumed rotations (H, 3, 3) with the body's centre about `centre` (3,)."""
+    body, shifts = problem.body, problem.free[:3]
     translations = centre - rotations @ body.means.mean(axis=0)
-    reference = constraint.T_reference[:3, 3]
-    translations = np.where(constraint.shifts, translations, reference)
-    for _ in range(steps):
-        poses = from_parts(rotations, translations)
-        points = transform(poses, body.nodes.points)
-        A, b, _ = _equations(detections, points)
-        translations = translations + _solve(A, b, constraint.shifts, limit=body.radius)
+    translations = np.where(shifts, translations, problem.T_reference[:3, 3])
+    for _ in range(problem.budget.turn_steps):
+        points = transform(from_parts(rotations, translations), body.nodes.points)
+        translations = translations + _steps(problem, points, limit=body.radius)[0]
     return from_parts(rotations, translations)
 
 
-def _starts(detections: Sequence[SensorDetections], body: Body, constraint: Constraint) -> Floats:
+def _starts(problem: SearchProblem) -> Floats:
     """Places (S, 3) to start from: on rays, as far as the body looks large, and about ranges."""
+    body, T_reference = problem.body, problem.T_reference
     centre = body.means.mean(axis=0)
     size = float(np.sqrt(((body.nodes.points - centre) ** 2).sum(axis=1).mean()))
-    starts = [] if constraint.free.all() else [transform(constraint.T_reference, centre[None])[0]]
+    held = transform(T_reference, centre[None])[0]
+    starts = [] if problem.free.all() else [held]
     sources, ranges = [], []
-    for each in detections:
+    for each in problem.detections:
         ray = each.view.sensor.rays(each.mean[None])
         if ray is None:
             sources.append(_source(each.view.sensor, body.radius))
@@ -84,30 +63,27 @@ def _starts(detections: Sequence[SensorDetections], body: Body, constraint: Cons
         normal = np.linalg.svd(positions - positions.mean(axis=0))[2][-1]
         axes = np.concatenate([[normal], np.eye(3)])
         starts += list(positions.mean(axis=0) + distance * np.concatenate([axes, -axes]))
-    places = np.array(starts).reshape(-1, 3)
-    fixed = constraint.T_reference[:3] @ np.append(centre, 1.0)
-    return np.where(constraint.shifts, places, fixed)
+    return np.where(problem.free[:3], np.array(starts).reshape(-1, 3), held)
 
 
 def _source(sensor: Sensor, length: float) -> Floats:
     """Where the directions towards a sensor meet (3,), in the sense of least squares."""
     probes = length * np.concatenate([np.zeros((1, 3)), np.eye(3)])
     towards = sensor.towards(probes)
-    away = np.linalg.norm(towards, axis=1)
-    # from where the sensor stands it is seen in no direction
-    probes, towards = probes[away > 0], towards[away > 0] / away[away > 0, None]
+    towards = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-300)
     across = np.eye(3) - towards[:, :, None] * towards[:, None, :]
     right = (across @ probes[:, :, None]).sum(axis=0)[:, 0]
     return np.asarray(np.linalg.lstsq(across.sum(axis=0), right)[0])
 
 
-def _equations(
-    detections: Sequence[SensorDetections], points: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Normal equations (H, 3, 3), (H, 3) of steps that bring means to where they are seen."""
+def _steps(problem: SearchProblem, points: Floats, limit: float) -> tuple[Floats, Floats]:
+    """Steps (H, 3) that bring means of points (H, n, 3) to where they are seen, and how far off.
+
+    Both are lengths; no step is longer than `limit`.
+    """
     A, b = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
     off = np.zeros(len(points))
-    for each in detections:
+    for each in problem.detections:
         y, by_world, seen = each.view.sensor.linearise(points)
         share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
         J = np.einsum("hn,hnmk->hmk", share, by_world)
@@ -118,13 +94,8 @@ def _equations(
         A += np.einsum("hmk,hml->hkl", J, J) / scale[:, None, None]
         b += np.einsum("hmk,hm->hk", J, residual) / scale[:, None]
         off += np.where(any_seen, (residual**2).sum(axis=1) / scale, 1e30)
-    return A, b, np.sqrt(off)
-
-
-def _solve(A: Floats, b: Floats, free: NDArray[np.bool_], limit: float) -> Floats:
-    steps = np.zeros_like(b)
-    if free.any():
-        inner = A[:, free][:, :, free] + 1e-6 * np.eye(int(free.sum()))
-        steps[:, free] = np.linalg.solve(inner, b[:, free][..., None])[..., 0]
+    free, steps = problem.free[:3], np.zeros_like(b)
+    inner = A[:, free][:, :, free] + 1e-6 * np.eye(int(free.sum()))
+    steps[:, free] = np.linalg.solve(inner, b[:, free][..., None])[..., 0]
     length = np.linalg.norm(steps, axis=1, keepdims=True)
-    return np.asarray(steps * np.minimum(1.0, limit / np.maximum(length, 1e-30)))
+    return steps * np.minimum(1.0, limit / np.maximum(length, 1e-30)), np.sqrt(off)

@@ -3,32 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search.budget import DescentOptions
 
-Floats: TypeAlias = NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class Stage:
-    """One blur of a descent.
-
-    Attributes
-    ----------
-    factors : tuple of float
-        Blur per sensor, as a multiple of its σ_ε.
-    steps : int
-    survivors : int
-        How many poses go on.
-    """
+class Stage(NamedTuple):
+    """One blur of a descent: factors of σ_ε per sensor, steps at it, and how many poses go on."""
 
     factors: tuple[float, ...]
     steps: int
@@ -54,17 +42,14 @@ class Descent:
         free: NDArray[np.bool_],
         options: DescentOptions,
     ) -> None:
-        self._views = views
-        self._body = body
-        self._free = free
-        self._options = options
+        self._views, self._body, self._free, self._options = views, body, free, options
         self._objectives: dict[tuple[float, ...], MatchedObjective] = {}
 
-    def objective(self, factors: Sequence[float] | None = None) -> MatchedObjective:
-        """The matched objective with features wider than σ_ε by factors per sensor; None: 1."""
-        key = tuple(factors or [1.0] * len(self._views))
+    def objective(self, factors: tuple[float, ...] = ()) -> MatchedObjective:
+        """The matched objective with features wider than σ_ε by factors per sensor; none: 1."""
+        key = factors or (1.0,) * len(self._views)
         if key not in self._objectives:
-            sigmas = [f * view.observation.sigma for f, view in zip(key, self._views, strict=True)]
+            sigmas = [f * one.observation.sigma for f, one in zip(key, self._views, strict=True)]
             self._objectives[key] = matched_objective(self._views, self._body, sigmas)
         return self._objectives[key]
 
@@ -77,7 +62,7 @@ class Descent:
             The poses left.  Where they are too many, the best: by the cosine between observed and
             predicted densities, summed over sensors.
         """
-        for stage in stages:
+        for stage in stages if len(poses) else ():
             objective = self.objective(stage.factors)
             for _ in range(stage.steps):
                 poses = self._stepped(objective, poses)
@@ -90,36 +75,26 @@ class Descent:
 
     def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:
         """One damped Newton step of every pose."""
-        if not len(poses):
-            return poses
-        model, free = objective.slopes(poses), self._free
+        model, free, most = objective.slopes(poses), self._free, self._options.max_turn
         A = model.curvature[:, free][:, :, free]
-        b = model.gradient[:, free]
         diagonal = np.einsum("hkk->hk", A)
         largest = diagonal.max(axis=1, keepdims=True)
-        tiny = np.finfo(np.float64).tiny
-        scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + tiny))
+        scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + np.finfo(np.float64).tiny))
         A = A * scale[:, :, None] * scale[:, None, :] + self._options.damping * np.eye(A.shape[1])
+        b = scale * model.gradient[:, free]
         twists = np.zeros((len(poses), 6))
-        twists[:, free] = scale * np.linalg.solve(A, (scale * b)[..., None])[..., 0]
+        twists[:, free] = scale * np.linalg.solve(A, b[..., None])[..., 0]
         twists[largest[:, 0] <= 0] = 0.0
-        turn = np.linalg.norm(twists[:, 3:], axis=1)
-        shift = np.linalg.norm(twists[:, :3], axis=1) / max(self._body.radius, 1e-12)
-        most = self._options.max_turn
-        longest = np.maximum(turn, most / 2 * shift)
+        shift, turn = (np.linalg.norm(each, axis=1) for each in (twists[:, :3], twists[:, 3:]))
+        longest = np.maximum(turn, most / 2 * (shift / max(self._body.radius, 1e-12)))
         twists *= np.minimum(1.0, most / np.maximum(longest, 1e-12))[:, None]
         return perturb(poses, twists)
 
 
 def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:
-    """Indices, ascending, of poses that do not put the features where an earlier one does.
+    """Indices, ascending, of poses (H, 4, 4) that do not put the body where an earlier one does.
 
-    Parameters
-    ----------
-    body : Body
-    poses : (H, 4, 4) array
-    cell : float
-        Side of the cells in which places are one, as a share of the body's radius.
+    Places of features are one within cells whose side is a share `cell` of the body's radius.
     """
     corners = body.means[[0, len(body) // 2, -1]]
     places = transform(poses, corners).reshape(len(poses), corners.size)
@@ -129,28 +104,19 @@ def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:
 
 
 def first_of_each(body: Body, poses: Floats, values: Floats, count: int, alike: float) -> list[int]:
-    """Indices of the best poses, no two of which put the features in about the same places.
+    """Indices of the `count` best poses (H, 4, 4), each of which puts the body somewhere else.
 
-    Parameters
-    ----------
-    body : Body
-    poses : (H, 4, 4) array
-    values : (H,) array
-    count : int
-    alike : float
-        Root mean square distance of features of poses that are one, as a share of the radius.
+    Poses are one where the root mean square distance of their features, symmetries aside, is less
+    than a share `alike` of the body's radius; `values` (H,) tell which are best.
     """
-    points = body.means
     kept: list[int] = []
     images: list[Floats] = []
     for k in np.argsort(-values, kind="stable"):
-        here = transform(poses[k], points)
-        if all(
-            np.sqrt(((here - image) ** 2).sum(axis=-1).mean(axis=-1)).min() > alike * body.radius
-            for image in images
-        ):
+        here = transform(poses[k], body.means)
+        squares = [((here - image) ** 2).sum(axis=-1).mean(axis=-1).min() for image in images]
+        if np.sqrt(min(squares, default=np.inf)) > alike * body.radius:
             kept.append(int(k))
-            images.append(transform(poses[k] @ body.symmetries, points))
+            images.append(transform(poses[k] @ body.symmetries, body.means))
         if len(kept) == count:
             break
     return kept

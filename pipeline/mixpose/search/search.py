@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from typing import TypeAlias
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,17 +12,22 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.objective import View
+from mixpose.records import Floats
 from mixpose.search.budget import THOROUGH, SearchBudget
-from mixpose.search.constraint import Constraint
-from mixpose.search.detections import SensorDetections, is_pointlike, sensor_detections
+from mixpose.search.detections import is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
 from mixpose.search.guesses import from_slips, from_spread_orientations, kinds_of_guesses
-from mixpose.search.inlier_counts import LabelImage, count_inliers, label_images
+from mixpose.search.inlier_counts import count_inliers, label_images
+from mixpose.search.problem import (
+    Candidate,
+    Kind,
+    SearchProblem,
+    SearchReport,
+    SearchResult,
+    SearchState,
+)
 from mixpose.search.refinement import Descent, Stage, first_of_each, unlike
-from mixpose.search.result import Candidate, SearchReport, SearchResult, SearchState
 from mixpose.search.spread import sparse
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 def search_frame(
@@ -34,7 +39,7 @@ def search_frame(
     count: int = 8,
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
-    state: SearchState | None = None,
+    state: SearchState = SearchState(),
 ) -> SearchResult:
     """Find poses that explain the views of one frame, without a start.
 
@@ -52,7 +57,7 @@ def search_frame(
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
-    state : SearchState or None
+    state : SearchState
         Of the frame before, where its budget was used up.
 
     Raises
@@ -68,115 +73,101 @@ def search_frame(
         )
     detections = sensor_detections(views, body, budget.peaks)
     if not detections:
-        return SearchResult([], SearchReport(), SearchState())
+        return SearchResult([])
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
-    run = _Run(detections, body, Constraint(free, reference), budget, seed)
-    after = run.find(state or SearchState())
-    return SearchResult(run.candidates(count), run.report, after)
+    run = _Run(SearchProblem(detections, body, free, reference, budget, seed))
+    after = run.find(state)
+    return SearchResult(run.candidates(count), SearchReport(**run.cost), after)
 
 
 class _Run:
     """One search: what stays the same during it, and what was found so far."""
 
-    def __init__(
-        self,
-        detections: Sequence[SensorDetections],
-        body: Body,
-        constraint: Constraint,
-        budget: SearchBudget,
-        seed: int,
-    ) -> None:
-        self._detections = detections
-        self._body = body
-        self._constraint = constraint
-        self._budget = budget
-        self._seed = seed
-        self._images: list[LabelImage] = []
-        if is_pointlike(body):
-            self._images = label_images(detections, budget.gate, budget.labels)
+    def __init__(self, problem: SearchProblem) -> None:
+        self._problem, self._body, self._budget = problem, problem.body, problem.budget
+        self._images = label_images(problem) if is_pointlike(self._body) else []
+        self._explainable = sum(min(image.count, len(self._body)) for image in self._images)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = bool(self._images) and all(one.rays is not None for one in detections)
-        seen = [one.view for one in detections]
-        self._descent = Descent(seen, body, constraint.free, budget.descent)
-        few = sparse(body, budget.descent_features)
+        self._by_evidence = bool(self._images) and all(
+            one.rays is not None for one in problem.detections
+        )
+        seen, budget = [one.view for one in problem.detections], self._budget
+        few = sparse(self._body, budget.descent_features)
+        self._descent = Descent(seen, self._body, problem.free, budget.descent)
         self._quick_descent = self._descent
-        if few is not body:
-            self._quick_descent = Descent(seen, few, constraint.free, budget.descent)
+        if few is not self._body:
+            self._quick_descent = Descent(seen, few, problem.free, budget.descent)
         plan = budget.descent_plan if self._by_evidence else budget.wide_plan
         self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
-        self._explainable = sum(min(image.count, len(body)) for image in self._images)
         self._poses = np.zeros((0, 4, 4))
         self._ranks, self._met = np.zeros(0), np.zeros(0)
-        self.report = SearchReport()
+        self.cost = Counter(made=0)
 
     def find(self, state: SearchState) -> SearchState:
         """Make as many kinds of guesses as are needed and allowed."""
-        budget = self._budget
-        after = self._sharp(state) if self._images else SearchState()
-        if (not self._by_evidence or not self.report.made) and (
-            self._coverage() < budget.sufficient
-        ):
-            self._keep(self._blunt())
-        slippery = len(self._body.grid_steps) > 0
-        slippery &= budget.min_slip_features <= len(self._body) <= budget.max_slip_features
-        if slippery and len(self._poses) and self._images:
+        budget, after = self._budget, SearchState()
+        if self._images:
+            after = self._sharp(state)
+        if not (self._by_evidence and self.cost["made"]) and self._coverage() < budget.sufficient:
+            poses, stages = from_spread_orientations(self._problem)
+            self._keep(self._descent.refine(poses, stages))
+        slippery = budget.min_slip_features <= len(self._body) <= budget.max_slip_features
+        if len(self._body.grid_steps) and slippery and len(self._poses) and self._images:
             slips = from_slips(self._body, self._poses[self._ranks.argmax()])
-            self._keep(self._descended(self._shortlist(iter([slips]))))
+            self._keep(self._descended(self._shortlist([slips])))
         return after
 
     def _sharp(self, state: SearchState) -> SearchState:
         """Guesses from rays, kind after kind; those after the first from where they stopped."""
-        kinds = kinds_of_guesses(self._detections, self._body, self._budget, self._seed)
-        most = self._budget.max_guesses
+        kinds, most = kinds_of_guesses(self._problem), self._budget.max_guesses
         if len(kinds) > 1:
-            self._tried(kinds[0](0), None if most is None else most // 2)
-        for k, kind in enumerate(kinds[1:] or kinds):
+            self._tried(kinds.pop(0), most / 2)
+        for k, kind in enumerate(kinds):
             if self._is_settled():
                 break
             if k >= state.kind:
-                skipped = state.batch if k == state.kind else 0
-                batches = self._tried(kind(skipped), most)
-                if most is not None and self.report.made >= most:
-                    return SearchState(k, skipped + batches)
+                done = self._tried(kind, most, state.batch if k == state.kind else 0)
+                if self.cost["made"] >= most:
+                    return SearchState(k, done)
         return SearchState()
 
-    def _tried(self, guesses: Iterator[Floats], most: int | None) -> int:
-        """Keep what comes of guesses until `most` were made; the number of batches."""
-        batches = 0
+    def _tried(self, kind: Kind, most: float, skipped: int = 0) -> int:
+        """Keep what comes of a kind until `most` guesses were made; batches of it so far."""
+        done = skipped
 
-        def allowed() -> Iterator[Floats]:
-            nonlocal batches
-            for batch in guesses:
-                if most is not None and self.report.made >= most:
+        def guesses() -> Iterator[Floats]:
+            nonlocal done
+            for batch in islice(kind.batches, skipped, None):
+                if self.cost["made"] >= most:
                     return
-                batches += 1
-                yield batch
+                done += 1
+                yield kind.poses(batch)
 
-        self._keep(self._descended(self._shortlist(allowed())))
-        return batches
+        self._keep(self._descended(self._shortlist(guesses())))
+        return done
 
     def candidates(self, count: int) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept = first_of_each(
-            self._body, self._poses, self._ranks, count, self._budget.descent.alike
-        )
+        kept, ranks = self._first(count), self._ranks
         if self._by_evidence and kept:
-            least = max(self._ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
-            kept = kept[:1] + [k for k in kept[1:] if self._ranks[k] > least]
-        return [Candidate(self._poses[k], float(self._ranks[k])) for k in kept]
+            least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
+            kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
+        return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
+
+    def _first(self, count: int) -> list[int]:
+        alike = self._budget.descent.alike
+        return first_of_each(self._body, self._poses, self._ranks, count, alike)
 
     def _keep(self, poses: Floats) -> None:
-        if not len(poses):
-            return
-        ranks, met = self._judged(poses)
-        self._poses = np.concatenate([self._poses, poses])
-        self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
+        if len(poses):
+            ranks, met = self._judged(poses)
+            self._poses = np.concatenate([self._poses, poses])
+            self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
 
     def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""
         if self._by_evidence:
-            free, gate = self._constraint.free, self._budget.gate
-            return evidence(self._detections, self._body, poses, free, gate)
+            return evidence(self._problem, poses)
         shares = self._descent.objective().shares(poses)
         return shares.sum(axis=0), np.sqrt(shares).mean(axis=0)
 
@@ -189,19 +180,18 @@ class _Run:
         budget, coverage = self._budget, self._coverage()
         if coverage >= budget.convincing:
             return True
-        if len(self._detections) < 2 or not self._is_beyond_doubt():
+        if len(self._problem.detections) < 2 or not self._is_beyond_doubt():
             return False
-        best = self._poses[self._ranks.argmax()]
-        return coverage >= budget.sufficient or (
-            int(self._count(self._body, best[None])[0]) >= budget.sufficient * self._explainable
-        )
+        best = self._poses[self._ranks.argmax()][None]
+        most = budget.sufficient * self._explainable
+        return coverage >= budget.sufficient or int(self._count(self._body, best)[0]) >= most
 
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
         budget, best = self._budget, self._ranks.max(initial=0.0)
         if not self._by_evidence or best < budget.promising:
             return False
-        two = first_of_each(self._body, self._poses, self._ranks, 2, budget.descent.alike)
+        two = self._first(2)
         lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
         return bool(best > budget.beyond_doubt or lead > budget.outdone)
 
@@ -211,29 +201,21 @@ class _Run:
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
-        self.report = replace(self.report, refined=self.report.refined + len(guesses))
-        return self._quick_descent.refine(guesses, self._stages) if len(guesses) else guesses
+        self.cost["refined"] += len(guesses)
+        return self._quick_descent.refine(guesses, self._stages)
 
-    def _blunt(self) -> Floats:
-        """Refined poses of all orientations on blurred densities."""
-        poses, stages = from_spread_orientations(
-            self._detections, self._body, self._constraint, self._budget
-        )
-        return self._descent.refine(poses, stages)
-
-    def _shortlist(self, guesses: Iterator[Floats]) -> Floats:
+    def _shortlist(self, guesses: Iterable[Floats]) -> Floats:
         """The guesses that explain most distinct detections, and among equals most closely."""
         budget = self._budget
         poses, ranks, best, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0
         most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
         most = max(most, budget.min_shortlist)
         for batch in guesses:
-            allowed = self._promising(self._constraint.apply(batch))
-            rank = self._count(self._body, allowed)
-            if len(ranks) == most:
-                better = rank > ranks[-1]
-                allowed, rank = allowed[better], rank[better]
-            poses, ranks = np.concatenate([poses, allowed]), np.concatenate([ranks, rank])
+            more = self._promising(self._problem.allowed(batch))
+            rank = self._count(self._body, more)
+            better = rank > (ranks[-1] if len(ranks) == most else -np.inf)
+            poses = np.concatenate([poses, more[better]])
+            ranks = np.append(ranks, rank[better])
             order = np.argsort(-ranks, kind="stable")
             order = order[unlike(self._body, poses[order], budget.distinct)][:most]
             poses, ranks = poses[order], ranks[order]
@@ -248,28 +230,24 @@ class _Run:
 
     def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
-        together = self._budget.max_together
-        counts, near = count_inliers(self._images, body.means, body.normals, poses, together)
+        counts, near = count_inliers(self._images, body, poses, self._budget.max_together)
         return np.asarray(counts.sum(axis=0) + 0.1 * near)
 
     def _promising(self, poses: Floats) -> Floats:
         """The better of many guesses, judged by some features where the body has many."""
-        few = sparse(self._body, self._budget.test_features)
-        self.report = replace(self.report, made=self.report.made + len(poses))
-        if few is not self._body and len(poses) > self._budget.shortlist:
-            rank = self._count(few, poses)
-            poses = poses[np.argsort(-rank, kind="stable")[: self._budget.shortlist]]
-        self.report = replace(self.report, tested=self.report.tested + len(poses))
+        few, most = sparse(self._body, self._budget.test_features), self._budget.shortlist
+        self.cost["made"] += len(poses)
+        if few is not self._body and len(poses) > most:
+            poses = poses[np.argsort(-self._count(few, poses), kind="stable")[:most]]
+        self.cost["tested"] += len(poses)
         return poses
 
     def _is_found(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras leave no need for others."""
-        budget = self._budget
-        if not self._by_evidence or len(self._detections) < 2:
+        if not self._by_evidence or len(self._problem.detections) < 2:
             return False
-        if explained < budget.sufficient * self._explainable and (
-            self._judged(guesses)[0].max() < budget.hopeless
-        ):
+        doubtful = explained < self._budget.sufficient * self._explainable
+        if doubtful and self._judged(guesses)[0].max() < self._budget.hopeless:
             return False
         self._keep(self._descended(guesses))
         return self._is_beyond_doubt() and self._is_settled()

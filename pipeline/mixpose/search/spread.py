@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
-
-Floats: TypeAlias = NDArray[np.float64]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.records import Floats
 
 _PHI = np.sqrt(2.0)
 _PSI = 1.533751168756204288118041
@@ -28,7 +25,7 @@ def sparse(body: Body, count: int) -> Body:
     return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
 
 
-def far_apart(points: Floats, count: int) -> Indices:
+def far_apart(points: Floats, count: int) -> NDArray[np.intp]:
     """Indices of points that are far from one another, starting at the outermost."""
     count = min(count, len(points))
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.records import Floats
 from mixpose.sensors import Rays
 
-Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
 
@@ -42,7 +43,7 @@ class TriangulatedPoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, chosen: Indices | NDArray[np.bool_]) -> TriangulatedPoints:
+    def select(self, chosen: Indices | Sequence[int]) -> TriangulatedPoints:
         """Some of the points."""
         return TriangulatedPoints(*(each[chosen] for each in vars(self).values()))
 
@@ -50,7 +51,7 @@ class TriangulatedPoints:
 def triangulate(
     rays: Sequence[Rays], gates: Sequence[float], min_sine: float
 ) -> TriangulatedPoints:
-    """All pairs of rays of two sensors that meet within the error of the detections.
+    """All pairs of rays of two sensors or more that meet within the error of the detections.
 
     Parameters
     ----------
@@ -61,41 +62,33 @@ def triangulate(
     min_sine : float
         Of the angle between two rays that still fix a depth.
     """
-    found = [
-        _between(rays, gates, first, second, min_sine)
-        for first in range(len(rays))
-        for second in range(first + 1, len(rays))
-    ]
-    pairs = np.zeros((0, 2), dtype=np.intp)
-    found.append(TriangulatedPoints(np.zeros((0, 3)), np.zeros(0), np.zeros(0), pairs, pairs))
-    columns = zip(*(vars(each).values() for each in found), strict=True)
-    return TriangulatedPoints(*map(np.concatenate, columns))
-
-
-def _between(
-    rays: Sequence[Rays], gates: Sequence[float], first: int, second: int, min_sine: float
-) -> TriangulatedPoints:
-    a, b = rays[first], rays[second]
-    apart = b.origins[None] - a.origins[:, None]
-    cosine = a.directions @ b.directions.T
-    along_a = (apart * a.directions[:, None]).sum(axis=-1)
-    along_b = (apart * b.directions[None]).sum(axis=-1)
-    sine2 = np.maximum(1 - cosine**2, 1e-300)
-    s = (along_a - cosine * along_b) / sine2
-    t = (cosine * along_a - along_b) / sine2
-    on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
-    on_b = b.origins[None] + t[..., None] * b.directions[None]
-    gap = np.linalg.norm(on_a - on_b, axis=-1)
-    error_a = gates[first] * (a.offset + a.slope * np.abs(s))
-    error_b = gates[second] * (b.offset + b.slope * np.abs(t))
-    tolerance = np.hypot(error_a, error_b)
-    good = (gap <= tolerance) & (sine2 > min_sine**2)
-    good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
-    i, j = np.nonzero(good)
-    return TriangulatedPoints(
-        0.5 * (on_a[i, j] + on_b[i, j]),
-        tolerance[i, j] / np.sqrt(sine2[i, j]),
-        gap[i, j] / tolerance[i, j],
-        np.tile(np.array([first, second], dtype=np.intp), (len(i), 1)),
-        np.stack([i, j], axis=1),
-    )
+    found = []
+    for first, second in combinations(range(len(rays)), 2):
+        a, b = rays[first], rays[second]
+        apart = b.origins[None] - a.origins[:, None]
+        cosine = a.directions @ b.directions.T
+        along_a = (apart * a.directions[:, None]).sum(axis=-1)
+        along_b = (apart * b.directions[None]).sum(axis=-1)
+        sine2 = np.maximum(1 - cosine**2, 1e-300)
+        s = (along_a - cosine * along_b) / sine2
+        t = (cosine * along_a - along_b) / sine2
+        on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
+        on_b = b.origins[None] + t[..., None] * b.directions[None]
+        gap = np.linalg.norm(on_a - on_b, axis=-1)
+        tolerance = np.hypot(
+            gates[first] * (a.offset + a.slope * np.abs(s)),
+            gates[second] * (b.offset + b.slope * np.abs(t)),
+        )
+        good = (gap <= tolerance) & (sine2 > min_sine**2)
+        good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
+        i, j = np.nonzero(good)
+        found.append(
+            (
+                0.5 * (on_a[i, j] + on_b[i, j]),
+                tolerance[i, j] / np.sqrt(sine2[i, j]),
+                gap[i, j] / tolerance[i, j],
+                np.tile(np.array([first, second], dtype=np.intp), (len(i), 1)),
+                np.stack([i, j], axis=1),
+            )
+        )
+    return TriangulatedPoints(*map(np.concatenate, zip(*found, strict=True)))

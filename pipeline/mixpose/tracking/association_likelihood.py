@@ -10,24 +10,37 @@ each feature at most one detection and each detection at most one feature,
 
 c being the number of false detections to be expected and W the room they have.  The sum over all
 associations runs over subsets of features, detection by detection, so that it is exact.
+
+One frame alone says little about how such a body is turned.  Where frames before it gave a pose,
+that pose is a Gaussian prior, as wide as it was uncertain and as the body may have moved since (a
+Kalman filter whose model of motion is that the body stays).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import DetectionModel
-from mixpose.objective import View, project_body
+from mixpose.density import Noise
+from mixpose.fit import Fit, NormalPrior, blur_schedule
+from mixpose.judgement import Case, DetectionModel, Judged, Residuals, judge, nearest_alike
+from mixpose.objective import Quadratic, View, project_body
+from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import PointPattern
+from mixpose.rigid import Floats, perturb
 
-Floats: TypeAlias = NDArray[np.float64]
+if TYPE_CHECKING:
+    from mixpose.tracking.likelihood import FrameData, Likelihood, Start
+
+_OPTIONS = NewtonOptions(iterations=30, tolerance=1e-7)
+_STEP = 0.01  # of σ_ε: by how much ranges differ for second derivatives, half of their digits
+_MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
 
 
 @dataclass(frozen=True)
@@ -153,3 +166,115 @@ def _summed(odds: Floats) -> tuple[Floats, Floats]:
             before[:, rest] += then
         left = before
     return total, shares
+
+
+def noise_ratio(noise: Noise, rules: RangeRules) -> float:
+    """Standard deviation of ranges in σ_ε, as residuals of earlier frames show it."""
+    stated = Noise(rules.stated_degrees, rules.stated_degrees).joined(noise)
+    return max(1.0, float(np.sqrt(stated.variance)))
+
+
+@dataclass(frozen=True, eq=False)
+class AssociationLikelihood:
+    """All associations of single ranges with the features of a small body.
+
+    `matched` leads from a start of which nothing is known to where it begins.
+    """
+
+    data: FrameData
+    matched: Callable[[FrameData], Likelihood]
+
+    @property
+    def knows_detections(self) -> bool:
+        """As `Likelihood` has it."""
+        return False
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of ranges, in σ_ε."""
+        return noise_ratio(self.data.track.residuals.total, self.data.rules.ranges)
+
+    def fit(self, start: Start) -> Fit:
+        """Climb the posterior, at first with ranges that err as far as the prior may."""
+        T, data, prior, widths = start.T_world_object, self.data, self._prior(start), [self.noise]
+        if prior is None:
+            T = self.matched(data).fit(start).T_world_object
+            T = nearest_alike(T, data.body, data.T_reference)
+        else:
+            uncertainty = np.where(data.free, prior.uncertainty, 0.0)
+            levels = blur_schedule(data.views, data.body, T, uncertainty)
+            ratios = [max(np.divide(level, data.sigmas).tolist()) for level in levels]
+            widths = [ratio for ratio in ratios if ratio > self.noise] + widths
+        found = Ascent(T, 0.0, False, 0)
+        for width in widths:
+            posterior = partial(self._posterior, prior, width)
+            found = ascend(posterior, perturb, found.state, data.free, _OPTIONS)
+        return Fit(found.state, found.value, found.converged, found.iterations)
+
+    def judge(self, fit: Fit, start: Start) -> Judged:
+        """Judge a pose by the sum over all associations, with the prior of the start."""
+        data, T, free, model = self.data, fit.T_world_object, self.data.free, self.data.rules
+        judged = judge(Case(data.finest, T), free, model.judgement)
+        found, before = self._sums(T[None], self.noise), data.track.residuals.total
+        count, memory = int(free.sum()), model.judgement.noise.memory
+        degrees = max(float(found.met[0]) - count, 0.0)
+        noise = Noise(float(found.squares[0]) if degrees else 0.0, degrees)
+        inner = np.ix_(free, free)
+        # a direction that the data leave open is as uncertain as anywhere; the posterior holds
+        # the prediction already
+        information = self._definite(self._posterior(self._prior(start), self.noise, T))
+        information += np.diag(1 / data.anywhere.spread[free] ** 2)
+        covariance = np.zeros((6, 6))
+        covariance[inner] = np.linalg.inv(information)
+        volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
+        degrees = model.ranges.stated_degrees + before.degrees
+        covariance *= model.judgement.noise.enlargement(count, degrees)
+        log_odds = float(found.log_odds[0])
+        return replace(
+            judged,
+            covariance=covariance,
+            log_evidence=log_odds + data.prior(T).log_density + float(volume),
+            residuals=Residuals({"": before.faded(memory).joined(noise)}),
+            spread=np.sqrt(np.diag(covariance)),
+            value=log_odds,
+        )
+
+    def _prior(self, start: Start) -> NormalPrior | None:
+        """What frames before said of a start as surely as this one will."""
+        expected = start.prediction
+        if expected is None or not expected.is_prior:
+            return None
+        return NormalPrior(expected.T_world_object, expected.uncertainty, self.data.free)
+
+    def _sums(self, poses: Floats, noise: float) -> AssociationSum:
+        data = self.data
+        return sum_associations(data.views, data.body, poses, noise, data.rules.judgement.detection)
+
+    def _posterior(
+        self, prior: NormalPrior | None, noise: float, T_world_object: Floats
+    ) -> Quadratic:
+        """Second-order model; the second derivatives are differences of gradients.
+
+        Steps move ranges by a small part of their error.
+        """
+        free, sigma = self.data.free, noise * min(self.data.sigmas)
+        arm = float(np.linalg.norm(self.data.body.means, axis=1).max())
+        scale = np.repeat([_STEP * sigma, _STEP * sigma / max(arm, sigma)], 3)[free]
+        steps = scale[:, None] * np.eye(6)[free]
+        poses = perturb(T_world_object, np.vstack([np.zeros(6), steps, -steps]))
+        found = self._sums(poses, noise)
+        here, ahead, behind = np.split(found.gradient, [1, 1 + len(steps)])
+        H = np.zeros((6, 6))
+        H[free] = (behind - ahead) / (2 * scale[:, None])
+        value, C = float(found.log_odds[0]), found.information[0]
+        model = Quadratic(value, here[0], C, (H + H.T) / 2)
+        return model if prior is None else prior.joined(model, T_world_object)
+
+    def _definite(self, here: Quadratic) -> Floats:
+        """Minus the Hessian (k, k) where definite; in directions where not, next to nothing."""
+        assert here.hessian is not None
+        free, least = self.data.free, self.data.rules.ranges.min_information
+        scale = 1 / np.sqrt(np.maximum(np.diagonal(here.curvature)[free], _MIN_INFORMATION))
+        values, vectors = np.linalg.eigh(here.hessian[np.ix_(free, free)] * scale * scale[:, None])
+        bounded = (vectors * np.maximum(values, least)) @ vectors.T
+        return np.asarray(bounded / scale / scale[:, None])

@@ -10,15 +10,13 @@ nothing of the pose itself: that is estimated from its frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.rigid import twist_between
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.rigid import Floats
+from mixpose.sensors import Motion
 
 _ORDER = 4  # place, velocity, acceleration, jerk
 _FACTORIAL = np.array([1.0, 1.0, 2.0, 6.0])
@@ -68,6 +66,10 @@ class Expected(NamedTuple):
     deviation: Floats
     acceleration: Floats
 
+    def at(self, T_world_object: Floats) -> Motion:
+        """How a body moves at that pose."""
+        return Motion(T_world_object, self.velocity, self.acceleration)
+
 
 def unknown(radius: float, rules: CourseRules) -> Expected:
     """What is expected where nothing was seen before: rest, give or take what hands can do."""
@@ -78,12 +80,10 @@ def unknown(radius: float, rules: CourseRules) -> Expected:
 
 @dataclass(frozen=True)
 class Course:
-    """Where a body is, how fast it goes there, and how sure that is.
+    """How fast a body goes at its last pose, to which states are relative, and how sure that is.
 
     Attributes
     ----------
-    T_world_object : (4, 4) float64
-        The last pose; states are relative to it.
     means : (F, 6, 4) float64
         Place, velocity, acceleration and jerk by F filters.
     covariances : (F, 6, 4, 4) float64
@@ -93,31 +93,26 @@ class Course:
         The body's radius.
     """
 
-    T_world_object: Floats
     means: Floats
     covariances: Floats
     log_likelihoods: Floats
     scale: float
 
     @classmethod
-    def begun(cls, T: Floats, deviation: Floats, radius: float, rules: CourseRules) -> Course:
+    def begun(cls, deviation: Floats, radius: float, rules: CourseRules) -> Course:
         """A course of one pose with standard deviations (6,)."""
         count = rules.filters
         fastest = unknown(radius, rules).deviation
         spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(_ORDER - 1))], 1)
         covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(_ORDER), (count, 6, 4, 4))
-        return cls(T, np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), radius)
+        return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), radius)
 
-    def expected(
-        self, T_world_object: Floats | None, elapsed: float, rules: CourseRules
-    ) -> Expected:
-        """The velocity at a pose some seconds after the last; None: where that is foretold."""
+    def expected(self, moved: Floats | None, elapsed: float, rules: CourseRules) -> Expected:
+        """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
         means, covariances = self._foretold(elapsed, rules)
         each = (self.log_likelihoods.argmax(axis=0)[_KINDS], np.arange(6))
         mean, covariance = means[each], covariances[each]
-        moved = mean[:, 0]
-        if T_world_object is not None:
-            moved = twist_between(self.T_world_object, T_world_object)
+        moved = mean[:, 0] if moved is None else moved
         gains = covariance[:, 1:3, 0] / covariance[:, :1, 0]
         rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
         variance = covariance[:, 1, 1] - gains[:, 0] * covariance[:, 1, 0]
@@ -126,32 +121,31 @@ class Course:
         return Expected(rates[:, 0], gains[:, 0], deviation, rates[:, 1])
 
     def followed(
-        self, T_world_object: Floats, deviation: Floats, elapsed: float, rules: CourseRules
+        self, moved: Floats, deviation: Floats, elapsed: float, rules: CourseRules
     ) -> Course:
-        """The course after one more pose with standard deviations (6,)."""
+        """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""
         means, covariances = self._foretold(elapsed, rules)
-        moved = twist_between(self.T_world_object, T_world_object)
         rest = moved - means[:, :, 0]
         variance = covariances[:, :, 0, 0] + deviation**2
         off = rest**2 / variance
         if off.min(axis=0).max() > rules.lost:
-            return Course.begun(T_world_object, deviation, self.scale, rules)
+            return Course.begun(deviation, self.scale, rules)
         gains = covariances[..., 0] / variance[..., None]
         means = means + gains * rest[..., None]
         covariances = covariances - gains[..., None] * covariances[..., None, 0, :]
         means[..., 0] -= moved
         # derivatives by the turn itself, not by its logarithm
-        half = np.cross(moved[3:], means[:, 3:, 1:], axisb=1, axisc=1) / 2
-        means[:, 3:, 1:] += half
+        means[:, 3:, 1:] += np.cross(moved[3:], means[:, 3:, 1:], axisb=1, axisc=1) / 2
         seen = -0.5 * (np.log(variance) + off)
         logs = rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
-        return Course(T_world_object, means, covariances, logs - logs.max(axis=0), self.scale)
+        return Course(means, covariances, logs - logs.max(axis=0), self.scale)
 
     def _foretold(self, elapsed: float, rules: CourseRules) -> tuple[Floats, Floats]:
         """Means and covariances of all filters some seconds later."""
         n, t = _ORDER - 1, elapsed
         i, j = np.indices((_ORDER, _ORDER))
-        F = np.where(j >= i, t ** np.maximum(j - i, 0) / _FACTORIAL[np.maximum(j - i, 0)], 0.0)
+        on = np.maximum(j - i, 0)
+        F = np.where(j >= i, t**on / _FACTORIAL[on], 0.0)
         # of white noise in the derivative of the jerk
         ahead = 2 * n + 1 - i - j
         Q = t**ahead / (ahead * _FACTORIAL[n - i] * _FACTORIAL[n - j])

@@ -1,28 +1,104 @@
-"""A pose near a start, with the velocity at which the body is seen there."""
+"""A pose near a start, with the velocity at which the body is seen there.
+
+Sensors may see a moving body at moments of their own: late, or row after row.  A pose and a
+velocity are estimated together: the pose by the objective, in which every feature is predicted
+where the body is when its row is read, and the velocity from what the frame's residuals and the
+poses before say of it.  Both are the maximum of one likelihood, sought in turns: a Gauss-Newton
+step of both gives the velocity, with which the objective is climbed again.
+
+With velocity v, a feature that is seen t seconds after the common time moves by J δ + t J δv when
+the pose changes by δ and the velocity by δv.  A sensor that is later than it says by τ has offsets
+J v τ more.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.density import errors_seen, sums_of
 from mixpose.fit import Fit
-from mixpose.judgement import Judged, nearest_alike
-from mixpose.rigid import perturb
-from mixpose.sensors import Motion
-from mixpose.tracking.delays import together, widened
+from mixpose.judgement import Association, Judged, associate, joined_offsets, nearest_alike
+from mixpose.judgement.moments import inverses
+from mixpose.objective import View
+from mixpose.rigid import Floats, perturb
+from mixpose.sensors import Motion, moments
+from mixpose.tracking.course import Expected
 
 if TYPE_CHECKING:
     from mixpose.tracking.likelihood import FrameData
 
-Floats: TypeAlias = NDArray[np.float64]
-
 ROUNDS = 6
 LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
 SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
+
+TYPICAL = 0.2  # residuals in σ_ε, as two features would say: what a frame alone is weighed by
+_TYPICAL_DEGREES = 4.0
+LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
+
+
+class Offsets(NamedTuple):
+    """Met features of all sensors, in σ_ε and as rows for least squares.
+
+    Attributes
+    ----------
+    rows : (K, 6) float64
+        J, each weighted by the root of how far its feature is met.
+    late : (K,) float64
+        Seconds after the common time at which it is seen.
+    offsets : (K,) float64
+        Observed minus predicted.
+    sensor : (K,) int
+    unsure : tuple of (int, float)
+        Sensors whose delays are estimated, with the standard deviations.
+    """
+
+    rows: Floats
+    late: Floats
+    offsets: Floats
+    sensor: NDArray[np.intp]
+    unsure: tuple[tuple[int, float], ...]
+
+    def of(self, sensors: Sequence[int]) -> NDArray[np.bool_]:
+        """Which rows are of each of some sensors (K, q)."""
+        return np.asarray(self.sensor[:, None] == np.array(sensors, int))
+
+    def by_delay(self, velocity: Floats, sensors: Sequence[int]) -> Floats:
+        """How the features of some sensors would move with their delays, (K, q) per second."""
+        return np.where(self.of(sensors), (self.rows @ velocity)[:, None], 0.0)
+
+    def followed(self, change: Floats, free: NDArray[np.bool_]) -> Floats:
+        """How the pose (6,) follows a change of the velocity: a Gauss-Newton step."""
+        rows, step = self.rows[:, free], np.zeros(6)
+        left = self.offsets - self.late * (self.rows @ change)
+        step[free] = _inverse(rows.T @ rows) @ (rows.T @ left)
+        return step
+
+    def system(
+        self, velocity: Floats, expected: Expected, free: NDArray[np.bool_]
+    ) -> tuple[Floats, Floats, Floats]:
+        """Derivatives by all unknowns, and what is known of these: rows and right sides.
+
+        The unknowns are the pose, the velocity, the estimated delays, and of each delay the way of
+        the body in it at a velocity other than this.  What is known has standard deviation one.
+        """
+        rows, fast = self.rows[:, free], expected.deviation[free]
+        count, late = len(fast), np.array([deviation for _, deviation in self.unsure])
+        own = self.of([k for k, _ in self.unsure])
+        ways = (own[:, :, None] * rows[:, None]).reshape(len(rows), -1)
+        by_delay = self.by_delay(velocity, [k for k, _ in self.unsure])
+        design = np.hstack([rows, rows * self.late[:, None], by_delay, ways])
+        # the velocity less what is expected of the pose after its step, and the delays
+        prior = np.eye(design.shape[1])[count:]
+        prior[:count, :count] = -np.diag(expected.gain[free])
+        prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
+        known = np.zeros(len(prior))
+        known[:count] = (expected.velocity - velocity)[free] / fast
+        return design, prior, known
 
 
 def fit_in_motion(
@@ -41,19 +117,20 @@ def fit_in_motion(
         Takes a frame as of the common time, a pose, and how far features may be off, in σ_ε, to
         the best pose near it.
     """
-    motion = data.motion(T_start, is_there=False)
+    motion = data.expected(T_start, is_there=False).at(T_start)
     T, expected, moved = T_start, data.expected(T_start), np.inf
     for _ in range(ROUNDS):
         seen = data.in_motion(motion)
         if moved > LINEAR:
-            fit = climb(seen, T, seen.unsure(T, expected))
+            fit = climb(seen, T, _in_view(seen, T, expected))
             T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         expected = data.expected(T)
-        offsets = seen.offsets(T, expected)
-        both = together(offsets, motion.velocity, expected, data.free)
-        moved = float(np.abs(offsets.rows @ both.change * offsets.late).max(initial=0.0))
-        T = np.asarray(perturb(T, offsets.followed(both.change, data.free)))
-        motion = Motion(T, motion.velocity + both.change, expected.acceleration)
+        found, _ = associate(seen.finest, T, data.rules.judgement.association)
+        offsets = offsets_of(seen, found, expected)
+        change = _change(offsets, motion.velocity, expected, data.free)
+        moved = float(np.abs(offsets.rows @ change * offsets.late).max(initial=0.0))
+        T = np.asarray(perturb(T, offsets.followed(change, data.free)))
+        motion = Motion(T, motion.velocity + change, expected.acceleration)
         if moved < SETTLED:
             break
     return replace(fit, T_world_object=T, motion=motion)
@@ -61,9 +138,88 @@ def fit_in_motion(
 
 def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judged:
     """A judged pose, as sure as its velocity lets it be."""
-    T = judged.T_world_object
-    expected = data.expected(T)
+    free, expected = data.free, data.expected(judged.T_world_object)
     used = [one for one in judged.associations if judged.sensors[one.name].used]
-    offsets = data.offsets(T, expected, used)
-    wider = widened(judged.covariance, offsets, motion.velocity, expected, data.free)
-    return replace(judged, covariance=wider)
+    offsets, inner, count = offsets_of(data, used, expected), np.ix_(free, free), int(free.sum())
+    rows, covariance = offsets.rows[:, free], judged.covariance.copy()
+    alone = rows.T @ rows
+    # the variance by which the covariance goes
+    scale = float(np.trace(alone @ covariance[inner])) / max(count, 1)
+    if not np.isfinite(scale) or scale <= 0:
+        return judged
+    design, prior, _ = offsets.system(motion.velocity, expected, free)
+    together = _inverse(design.T @ design / scale + prior.T @ prior)[:count, :count]
+    extra = together - scale * _inverse(alone)
+    values, vectors = np.linalg.eigh((extra + extra.T) / 2)
+    covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return replace(judged, covariance=covariance)
+
+
+def offsets_of(
+    data: FrameData, found: Sequence[Association], expected: Expected | None = None
+) -> Offsets:
+    """How far off features are met, as they pull, and when they were seen.
+
+    What is farther off than noise and an expected velocity let it be counts for little.
+    """
+    names = [view.name for view in data.views]
+    chosen = [names.index(one.name) for one in found]
+    views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(found))
+    if expected is not None:
+        errors, known = data.rules.judgement.noise.errors, sums_of([data.noise[k] for k in chosen])
+        noise = errors_seen(joined_offsets(found), int(data.free.sum()), known, errors).blurs
+        pairs = zip(found, views, strict=True)
+        unsure = [_unsure_by(one.J, one.places, view, expected) for one, view in pairs]
+        # a pose that was climbed to at another velocity is off by as much in all sensors
+        blurs = np.minimum(np.hypot(noise, errors.blur * max(unsure, default=0.0)), 1.0)
+    parts = []
+    for k, (one, view, blur) in enumerate(zip(found, views, blurs.tolist(), strict=True)):
+        seconds = moments(view.sensor, one.places, view.delay, view.readout)
+        pull = np.sqrt(one.shares * np.exp(-0.25 * one.squared / blur**2))
+        m = one.J.shape[1]
+        root = np.repeat(pull / one.sigma, m)
+        own = one.J.reshape(-1, 6) * root[:, None], np.repeat(seconds, m)
+        parts.append((*own, one.offsets.reshape(-1) * root, np.full(len(root), k)))
+    rows, late, offsets, sensor = (np.concatenate(part) for part in zip(*parts, strict=True))
+    delays = [(k, view.unsure) for k, view in enumerate(views) if view.unsure is not None]
+    return Offsets(rows, late, offsets, sensor, tuple(delays))
+
+
+def _in_view(data: FrameData, T_world_object: Floats, expected: Expected) -> float:
+    """How far features in view may be off by velocity and delay, in σ_ε of their sensor."""
+    projection, views = data.finest.projection, (data.still or data).views
+    at = projection.project(T_world_object[None])
+    each = zip(at.J, at.y, at.seen, projection.dimensions.tolist(), views, strict=True)
+    return max(
+        _unsure_by(J[0, seen[0], :m], y[0, seen[0], :m], view, expected)
+        for J, y, seen, m, view in each
+    )
+
+
+def _unsure_by(J: Floats, y: Floats, view: View, expected: Expected) -> float:
+    """How far features at places (n, m) may be off by velocity and delay, in σ_ε; J (n, m, 6)."""
+    late = moments(view.sensor, y, view.delay, view.readout)
+    speed = np.hypot(expected.velocity, expected.deviation) * (view.unsure or 0.0)
+    ways = np.hypot(late[:, None] * expected.deviation, speed)
+    squares = ((J * ways[:, None]) ** 2).sum(axis=(1, 2)).max(initial=0.0)
+    return float(np.sqrt(squares)) / view.observation.sigma
+
+
+def _change(seen: Offsets, velocity: Floats, expected: Expected, free: NDArray[np.bool_]) -> Floats:
+    """Change (6,) of the velocity by one Gauss-Newton step of it and the pose."""
+    design, prior, known = seen.system(velocity, expected, free)
+    count, change, variance = int(free.sum()), np.zeros(6), TYPICAL**2
+    for _ in range(2):  # the second time with the variance that the first leaves
+        information = design.T @ design / variance + prior.T @ prior
+        x = _inverse(information) @ (design.T @ seen.offsets / variance + prior.T @ known)
+        rest = seen.offsets - design @ x
+        degrees = _TYPICAL_DEGREES + max(len(rest) - count, 0)
+        total = _TYPICAL_DEGREES * TYPICAL**2 + float(rest @ rest)
+        variance = max(total / degrees, LEAST_VARIANCE)
+    change[free] = x[count : 2 * count]
+    return change
+
+
+def _inverse(information: Floats) -> Floats:
+    """Inverse of one information matrix; large where it is open."""
+    return np.asarray(inverses(information[None])[0])

@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Noise, errors_seen, sums_of
-from mixpose.fit import Climbed, EstimatorOptions, Fit, NormalPrior, fit_near, free_mask
+from mixpose.density import Noise
+from mixpose.fit import Climbed, EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
     Association,
     Case,
@@ -24,26 +24,22 @@ from mixpose.judgement import (
     Prior,
     associate,
     flat_prior,
-    joined_offsets,
     judge,
     nearest_alike,
 )
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.optimise import Ascent
 from mixpose.records import SensorReport
-from mixpose.rigid import twist_between
+from mixpose.rigid import Floats, twist_between
 from mixpose.search import SearchReport, SearchState
-from mixpose.sensors import Motion
-from mixpose.tracking.association_likelihood import are_associated
+from mixpose.sensors import Motion, in_motion
+from mixpose.tracking.association_likelihood import AssociationLikelihood, are_associated
 from mixpose.tracking.companion import either
 from mixpose.tracking.course import Expected, unknown
-from mixpose.tracking.delays import Offsets, is_timed, offsets_of, seen_in_motion, unsure_by
+from mixpose.tracking.delays import is_timed
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
-from mixpose.tracking.range_posterior import Posterior, judge_ranges, noise_ratio
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -142,6 +138,8 @@ class FrameData:
     begun: Begun | None = None
     log: SearchLog = field(default_factory=SearchLog)
     elapsed: float | None = None
+    frame: int = 0
+    time_s: float | None = None
     still: FrameData | None = None
     beside: Prediction | None = None
 
@@ -156,18 +154,19 @@ class FrameData:
         memory, known = self.rules.judgement.noise.memory, self.track.residuals.noise
         return [known.get(view.name, Noise()).faded(memory) for view in self.views]
 
+    @cached_property
+    def anywhere(self) -> Prior:
+        """What is known of a pose of which nothing is known."""
+        return flat_prior(self.body, self.free, self.rules.judgement.detection)
+
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
-        rules, misses = self.rules.motion, self.track.misses
-        detection = self.rules.judgement.detection
-
-        def prior(expected: Sequence[Prediction], misses: int) -> Prior:
-            return prior_of(
-                T_world_object, expected, self.body, self.free, misses, rules, detection
-            )
-
-        own = prior(self.predictions, misses)
-        return own if self.beside is None else either(own, prior([self.beside], 0), misses, rules)
+        rules, misses, of = self.rules.motion, self.track.misses, (self.body, self.free)
+        own = prior_of(T_world_object, self.predictions, *of, misses, rules, self.anywhere)
+        if self.beside is None:
+            return own
+        beside = prior_of(T_world_object, [self.beside], *of, 0, rules, self.anywhere)
+        return either(own, beside, misses, rules)
 
     def moves_alike(self, T_world_object: Floats) -> Floats | None:
         """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""
@@ -200,49 +199,30 @@ class FrameData:
     def in_motion(self, motion: Motion) -> FrameData:
         """The frame as of the common time, of a body that moves."""
         still = self.still or self
-        return replace(still, views=seen_in_motion(still.views, motion), still=still)
+        views = [
+            replace(view, sensor=in_motion(view.sensor, motion, view.delay, view.readout))
+            for view in still.views
+        ]
+        return replace(still, views=views, still=still)
 
     def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
         """The velocity that the frames before let expect of a pose, or near it."""
-        rules, track = self.rules, self.track
-        nothing = unknown(self.body.radius, rules.course)
-        if not self.elapsed or not track.branches or self.elapsed > rules.course.longest_s:
-            return nothing
-        course = nearest_branch(track, T_world_object, self.body).course
-        if course is None:
-            return nothing
-        T = nearest_alike(T_world_object, self.body, course.T_world_object)
-        expected = course.expected(T if is_there else None, self.elapsed, rules.course)
-        is_far = (np.abs(expected.velocity) > nothing.deviation).any()
-        return nothing if is_far else expected
-
-    def steady(self, T_world_object: Floats) -> Expected:
-        """The velocity at a pose, by the last two steps alone."""
-        nothing = unknown(self.body.radius, self.rules.course)
-        branch = (
-            nearest_branch(self.track, T_world_object, self.body) if self.track.branches else None
-        )
-        if branch is None or branch.velocity is None or not self.elapsed:
+        elapsed, rules = self.elapsed, self.rules.course
+        nothing = unknown(self.body.radius, rules)
+        branch = nearest_branch(self.track, T_world_object, self.body)
+        if branch is None or not elapsed:
             return nothing
         T = nearest_alike(T_world_object, self.body, branch.T_world_object)
-        mean = twist_between(branch.T_world_object, T) / self.elapsed
-        velocity = mean + (mean - branch.velocity) / 2
-        return Expected(velocity, np.full(6, 1.5 / self.elapsed), nothing.deviation, np.zeros(6))
-
-    def motion(self, T_world_object: Floats, *, is_there: bool = True) -> Motion:
-        """How the body is expected to move at a pose, or near it where it need not be there."""
-        expected = self.expected(T_world_object, is_there=is_there)
-        return Motion(T_world_object, expected.velocity, expected.acceleration)
-
-    def unsure(self, T_world_object: Floats, velocity: Expected) -> float:
-        """How far features in view may be off by velocity and delay, in σ_ε of their sensor."""
-        at, views = self.finest.projection.project(T_world_object[None]), (self.still or self).views
-        dimensions = self.finest.projection.dimensions.tolist()
-        each = zip(at.J, at.y, at.seen, dimensions, views, strict=True)
-        return max(
-            unsure_by(J[0, seen[0], :m], y[0, seen[0], :m], view, velocity)
-            for J, y, seen, m, view in each
-        )
+        moved = twist_between(branch.T_world_object, T)
+        if branch.course is not None and elapsed <= rules.longest_s:
+            expected = branch.course.expected(moved if is_there else None, elapsed, rules)
+            is_far = (np.abs(expected.velocity) > nothing.deviation).any()
+            return nothing if is_far else expected
+        if branch.course is not None or branch.velocity is None:
+            return nothing
+        # by the last two steps alone
+        velocity = moved / elapsed + (moved / elapsed - branch.velocity) / 2
+        return nothing._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
 
     def given(self, T_world_object: Floats) -> float:
         """How far features in view may be off by the body's spread, in σ_ε of their sensor."""
@@ -253,33 +233,6 @@ class FrameData:
         each = zip(at.J[:, 0], self.finest.projection.dimensions.tolist(), strict=True)
         variances = np.array([in_image(spreads, J[:, :m]) for J, m in each]) * at.seen[:, 0]
         return float(np.sqrt((variances / np.square(self.sigmas)[:, None]).max()))
-
-    def offsets(
-        self,
-        T_world_object: Floats,
-        velocity: Expected | None = None,
-        found: Sequence[Association] | None = None,
-    ) -> Offsets:
-        """How far off features are met at a pose, and when they were seen.
-
-        What is farther off than noise and an expected velocity let it be counts for little.
-        """
-        if found is None:
-            rules = self.rules.judgement.association
-            found, _ = associate(self.finest, T_world_object, rules)
-        names = {view.name: k for k, view in enumerate(self.views)}
-        chosen = [names[one.name] for one in found]
-        views = [(self.still or self).views[k] for k in chosen]
-        blurs = np.ones(len(found))
-        if velocity is not None:
-            known = sums_of([self.noise[k] for k in chosen])
-            errors = self.rules.judgement.noise.errors
-            noise = errors_seen(joined_offsets(found), int(self.free.sum()), known, errors).blurs
-            pairs = zip(found, views, strict=True)
-            unsure = [unsure_by(one.J, one.places, view, velocity) for one, view in pairs]
-            # a pose that was climbed to at another velocity is off by as much in all sensors
-            blurs = np.hypot(noise, errors.blur * max(unsure, default=0.0))
-        return offsets_of(found, views, np.minimum(blurs, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +294,7 @@ class MatchedLikelihood:
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         motion = fit.motion
         if is_timed(data.views):
-            motion = motion or data.motion(T)
+            motion = motion or data.expected(T).at(T)
             data = data.in_motion(motion)
         others: list[Association] = []
         if start.left_out:
@@ -363,53 +316,10 @@ class MatchedLikelihood:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class AssociationLikelihood:
-    """All associations of single ranges with the features of a small body."""
-
-    data: FrameData
-
-    @property
-    def knows_detections(self) -> bool:
-        """As `Likelihood` has it."""
-        return False
-
-    def fit(self, start: Start) -> Fit:
-        """Climb the posterior; the matched objective leads to where it begins."""
-        T, data, posterior = start.T_world_object, self.data, self._posterior(start)
-        if posterior.prior is None:
-            T = MatchedLikelihood(data).fit(start).T_world_object
-            T = nearest_alike(T, data.body, data.T_reference)
-        found = posterior.climbed(T)
-        return Fit(found.state, found.value, found.converged, found.iterations)
-
-    def judge(self, fit: Fit, start: Start) -> Judged:
-        """Judge a pose by the sum over all associations."""
-        data, T = self.data, fit.T_world_object
-        judged = judge(Case(data.finest, T), data.free, data.rules.judgement)
-        anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
-        return judge_ranges(
-            judged,
-            self._posterior(start),
-            data.track.residuals.total,
-            # the posterior holds the prediction already
-            replace(data.prior(T), spread=anywhere.spread),
-            data.rules.judgement.noise,
-            data.rules.ranges,
-        )
-
-    def _posterior(self, start: Start) -> Posterior:
-        data = self.data
-        noise = noise_ratio(data.track.residuals.total, data.rules.ranges)
-        detection, expected, prior = data.rules.judgement.detection, start.prediction, None
-        if expected and expected.is_prior:
-            prior = NormalPrior(expected.T_world_object, expected.uncertainty, data.free)
-        return Posterior(data.views, data.body, data.free, noise, prior, detection)
-
-
 def likelihood_of(data: FrameData) -> Likelihood:
     """The likelihood for a frame."""
-    ranged = data.options.objective == "matched" and are_associated(
+    if data.options.objective == "matched" and are_associated(
         data.views, data.body, data.rules.ranges
-    )
-    return AssociationLikelihood(data) if ranged else MatchedLikelihood(data)
+    ):
+        return AssociationLikelihood(data, MatchedLikelihood)
+    return MatchedLikelihood(data)

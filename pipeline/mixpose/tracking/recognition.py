@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.judgement import Judged, flat_prior
+from mixpose.judgement import Judged
 from mixpose.tracking.likelihood import FrameData
 
 TRIANGLE = "three markers are met, which other things may have alike"
@@ -38,8 +38,7 @@ def is_from_doubt(data: FrameData, judged: Judged) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
     if data.track.believed:
         return False
-    anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
-    gained = data.prior(judged.T_world_object).log_density - anywhere.log_density
+    gained = data.prior(judged.T_world_object).log_density - data.anywhere.log_density
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
 
@@ -56,5 +55,4 @@ def is_known(data: FrameData, judged: Judged) -> bool:
         return True
     if not data.track.known or data.track.misses:
         return False
-    anywhere = flat_prior(data.body, data.free, data.rules.judgement.detection)
-    return bool((data.prior(judged.T_world_object).spread < anywhere.spread).all())
+    return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())

@@ -5,25 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.judgement import DetectionModel, Prior, Residuals, flat_prior, nearest_alike
-from mixpose.rigid import perturb, twist_between
+from mixpose.judgement import Prior, Residuals, nearest_alike
+from mixpose.rigid import Floats, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.companion import Companion
 from mixpose.tracking.course import Course, CourseRules
 from mixpose.tracking.delays import DelayEvidence
 from mixpose.tracking.motion import MotionRules, RandomWalk
 from mixpose.tracking.static_clutter import StaticClutter
-
-Floats: TypeAlias = NDArray[np.float64]
-
-
-_MOST = 0.5  # of the features in view: a sensor that meets so many has met the body
 
 
 @dataclass(frozen=True)
@@ -54,15 +49,8 @@ class Branch:
     course: Course | None = None
 
 
-@dataclass(frozen=True)
-class SensorTally:
-    """How a sensor met the body in the last frame with a pose.
-
-    Attributes
-    ----------
-    met, in_view : int
-        Features with a detection, and all that should have one.
-    """
+class SensorTally(NamedTuple):
+    """How many features a sensor met in the last frame with a pose, and how many it should have."""
 
     met: int
     in_view: int
@@ -171,10 +159,9 @@ def prior_of(
     free: NDArray[np.bool_],
     misses: int,
     rules: MotionRules,
-    detection: DetectionModel,
+    anywhere: Prior,
 ) -> Prior:
     """Density of a pose before its frame: the predictions, or now and then anywhere."""
-    anywhere = flat_prior(body, free, detection)
     if not predictions:
         return anywhere
     surprise = min(rules.surprise * (1 + misses), 1.0)
@@ -223,12 +210,10 @@ def follow(
     found: Sequence[Found],
     frame: int,
     time_s: float | None,
-    residuals: Residuals,
-    tallies: Mapping[str, SensorTally],
     rules: MotionRules,
     course_rules: CourseRules = CourseRules(),
 ) -> Track:
-    """The track after a frame with poses.
+    """The track after a frame with poses, as far as these tell.
 
     Parameters
     ----------
@@ -239,10 +224,6 @@ def follow(
         Best first.
     frame, time_s
         Of the frame.
-    residuals : Residuals
-        So far.
-    tallies
-        Of the best pose, as `Track` has them.
     rules : MotionRules
     course_rules : CourseRules
     """
@@ -250,34 +231,35 @@ def follow(
     branches: list[Branch] = []
     walk = track.walk
     for T, weight, spread, deviation in found:
-        velocity, uncertainty = None, rules.unsteady * rules.steady(body)
-        parent = nearest_branch(track, T, body) if track.branches else None
-        if spread is not None and parent is not None and elapsed > 0:
-            if not branches and track.frame is not None:
-                moved = twist_between(parent.T_world_object, T)
+        velocity, course, uncertainty = None, None, rules.unsteady * rules.steady(body)
+        parent = nearest_branch(track, T, body)
+        before = parent.course if parent else None
+        if parent is not None and track.frame is not None and elapsed > 0:
+            moved = twist_between(parent.T_world_object, T)
+            if spread is not None and not branches:
                 walk = walk or RandomWalk.unknown(body, elapsed, rules)
                 walk = walk.joined(moved, body.radius, elapsed)
-        elif parent is not None and track.frame is not None and elapsed > 0:
-            moved = twist_between(parent.T_world_object, T)
-            if track.misses <= rules.coasting:
+            elif spread is None and track.misses <= rules.coasting:
                 velocity = moved / elapsed
-                change = moved - (0 if parent.velocity is None else parent.velocity * elapsed)
-                half = np.abs(change) if parent.velocity is not None else np.abs(moved) / 2
+                last = parent.velocity
+                change = moved / 2 if last is None else moved - last * elapsed
                 # of one frame, where it was seen over several
-                half = half / (1 + track.misses)
-                uncertainty = np.maximum(_per_kind(half), rules.steady(body))
-        course = None
+                change = change / (1 + track.misses)
+                uncertainty = np.maximum(_per_kind(change), rules.steady(body))
+            if deviation is not None and before and elapsed <= course_rules.longest_s:
+                course = before.followed(moved, deviation, elapsed, course_rules)
         if deviation is not None:
-            before = parent.course if parent is not None else None
-            if before is not None and 0 < elapsed <= course_rules.longest_s:
-                course = before.followed(T, deviation, elapsed, course_rules)
-            else:
-                course = Course.begun(T, deviation, body.radius, course_rules)
+            course = course or Course.begun(deviation, body.radius, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
-    met = [one for one in tallies.values() if one.met >= _MOST * one.in_view > 0]
-    agreed = track.agreed or len(met) > 1
-    parts = tuple(branches), frame, time_s, 0, residuals, walk, tallies
-    return Track(*parts, delays=track.delays, clutter=track.clutter, agreed=agreed)
+    return replace(
+        track,
+        branches=tuple(branches),
+        frame=frame,
+        time_s=time_s,
+        misses=0,
+        walk=walk,
+        search=SearchState(),
+    )
 
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
@@ -287,8 +269,10 @@ def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
     return float(frame - (track.frame or 0))
 
 
-def nearest_branch(track: Track, T: Floats, body: Body) -> Branch:
+def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:
     """The branch that a pose goes on from: the nearest."""
+    if not track.branches:
+        return None
     away = [
         np.linalg.norm(twist_between(branch.T_world_object, T) / np.repeat([body.radius, 1.0], 3))
         for branch in track.branches

@@ -7,9 +7,8 @@ everywhere else, and invents nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,8 @@ from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert, is_sure
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
-from mixpose.tracking.delays import LEAST_VARIANCE, DelayEvidence, believed, is_timed
+from mixpose.rigid import Floats
+from mixpose.tracking.delays import is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.proposers.stepped_aside import ASIDE, is_a_step
@@ -29,9 +29,7 @@ from mixpose.tracking.reflection import MIRRORED, is_reflection
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
-Floats: TypeAlias = NDArray[np.float64]
-
-SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
+_MOST = 0.5  # of the features in view: a sensor that meets so many has met the body
 
 
 @dataclass(frozen=True)
@@ -127,11 +125,11 @@ class Tracker:
         if verdict.status == "ok" and (best := verdict.best):
             alone = ALONE if is_alone(data, best, len(views)) else ""
             verdict = verdict.doubted(alone if is_known(data, best) else TRIANGLE)
-        followed = self.followed(data, frame, time_s, verdict)
-        estimate = self.estimate(frame, time_s, views, verdict, ranked, followed.delays)
+        followed = self.followed(data, verdict)
+        estimate = self.estimate(data, views, verdict, ranked)
         if data.log.report:
             estimate = replace(estimate, guesses=astuple(data.log.report))
-        return followed, estimate
+        return followed, replace(estimate, delays=followed.delays.seconds())
 
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
@@ -187,52 +185,43 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def refitted(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
-        """The same poses, fitted to other views and judged by them, most evident first."""
-        close = data.start_uncertainty / data.rules.proposals.narrowing**2
-        found: list[Judged] = []
-        for judged in self._again(data, ranked, close):
-            insert(found, judged, self.body, self.free, self.rules.acceptance)
-        return found
-
-    def rejudged(self, data: FrameData, ranked: Sequence[Judged]) -> list[Judged]:
-        """The same poses, judged by other views, most evident first."""
-        return sorted(self._again(data, ranked, None), key=lambda one: -one.log_evidence)
-
-    def _again(
-        self, data: FrameData, ranked: Sequence[Judged], uncertainty: Floats | None
-    ) -> Iterator[Judged]:
-        """The same poses by other views, fitted where they are uncertain."""
+    def again(self, data: FrameData, ranked: Sequence[Judged], *, fitted: bool) -> list[Judged]:
+        """The same poses judged by other views, and fitted to them, most evident first."""
         if not data.views:
-            return
-        likelihood = likelihood_of(data)
+            return []
+        likelihood, close = likelihood_of(data), None
+        if fitted:
+            close = data.start_uncertainty / data.rules.proposals.narrowing**2
+        found: list[Judged] = []
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
-            start = Start(one.T_world_object, uncertainty, left_out=left_out)
+            start = Start(one.T_world_object, close, left_out=left_out)
             judged = likelihood.judge(likelihood.fit(start), start)
-            yield replace(judged, proposer=one.proposer)
+            found.append(replace(judged, proposer=one.proposer))
+        if not fitted:
+            return sorted(found, key=lambda one: -one.log_evidence)
+        distinct: list[Judged] = []
+        for one in found:
+            insert(distinct, one, self.body, self.free, self.rules.acceptance)
+        return distinct
 
     def estimate(
-        self,
-        frame: int,
-        time_s: float | None,
-        views: Sequence[View],
-        verdict: Verdict,
-        ranked: Sequence[Judged],
-        delays: DelayEvidence = DelayEvidence(),
+        self, data: FrameData, views: Sequence[View], verdict: Verdict, ranked: Sequence[Judged]
     ) -> Estimate:
         """The estimate of a frame, with reports of the best pose, believed or not."""
         best = verdict.best
-        told = best or (ranked[0] if ranked else None)
+        told = best or next(iter(ranked), None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
-        offsets = _offsets(told, self.body) if told else {}
-        for name, report in (told.sensors if told else {}).items():
-            residuals = _residuals(offsets[name], self.body) if name in offsets else {}
-            reports[name] = replace(report, residuals=residuals)
+        offsets = {}
+        if told is not None:
+            reports |= told.sensors
+            offsets = _offsets(told, self.body)
+        for name, one in offsets.items():
+            reports[name] = replace(reports[name], residuals=_residuals(one, self.body))
         return Estimate(
-            frame=frame,
-            time_s=time_s,
+            frame=data.frame,
+            time_s=data.time_s,
             object=self.body.name,
             status=verdict.status,
             T_world_object=best.T_world_object if best else None,
@@ -243,49 +232,39 @@ class Tracker:
             proposer=best.proposer if best else "",
             doubt=verdict.doubt,
             offsets=offsets,
-            delays=delays.seconds(),
         )
 
-    def followed(
-        self, data: FrameData, frame: int, time_s: float | None, verdict: Verdict
-    ) -> Track:
+    def followed(self, data: FrameData, verdict: Verdict) -> Track:
         """The track after a frame."""
-        track, best = data.track, verdict.best
+        track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
         if best is None:
             clutter = track.clutter.learnt(data.views, self.rules.static)
             return track.missed(data.log.state, clutter)
-        found = [
-            Found(
-                one.T_world_object,
-                # what may be mere clutter counts as little in the next frame
-                weight * float(expit(one.log_evidence)),
-                one.spread if self.options.fuse else None,
-                np.sqrt(np.diagonal(one.covariance - one.lasting))
-                if is_timed(data.views)
-                else None,
-            )
-            for one, weight in verdict.kept
-        ]
-        residuals = best.residuals if verdict.status == "ok" else track.residuals
-        motion = self.rules.motion
-        followed = follow(
-            track,
-            self.body,
-            found,
-            frame,
-            time_s,
-            residuals,
-            _tallies(best),
-            motion,
-            self.rules.course,
-        )
-        believed = track.believed + (verdict.status == "ok")
-        followed = replace(followed, known=is_known(data, best), believed=believed)
+        found = []
+        for one, weight in verdict.kept:
+            # what may be mere clutter counts as little in the next frame
+            belief = weight * float(expit(one.log_evidence))
+            spread = one.spread if self.options.fuse else None
+            momentary = np.diagonal(one.covariance - one.lasting)
+            deviation = np.sqrt(momentary) if is_timed(data.views) else None
+            found.append(Found(one.T_world_object, belief, spread, deviation))
+        tallies = {
+            one.name: SensorTally(int(np.count_nonzero(one.shares)), len(one.features))
+            for one in best.associations
+            if best.sensors[one.name].used
+        }
+        rules, met = self.rules, [one.met >= _MOST * one.in_view > 0 for one in tallies.values()]
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
-        if verdict.status != "ok" and not late:
-            return followed
-        return replace(followed, delays=_delays(data, best, frame))
+        return replace(
+            follow(track, self.body, found, data.frame, data.time_s, rules.motion, rules.course),
+            residuals=best.residuals if is_ok else track.residuals,
+            tallies=tallies,
+            delays=track.delays.joined(data, best) if is_ok or late else track.delays,
+            agreed=track.agreed or sum(met) > 1,
+            known=is_known(data, best),
+            believed=track.believed + is_ok,
+        )
 
     def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
         """Where the track expects the body; arguments as of `advance`."""
@@ -300,9 +279,7 @@ class Tracker:
         elapsed = None
         if time_s is not None and track.time_s is not None:
             elapsed = time_s - track.time_s
-        views = believed(track.delays.applied(views), elapsed)
-        if time_s is None:
-            views = [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        views = track.delays.applied(views, time_s, elapsed)
         data = FrameData(
             views=views,
             body=self.body,
@@ -314,27 +291,13 @@ class Tracker:
             start_uncertainty=self.start_uncertainty,
             rules=self.rules,
             elapsed=elapsed,
+            frame=frame,
+            time_s=time_s,
         )
         if predictions and is_timed(views):
-            return data.in_motion(data.motion(predictions[0].T_world_object))
+            T = predictions[0].T_world_object
+            return data.in_motion(data.expected(T).at(T))
         return data
-
-
-def _delays(data: FrameData, best: Judged, frame: int) -> DelayEvidence:
-    """What the frames so far say of how late sensors are, with this one."""
-    before, T = data.track.delays, best.T_world_object
-    used = [one for one in best.associations if best.sensors[one.name].used]
-    timed = is_timed(data.views)
-    if len(used) < 2 or not data.elapsed or (frame % SOME_FRAMES and not timed):
-        return before
-    expected = data.expected(T) if timed else data.steady(T)
-    if not expected.gain.any():
-        return before
-    seen = data.offsets(T, found=used)
-    names = [one.name for one in used]
-    views = [view for view in data.views if view.name in names]
-    rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
-    return before.joined(seen, views, expected, max(rest, LEAST_VARIANCE))
 
 
 def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
@@ -354,13 +317,4 @@ def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
     return {
         body.labels[i]: length if met else None
         for i, met, length in zip(offsets.features, offsets.met, lengths, strict=True)
-    }
-
-
-def _tallies(judged: Judged) -> dict[str, SensorTally]:
-    """How each sensor met the body."""
-    return {
-        one.name: SensorTally(int(np.count_nonzero(one.shares)), len(one.features))
-        for one in judged.associations
-        if judged.sensors[one.name].used
     }

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 from mixpose.judgement import Judged
-from mixpose.search import Candidate, search_frame
+from mixpose.search import Candidate, SearchReport, SearchState, search_frame
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
 
@@ -33,17 +33,17 @@ def candidates_of(data: FrameData) -> list[Candidate]:
         seed=data.options.seed,
     )
     found: list[Candidate] = []
+    spent = SearchReport()
     moving = data.track.clutter.without(data.views, data.rules.static)
     if any(one is not other for one, other in zip(moving, data.views, strict=True)):
-        half = None if budget.max_guesses is None else budget.max_guesses // 2
-        budget = replace(budget, max_guesses=half)
+        budget = replace(budget, max_guesses=budget.max_guesses / 2)
         first = search(moving, budget=budget)
-        found, data.log.report = first.candidates, first.report
+        found, spent = first.candidates, first.report
         if found and found[0].evidence > budget.beyond_doubt:
+            data.log.report = spent
             return found
-    result = search(data.views, budget=budget, state=data.track.search if live else None)
-    data.log.state = result.state
-    data.log.report = result.report.joined(data.log.report)
+    result = search(data.views, budget=budget, state=data.track.search if live else SearchState())
+    data.log.state, data.log.report = result.state, spent + result.report
     return found + result.candidates
 
 

@@ -1,0 +1,134 @@
+"""What a search is given, the guesses that it may make, and what it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
+from mixpose.search.budget import THOROUGH, SearchBudget
+from mixpose.search.detections import SensorDetections
+from mixpose.sensors import Rays
+
+
+@dataclass(frozen=True, eq=False)
+class SearchProblem:
+    """What stays the same during a search.
+
+    Attributes
+    ----------
+    detections : sequence of SensorDetections
+    body : Body
+    free : (6,) bool
+        Which directions may differ from the reference, order of `mixpose.rigid`.
+    T_reference : (4, 4) float64
+        Looked at only where a direction is not free.
+    budget : SearchBudget
+    seed : int
+        Of the order in which guesses are tried, where not all can be.
+    """
+
+    detections: Sequence[SensorDetections]
+    body: Body
+    free: NDArray[np.bool_]
+    T_reference: Floats
+    budget: SearchBudget = THOROUGH
+    seed: int = 0
+
+    @cached_property
+    def cameras(self) -> list[tuple[SensorDetections, Rays]]:
+        """Sensors whose detections have lines of sight, with these."""
+        return [
+            (one, one.rays) for one in self.detections if one.rays is not None and len(one.rays)
+        ]
+
+    def rng(self) -> np.random.Generator:
+        """Random numbers, always the same."""
+        return np.random.default_rng(self.seed)
+
+    def reach(self, seen: SensorDetections) -> float:
+        """Largest error of a sensor's detections, in its units."""
+        return self.budget.gate * seen.sigma
+
+    def allowed(self, poses: Floats) -> Floats:
+        """The poses nearest to poses (H, 4, 4) whose held directions are the reference's."""
+        if self.free.all() or not len(poses):
+            return poses
+        shifts, turns = self.free[:3], self.free[3:]
+        R_reference, t_reference = self.T_reference[:3, :3], self.T_reference[:3, 3]
+        R, t = poses[:, :3, :3], np.where(shifts, poses[:, :3, 3], t_reference)
+        if not turns.all():
+            turned = Rotation.from_matrix(R @ R_reference.T)
+            if turns.sum() == 1:  # of swing and twist the twist alone
+                x, y, z, w = turned.as_quat().T
+                vectors = np.where(turns, 2 * np.arctan2(np.array([x, y, z]), w).T, 0.0)
+            else:
+                vectors = np.where(turns, turned.as_rotvec(), 0.0)
+            R = Rotation.from_rotvec(vectors).as_matrix() @ R_reference
+        return from_parts(R, t)
+
+
+class Kind(NamedTuple):
+    """A kind of guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
+
+    name: str
+    batches: Iterable[Any]
+    poses: Callable[[Any], Floats]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A pose that may explain the views.
+
+    Attributes
+    ----------
+    T_world_object : (4, 4) float64
+    evidence : float
+        What candidates are ranked by: logarithm of the odds that this is not chance; with ranges
+        among the sensors, the matched objective at the finest blur, summed over views, every
+        detection counting alike.
+    """
+
+    T_world_object: Floats
+    evidence: float
+
+
+@dataclass(frozen=True)
+class SearchReport:
+    """What a search cost: guesses made, tested on all features and sensors, and refined."""
+
+    made: int = 0
+    tested: int = 0
+    refined: int = 0
+
+    def __add__(self, other: SearchReport) -> SearchReport:
+        made, tested, refined = self.made, self.tested, self.refined
+        return SearchReport(made + other.made, tested + other.tested, refined + other.refined)
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """Where a search with a limited budget goes on in the next frame.
+
+    `kind` of guess, after the first, which is tried in every frame, and batches of it tried.
+    """
+
+    kind: int = 0
+    batch: int = 0
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Candidates, best first, what they cost, and where to go on while none convinces."""
+
+    candidates: list[Candidate]
+    report: SearchReport = SearchReport()
+    state: SearchState = SearchState()
