@@ -33,8 +33,8 @@ MOST_CELLS = 1_500_000
 """Grid points of a dense window; a larger one gets coarser."""
 
 MOST_SIGMAS = 4000.0
-"""Extent of features over the narrowest blur at which they are drawn: pages are 12 σ wide, and a
-plane has 400 000 of them."""
+"""Extent of features over the narrowest blur at which they are drawn: pages are 8.5 σ wide, and a
+plane has 250 000 of them."""
 
 _MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 

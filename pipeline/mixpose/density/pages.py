@@ -15,7 +15,7 @@ Floats: TypeAlias = NDArray[np.float64]
 Singles: TypeAlias = NDArray[np.float32]
 Indices: TypeAlias = NDArray[np.intp]
 
-MAX_PAGES = 100_000
+MAX_PAGES = 250_000
 """Pages of a sensor's plane; detections that are too far from their middle for it are left out,
 and pages of grey values are larger."""
 
