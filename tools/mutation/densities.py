@@ -88,7 +88,7 @@ _ERRORS = (
     Mutant(
         "density-errors-of-all-detections-alike",
         "density/extraction_error.py",
-        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])",
+        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])",
         "weights = shares",
         "a cut spot is noise of all others",
     ),

@@ -143,22 +143,9 @@ def believed(
     prior: NormalPrior,
     rules: MisfitRules = MisfitRules(),
 ) -> tuple[Floats, bool]:
-    """The most probable pose, or the fit to freed features of a body that does not fit.
+    """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
 
-    Parameters
-    ----------
-    objective : MatchedObjective
-        At σ_ε of sensors with noise in their cells.
-    T_world_object : (4, 4) array
-        A maximum of the objective.
-    prior : NormalPrior
-    rules : MisfitRules
-
-    Returns
-    -------
-    (4, 4) array
-    bool
-        Whether features were freed.
+    Or the fit to freed features of a body that does not fit, and whether it is that.
     """
     body = objective.projection.body
     points = body.nodes.points

@@ -232,18 +232,9 @@ def contradict(
 ) -> bool:
     """Whether the two sensors of a frame contradict each other: no pose is right for both.
 
-    Of three sensors the one that disagrees is left out.  Of two, nobody can tell which is wrong.
-
-    Parameters
-    ----------
-    judged : Judged
-        The frame's best pose.
-    before : Noise
-        Residuals of the frames before.
-    agreed : bool
-        Whether two sensors met the body in some frame before: then one may miss it now.
-    rules : AcceptanceRules
-    model : NoiseModel
+    Of three sensors the one that disagrees is left out; of two, nobody can tell which is wrong.
+    `before` are the residuals of the frames before, and where two sensors `agreed` in one of them,
+    one may miss the body now.
     """
     used = [one for one in judged.associations if judged.sensors[one.name].used]
     if len(used) != 2 or any(one.J.shape[1] != 2 for one in used):

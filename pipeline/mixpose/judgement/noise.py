@@ -61,12 +61,7 @@ class NoiseModel:
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
         """Factors that make the Gaussian ellipsoid as large as that of the F distribution.
 
-        Parameters
-        ----------
-        directions : int
-            Of the pose that are free.
-        degrees : (n,) array or float
-            Of freedom, from which the variances were estimated.
+        Of a pose that is free in so many directions; variances have degrees (n,) of freedom.
         """
         if directions == 0 or self.confidence == 0:
             return np.ones(np.shape(degrees))
@@ -113,12 +108,13 @@ def noises_of(
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    pairs = list(zip(each, before, strict=True))
-    levels = [_level(*one, int(free.sum()), model) for one in pairs]
+    offsets = [joined_offsets(one, found, k) for k, one in enumerate(each)]
+    parts = zip(each, before, offsets, strict=True)
+    levels = [_level(*one, int(free.sum()), model) for one in parts]
     scales = np.array([one.scale for one in levels])
     frames = frames_of(each, found, scales, free, model.errors.outlying)
-    parts = zip(pairs, levels, frames, strict=True)
-    return [_frame_noise(*pair, level, frame, free, model) for pair, level, frame in parts]
+    pairs = zip(each, before, levels, frames, strict=True)
+    return [_frame_noise(*one, free, model) for one in pairs]
 
 
 class _Level(NamedTuple):
@@ -132,9 +128,13 @@ class _Level(NamedTuple):
 
 
 def _level(
-    associations: Sequence[Association], before: Residuals, count: int, model: NoiseModel
+    associations: Sequence[Association],
+    before: Residuals,
+    offsets: Offsets,
+    count: int,
+    model: NoiseModel,
 ) -> _Level:
-    offsets, rules = joined_offsets(associations), model.errors
+    rules = model.errors
     past = sums_of([before.noise.get(one.name, Noise()) for one in associations])
     sums = model.memory * past
     seen = errors_seen(offsets, count, sums, rules)
@@ -177,15 +177,10 @@ def _frame_noise(
     return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
 
 
-def joined_offsets(associations: Sequence[Association]) -> Offsets:
-    """Offsets of the features of all sensors."""
-    return Offsets(
-        np.concatenate([one.squared for one in associations]),
-        np.concatenate([one.shares for one in associations]),
-        np.repeat(np.arange(len(associations)), [len(one.shares) for one in associations]),
-        np.array([one.J.shape[1] for one in associations]),
-        np.array([one.finest for one in associations]),
-    )
+def joined_offsets(associations: Sequence[Association], found: Matches, k: int = 0) -> Offsets:
+    """Offsets of the features of all sensors at pose k."""
+    squared, finest = (found.offsets[k] ** 2).sum(axis=2), [one.finest for one in associations]
+    return Offsets(squared, found.shares[k], found.dimensions, np.array(finest))
 
 
 def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:
