@@ -15,6 +15,7 @@ from mixpose.density import (
     ErrorRules,
     FeaturesMet,
     Observation,
+    Offsets,
     crowding,
     features_met,
     surplus,
@@ -149,6 +150,12 @@ class Matches:
     crowd: Floats  # (K, L) observed features per m-th power of σ_ε
     count: Floats  # (K, L) number of observed features
     unseen: Floats  # (K, L) weight of the features that face a sensor outside its view
+    each: Sequence[Sequence[Association]] = ()  # what they were put together of, if of these
+
+    def residuals(self, k: int = 0) -> Offsets:
+        """Offsets of the features of all sensors at one of the poses."""
+        squared, finest = (self.offsets[k] ** 2).sum(axis=2), [one.finest for one in self.each[k]]
+        return Offsets(squared, self.shares[k], self.dimensions, np.array(finest))
 
     @classmethod
     def of(cls, each: Sequence[Sequence[Association]]) -> Matches:
@@ -173,7 +180,7 @@ class Matches:
             (one.crowd * one.sigma ** one.J.shape[1], one.count, one.unseen) for one in all_of_them
         ]
         crowd, count, unseen = np.array(whole).reshape(*shape[:2], 3).transpose(2, 0, 1)
-        return cls(dimensions, weights, shares, places, offsets, J, crowd, count, unseen)
+        return cls(dimensions, weights, shares, places, offsets, J, crowd, count, unseen, each)
 
 
 def associate(

@@ -111,11 +111,10 @@ def judge_together(
     pairs = [
         associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
     ]
-    each = [associations for associations, _ in pairs]
-    found = Matches.of(each)
-    noises = noises_of(each, found, free, [one.before for one in cases], rules.noise)
+    found = Matches.of([associations for associations, _ in pairs])
+    noises = noises_of(found, free, [one.before for one in cases], rules.noise)
     variances = np.array([noise.variances for noise in noises])
-    evidence, bent = _evidence(cases, each, found, variances, free, rules.detection)
+    evidence, bent = _evidence(cases, found, variances, free, rules.detection)
     parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
     return [
         Judged(
@@ -139,7 +138,6 @@ def judge_together(
 
 def _evidence(
     cases: Sequence[Case],
-    each: Sequence[Sequence[Association]],
     found: Matches,
     variances: Floats,
     free: NDArray[np.bool_],
@@ -150,7 +148,7 @@ def _evidence(
     whole, widened = found, variances
     blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
     if any(blind):
-        whole = Matches.of([[*own, *others] for own, others in zip(each, blind, strict=True)])
+        whole = Matches.of([[*own, *others] for own, others in zip(found.each, blind, strict=True)])
         widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
     priors = [
         one.prior or flat_prior(body, free, detection)

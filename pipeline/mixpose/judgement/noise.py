@@ -97,7 +97,6 @@ class FrameNoise(NamedTuple):
 
 
 def noises_of(
-    each: Sequence[Sequence[Association]],
     found: Matches,
     free: NDArray[np.bool_],
     before: Sequence[Residuals],
@@ -108,13 +107,13 @@ def noises_of(
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    offsets = [joined_offsets(one, found, k) for k, one in enumerate(each)]
-    parts = zip(each, before, offsets, strict=True)
-    levels = [_level(*one, int(free.sum()), model) for one in parts]
-    scales = np.array([one.scale for one in levels])
-    frames = frames_of(each, found, scales, free, model.errors.outlying)
-    pairs = zip(each, before, levels, frames, strict=True)
-    return [_frame_noise(*one, free, model) for one in pairs]
+    pairs = list(zip(found.each, before, strict=True))
+    levels = [
+        _level(*one, found.residuals(k), int(free.sum()), model) for k, one in enumerate(pairs)
+    ]
+    frames = frames_of(found, np.array([one.scale for one in levels]), free, model.errors.outlying)
+    parts = zip(pairs, levels, frames, strict=True)
+    return [_frame_noise(*pair, level, frame, free, model) for pair, level, frame in parts]
 
 
 class _Level(NamedTuple):
@@ -175,12 +174,6 @@ def _frame_noise(
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
     remembered = Residuals({**before.noise, **noise}, moments, lasting)
     return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
-
-
-def joined_offsets(associations: Sequence[Association], found: Matches, k: int = 0) -> Offsets:
-    """Offsets of the features of all sensors at pose k."""
-    squared, finest = (found.offsets[k] ** 2).sum(axis=2), [one.finest for one in associations]
-    return Offsets(squared, found.shares[k], found.dimensions, np.array(finest))
 
 
 def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:

@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 
 from mixpose.density import errors_seen, sums_of
 from mixpose.fit import Fit
-from mixpose.judgement import (
-    Association,
-    Judged,
-    Matches,
-    associate,
-    joined_offsets,
-    nearest_alike,
-)
+from mixpose.judgement import Association, Judged, Matches, associate, nearest_alike
 from mixpose.judgement.moments import inverses
 from mixpose.objective import View
 from mixpose.rigid import Floats, perturb
@@ -174,7 +167,7 @@ def offsets_of(
     views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(found))
     if expected is not None:
         errors, known = data.rules.judgement.noise.errors, sums_of([data.noise[k] for k in chosen])
-        met = joined_offsets(found, Matches.of([found]))
+        met = Matches.of([found]).residuals()
         noise = errors_seen(met, int(data.free.sum()), known, errors).blurs
         pairs = zip(found, views, strict=True)
         unsure = [_unsure_by(one.J, one.places, view, expected) for one, view in pairs]
