@@ -185,8 +185,8 @@ _MET = (
     Mutant(
         "density-detection-met-twice",
         "density/features_met.py",
-        "if i not in met and j not in taken:",
-        "if i not in met:",
+        "if found.detections[i] < 0 and j not in taken:",
+        "if found.detections[i] < 0:",
         "one detection is taken for several features, hidden ones count as seen",
     ),
     Mutant(

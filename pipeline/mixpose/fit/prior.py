@@ -39,21 +39,11 @@ _VALUE_ERROR = value_error(FINE_STEPS)
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """A normal distribution of the pose.
+    """A normal distribution of the pose."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        Its mean.
-    uncertainty : (6,) float64
-        Standard deviations, lengths and radians; positive where free.
-    free : (6,) bool
-        Directions in which the pose may change.
-    """
-
-    T_world_object: Floats
-    uncertainty: Floats
-    free: NDArray[np.bool_]
+    T_world_object: Floats  # (4, 4) its mean
+    uncertainty: Floats  # (6,) standard deviations, lengths and radians; positive where free
+    free: NDArray[np.bool_]  # (6,) directions in which the pose may change
 
     def joined(self, likelihood: Quadratic, T_world_object: Floats) -> Quadratic:
         """A log-likelihood at a pose (4, 4), with the logarithm of the prior."""

@@ -82,22 +82,21 @@ def frames_of(
     of_fields = (drawn[:, None] * kinds.T[:, None]) @ drawn.swapaxes(1, 2)[:, None]
     parts = np.concatenate([inverse[:, None], of_fields, part[:, None]], axis=1)
     # the noise of the sensor that each field is of
-    sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)
-    information /= sizes[:, :, None] * sizes[:, None]
+    sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)[:, None]
+    information /= sizes.swapaxes(1, 2) * sizes
     names = tuple(one.name for one in found.each[0])
-    return [
-        Frame(
-            Moments(seen[k], expected[k]) if expected[k, 0, 0] > 0 else Moments(),
-            parts[k],
-            Lasting(names, information[k], vector[k] / sizes[k]),
-            drawn[k] / sizes[k],
-            inverse[k] @ doubts[k],
-            np.hstack([r[k], left[k] / sizes[k]]),
-            fields[k],
-            kinds,
-        )
-        for k in range(frames)
-    ]
+    each = zip(
+        [Moments(*one) if one[1][0, 0] > 0 else Moments() for one in zip(seen, expected)],
+        parts,
+        [Lasting(names, *one) for one in zip(information, vector / sizes[:, 0])],
+        drawn / sizes,
+        [moves @ doubt for moves, doubt in zip(inverse, doubts)],
+        np.concatenate([r, left / sizes], axis=2),
+        fields,
+        [kinds] * frames,
+        strict=True,
+    )
+    return [Frame(*one) for one in each]
 
 
 def _fields(places: Floats, shares: Floats, dimensions: NDArray[np.intp]) -> tuple[Floats, Floats]:
