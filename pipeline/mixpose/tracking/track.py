@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.judgement import Prior, Residuals, nearest_alike
+from mixpose.judgement import Residuals
 from mixpose.rigid import Floats, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.companion import Companion
-from mixpose.tracking.delays import DelayEvidence
-from mixpose.tracking.motion import Course, CourseRules, MotionRules, RandomWalk
+from mixpose.tracking.in_motion import DelayEvidence
+from mixpose.tracking.motion import Course, MotionRules, RandomWalk
 from mixpose.tracking.static_clutter import StaticClutter
+
+if TYPE_CHECKING:
+    from mixpose.tracking.likelihood import FrameData
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,11 @@ class Track:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s
 
+    def elapsed(self, frame: int, time_s: float | None) -> float:
+        """Time since the last pose: seconds where both frames have times, else frames."""
+        seconds = self.seconds_until(time_s)
+        return float(frame - (self.frame or 0)) if seconds is None else seconds
+
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
         return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
@@ -127,6 +135,24 @@ class Prediction:
     weight: float
     is_prior: bool = False
 
+    def log_density(
+        self, T_world_object: Floats, free: NDArray[np.bool_], rules: MotionRules
+    ) -> float:
+        """Of a pose before its frame, in the directions that are free.
+
+        How far a prediction errs is known from a step or two: errors have the distribution of
+        Student.
+        """
+        u = self.uncertainty[free]
+        scaled = twist_between(self.T_world_object, T_world_object)[free] / u
+        count, volume = len(u), float(np.log(u).sum())
+        if self.is_prior:
+            return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
+        n = rules.known_from
+        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+        tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
+        return count * peak - tails - volume
+
 
 def predict(
     track: Track,
@@ -139,7 +165,7 @@ def predict(
 
     The longer nothing was seen, the wider; velocities are believed for a few frames only.
     """
-    elapsed = elapsed_since(track, frame, time_s)
+    elapsed = track.elapsed(frame, time_s)
     widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
     for branch in track.branches:
@@ -155,46 +181,6 @@ def predict(
     return predictions
 
 
-def prior_of(
-    T_world_object: Floats,
-    predictions: Sequence[Prediction],
-    body: Body,
-    free: NDArray[np.bool_],
-    misses: int,
-    rules: MotionRules,
-    anywhere: Prior,
-) -> Prior:
-    """Density of a pose before its frame: the predictions, or now and then anywhere."""
-    if not predictions:
-        return anywhere
-    surprise = min(rules.surprise * (1 + misses), 1.0)
-    terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
-    for prediction in predictions:
-        u = prediction.uncertainty[free]
-        twist = twist_between(
-            prediction.T_world_object,
-            nearest_alike(T_world_object, body, prediction.T_world_object),
-        )
-        log_density = _log_density(twist[free] / u, rules, prediction) - np.log(u).sum()
-        weight = max((1 - surprise) * prediction.weight, 1e-12)
-        terms.append(np.log(weight) + log_density)
-        spreads.append(prediction.uncertainty)
-    # directions that the data leave open are as uncertain as where the pose most likely comes from
-    return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
-
-
-def _log_density(scaled: Floats, rules: MotionRules, prediction: Prediction) -> float:
-    """Of a pose so many standard deviations (k,) from a prediction, but for their product.
-
-    How far a prediction errs is known from a step or two: errors have the distribution of Student.
-    """
-    if prediction.is_prior:
-        return float(-0.5 * scaled @ scaled) - 0.5 * len(scaled) * math.log(2 * math.pi)
-    n = rules.known_from
-    peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-    return len(scaled) * peak - 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
-
-
 class Found(NamedTuple):
     """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior.
 
@@ -207,32 +193,11 @@ class Found(NamedTuple):
     deviation: Floats | None = None
 
 
-def follow(
-    track: Track,
-    body: Body,
-    found: Sequence[Found],
-    frame: int,
-    time_s: float | None,
-    rules: MotionRules,
-    course_rules: CourseRules = CourseRules(),
-) -> Track:
-    """The track after a frame with poses, as far as these tell.
-
-    Parameters
-    ----------
-    track : Track
-        Before the frame.
-    body : Body
-    found : sequence of Found
-        Best first.
-    frame, time_s
-        Of the frame.
-    rules : MotionRules
-    course_rules : CourseRules
-    """
-    elapsed = elapsed_since(track, frame, time_s)
+def follow(data: FrameData, found: Sequence[Found]) -> Track:
+    """The track after a frame with poses, the best first, as far as these tell."""
+    track, body, rules, course_rules = data.track, data.body, data.rules.motion, data.rules.course
+    elapsed, walk = track.elapsed(data.frame, data.time_s), track.walk
     branches: list[Branch] = []
-    walk = track.walk
     for T, weight, spread, deviation in found:
         velocity, course, uncertainty = None, None, rules.unsteady * rules.steady(body)
         parent = nearest_branch(track, T, body)
@@ -257,18 +222,12 @@ def follow(
     return replace(
         track,
         branches=tuple(branches),
-        frame=frame,
-        time_s=time_s,
+        frame=data.frame,
+        time_s=data.time_s,
         misses=0,
         walk=walk,
         search=SearchState(),
     )
-
-
-def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
-    """Time since the last pose: seconds where both frames have times, else frames."""
-    seconds = track.seconds_until(time_s)
-    return float(frame - (track.frame or 0)) if seconds is None else seconds
 
 
 def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:
