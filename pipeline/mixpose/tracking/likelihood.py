@@ -34,11 +34,10 @@ from mixpose.rigid import Floats, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.association_likelihood import AssociationLikelihood, are_associated
-from mixpose.tracking.companion import either
 from mixpose.tracking.in_motion import fit_in_motion, is_timed, with_motion_unknown
 from mixpose.tracking.motion import Expected, unknown
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Prediction, Track, nearest_branch
+from mixpose.tracking.track import Prediction, Track, either, nearest_branch
 
 
 @dataclass(frozen=True)
