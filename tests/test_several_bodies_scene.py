@@ -32,7 +32,7 @@ from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, ove
 from mixpose.search import SearchResult, search_frame
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Companion, Rules, Track, Tracker
-from mixpose.tracking.companion import either
+from mixpose.tracking.track import either
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 TOOL = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [10, -30, 45], [35, 30, -40.0]])
@@ -250,7 +250,7 @@ def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
         outcomes = scene.advance(tracks, frame, None, views)
         tracks = tuple(one.track for one in outcomes)
         assert outcomes[1].estimate.status == "lost"
-    thorough = [frame for frame, most in zip(frames, asked, strict=True) if most is None]
+    thorough = [frame for frame, most in zip(frames, asked, strict=True) if most == np.inf]
     # as long as it may be near, and again after ten frames without it
     assert sorted(set(thorough)) == [0, 1, 2, 3, 4, 5, 10]
     assert sorted(set(frames)) == list(range(12))
