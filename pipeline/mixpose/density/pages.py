@@ -81,7 +81,7 @@ class Pages:
         self.table = np.full(sensors * plane.squares, _PENDING, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
         side = plane.page + 3
-        columns = len(self.table) * side // _LARGEST + 1
+        columns = min(len(self.table) * side // _LARGEST + 1, _LARGEST // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1
         # from a place in the plane to one in the array, by page; from nothing out of the array
