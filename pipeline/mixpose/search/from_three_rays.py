@@ -87,8 +87,8 @@ def _perspective(
     largest = np.sqrt(squared.max(axis=0))[which]
     near = largest > min_pixels * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
-    body = features.T[:, corners[:, which]].swapaxes(0, 1)
-    directions = rays.directions.T[:, detections[:, which]].swapaxes(0, 1)
+    body = np.take(features.T, corners[:, which], axis=1).swapaxes(0, 1)
+    directions = np.take(rays.directions.T, detections[:, which], axis=1).swapaxes(0, 1)
     return align_triples(body, rays.origins[0][:, None] + directions * distances[:, None])
 
 
@@ -99,8 +99,8 @@ def _orthographic(
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    body = features.T[:, corners].swapaxes(0, 1)
-    seen = rays.origins.T[:, detections].swapaxes(0, 1)
+    body = np.take(features.T, corners, axis=1).swapaxes(0, 1)
+    seen = np.take(rays.origins.T, detections, axis=1).swapaxes(0, 1)
     tolerance = 3 * min_pixels * rays.offset
     rise = []
     for i, j in SIDES:

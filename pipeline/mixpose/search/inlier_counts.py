@@ -66,7 +66,7 @@ class LabelImage:
         rows, columns = self.cells.shape
         column = np.clip(u + self.origin[0], 0.0, columns - 1.0).astype(np.int32)
         row = np.clip(v + self.origin[1], 0.0, rows - 1.0).astype(np.int32)
-        return np.asarray(self.cells[row, column])
+        return np.asarray(np.take(self.cells, row * columns + column))
 
     def faced(self, world: Floats, outward: Floats) -> NDArray[np.bool_]:
         """Which points (3, K) with normals (3, K) turn their face to the camera."""

@@ -12,21 +12,16 @@ runs over long rows.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.records import Floats
-
-Mask: TypeAlias = NDArray[np.bool_]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.search.alignment import cross
+from mixpose.search.triangulation import Indices
 
 _POLISHING = 2  # Newton steps on the distances
 _ROUNDING = 1e-9  # a discriminant this little below zero is a double root
 _INEXACT = 1e-3  # share of the squared distances that a solution may miss them by
 
-# A symmetric 3x3 matrix is its entries (00, 01, 02, 11, 12, 22); sides are (01, 02, 12).
 SIDES = ((0, 1), (0, 2), (1, 2))
 
 
@@ -49,155 +44,101 @@ def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
     """
     with np.errstate(all="ignore"):
         D1, D2 = _conics(cosines, squared)
-        gamma = _pencil_root(D1, D2)
-        found = [
-            ratios
-            for line in _two_lines(D1 + gamma * D2)
-            for ratios in _cut(line, np.where(_larger(D1, D2), D1, D2))
-        ]
-        scaled = [_scaled(ratios, cosines, squared) for ratios in found]
-        good = [(solution > 0).all(axis=0) for solution in scaled]
-        which = np.concatenate([np.flatnonzero(each) for each in good])
-        solved = np.concatenate([s[:, g] for s, g in zip(scaled, good)], axis=1)
-        polished, exact = _polish(solved, cosines[:, which], squared[:, which])
-    return polished[:, exact], which[exact]
+        larger = np.where(np.abs(D1).sum(axis=(0, 1)) >= np.abs(D2).sum(axis=(0, 1)), D1, D2)
+        found = []
+        for line in _two_lines(D1 + _pencil_root(D1, D2) * D2):
+            for ratios in _cut(line, larger):
+                # made distances by the sum of the three cosine laws
+                sides, _ = _sides_squared(ratios, cosines)
+                scale = np.sqrt(squared.sum(axis=0) / sides.sum(axis=0))
+                found.append(ratios * (np.sign(ratios[0]) * scale))
+        x = np.concatenate(found, axis=1)
+        which = np.flatnonzero((x > 0).all(axis=0))
+        x, which = x[:, which], which % cosines.shape[1]
+        return _polished(x, which, cosines[:, which], squared[:, which])
 
 
 def _conics(cosines: Floats, squared: Floats) -> tuple[Floats, Floats]:
-    """M01 d12² − M12 d01² and M02 d12² − M12 d02² (6, K each), where λᵀ M_ij λ = d_ij²."""
-    c01, c02, c12 = cosines
-    a01, a02, a12 = squared
-    zero = np.zeros_like(c01)
-    D1 = np.array([a12, -c01 * a12, zero, a12 - a01, c12 * a01, -a01])
-    D2 = np.array([a12, zero, -c02 * a12, -a02, c12 * a02, a12 - a02])
-    return D1, D2
+    """M01 d12² − M12 d01² and M02 d12² − M12 d02² (3, 3, K), where λᵀ M_ij λ = d_ij²."""
+    (c01, c02, c12), (a01, a02, a12) = -cosines, squared
+    o = np.zeros_like(a01)
+    D1 = [[a12, c01 * a12, o], [c01 * a12, a12 - a01, -c12 * a01], [o, -c12 * a01, -a01]]
+    D2 = [[a12, o, c02 * a12], [o, -a02, -c12 * a02], [c02 * a12, -c12 * a02, a12 - a02]]
+    return np.array(D1), np.array(D2)
 
 
-def _larger(D1: Floats, D2: Floats) -> Mask:
-    return np.asarray(np.abs(D1).sum(axis=0) >= np.abs(D2).sum(axis=0))
+def _cofactors(A: Floats) -> Floats:
+    return np.array([cross(A[1], A[2]), cross(A[2], A[0]), cross(A[0], A[1])])
 
 
 def _pencil_root(D1: Floats, D2: Floats) -> Floats:
-    """A real γ with det(D1 + γ D2) = 0 (K,)."""
-    A1, A2 = _adjugate(D1), _adjugate(D2)
-    c3, c0 = _product(A2, D2) / 3, _product(A1, D1) / 3
-    c2, c1 = _product(A2, D1), _product(A1, D2)
-    c3 = np.where(c3 == 0, np.finfo(np.float64).tiny, c3)
-    return _cubic_root(c2 / c3, c1 / c3, c0 / c3)
+    """A real γ with det(D1 + γ D2) = 0 (K,), of three the one farthest from the others."""
+    A1, A2 = _cofactors(D1), _cofactors(D2)
+    d, c, b, a = ((A * D).sum(axis=(0, 1)) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2)))
+    a = np.where(a == 0, np.finfo(np.float64).tiny, a / 3)
+    b, c, d = b / a, c / a, d / (3 * a)
+    p, q = c - b * b / 3, (2 * b * b / 27 - c / 3) * b + d
+    # from beyond the root on the side of −q, which stands alone, Newton steps fall short of it
+    x = np.where(q <= 0, 1.0, -1.0) * (np.sqrt(np.maximum(-p, 0.0) * 4 / 3) + np.cbrt(np.abs(q)))
+    x -= b / 3
+    for _ in range(10):
+        step = (((x + b) * x + c) * x + d) / ((3 * x + 2 * b) * x + c)
+        x -= np.where(np.isfinite(step), step, 0.0)
+    return np.where(np.isfinite(x), x, 0.0)
 
 
-def _adjugate(A: Floats) -> Floats:
-    a, b, c, d, e, f = A
-    return np.array(
-        [d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b]
-    )
+def _two_lines(C: Floats) -> tuple[Floats, Floats]:
+    """The lines (3, K) that degenerate conics (3, 3, K) consist of; NaN where they are not real."""
+    B, every = -_cofactors(C), np.arange(C.shape[2])
+    diagonal = np.einsum("iik->ik", B)
+    k = diagonal.argmax(axis=0)
+    N = C + _crossed(B[:, k, every] / np.sqrt(diagonal[k, every]))
+    row, column = np.divmod(np.abs(N).reshape(9, -1).argmax(axis=0), 3)
+    return N[row, [[0], [1], [2]], every], N[:, column, every]
 
 
-def _product(A: Floats, B: Floats) -> Floats:
-    """Trace of the product of symmetric matrices."""
-    off = A[1] * B[1] + A[2] * B[2] + A[4] * B[4]
-    return np.asarray(A[0] * B[0] + A[3] * B[3] + A[5] * B[5] + 2 * off)
+def _crossed(v: Floats) -> Floats:
+    """Matrices (3, 3, K) by which cross products with vectors (3, K) are taken."""
+    (x, y, z), o = v, np.zeros_like(v[0])
+    return np.array([[o, -z, y], [z, o, -x], [-y, x, o]])
 
 
-def _cubic_root(b: Floats, c: Floats, d: Floats) -> Floats:
-    """A real root of x³ + b x² + c x + d, of three the one farthest from the others."""
-    p = c - b * b / 3
-    q = (2 * b * b / 27 - c / 3) * b + d
-    discriminant = q * q / 4 + p * p * p / 27
-    # the larger of Cardano's two cube roots, without cancellation; the other follows from p
-    u = -np.cbrt(np.abs(q) / 2 + np.sqrt(np.maximum(discriminant, 0.0)))
-    u = np.where(q < 0, -u, u)
-    single = u - p / np.where(u == 0, 1.0, 3 * u)
-    amplitude = 2 * np.sqrt(np.maximum(-p, 0.0) / 3)
-    angle = np.arccos(np.clip(np.abs(4 * q) / amplitude**3, -1.0, 1.0)) / 3
-    # of three roots the one on the side of −q stands alone
-    triple = np.where(q <= 0, 1.0, -1.0) * amplitude * np.cos(angle)
-    x = np.where(discriminant >= 0, single, triple) - b / 3
-    for _ in range(2):
-        slope = (3 * x + 2 * b) * x + c
-        step = (((x + b) * x + c) * x + d) / slope
-        x = x - np.where(np.isfinite(step), step, 0.0)
-    return np.asarray(np.where(np.isfinite(x), x, 0.0))
-
-
-def _two_lines(conic: Floats) -> tuple[Floats, Floats]:
-    """The lines (3, K) that degenerate conics (6, K) consist of; NaN where they are not real."""
-    B = -_adjugate(conic)
-    diagonal = B[[0, 3, 5]]
-    column = diagonal.argmax(axis=0)
-    full = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-    which = np.arange(B.shape[1])
-    p = B[full[column].T, which] / np.sqrt(diagonal[column, which])
-    N = conic[[0, 1, 2, 1, 3, 4, 2, 4, 5]]
-    for entry, k, sign in ((1, 2, -1), (2, 1, 1), (3, 2, 1), (5, 0, -1), (6, 1, -1), (7, 0, 1)):
-        N[entry] += sign * p[k]
-    largest = np.abs(N).argmax(axis=0)
-    row, column = largest // 3, largest % 3
-    first = N[3 * row + np.arange(3)[:, None], which]
-    second = N[3 * np.arange(3)[:, None] + column, which]
-    return first, second
-
-
-def _cut(line: Floats, conic: Floats) -> tuple[Floats, Floats]:
-    """Where lines (3, K) meet conics (6, K): two times ratios (3, K), NaN where not real."""
+def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
+    """Where lines (3, K) meet conics (3, 3, K): two times ratios (3, K), NaN where not real."""
     # two points that span the line: its cross products with the axes that it is least along
-    x, y, z = line
-    zero = np.zeros_like(x)
-    by_x, by_y, by_z = (np.array(p) for p in ([zero, z, -y], [-z, zero, x], [y, -x, zero]))
-    most = np.abs(line).argmax(axis=0)
-    P = np.where(most == 0, by_y, by_x)
-    Q = np.where(most == 2, by_y, by_z)
-    a, b, c = _form(Q, conic, Q), _form(P, conic, Q), _form(P, conic, P)
-    squared = b * b - a * c
-    squared = np.where(squared < -_ROUNDING * b * b, np.nan, np.maximum(squared, 0.0))
-    root = np.sqrt(squared)
-    w = -(b + np.where(b < 0, -root, root))
+    by, most = _crossed(line), np.abs(line).argmax(axis=0)
+    P = np.where(most == 0, by[:, 1], by[:, 0])
+    Q = np.where(most == 2, by[:, 1], by[:, 2])
+    CP, CQ = ((C * each).sum(axis=1) for each in (P, Q))
+    a, b, c = (Q * CQ).sum(axis=0), (P * CQ).sum(axis=0), (P * CP).sum(axis=0)
+    square = b * b - a * c
+    square = np.where(square < -_ROUNDING * b * b, np.nan, np.maximum(square, 0.0))
+    w = -(b + np.copysign(np.sqrt(square), b))
     # w/a and c/w, as homogeneous pairs so that neither division can fail
     return a * P + w * Q, w * P + c * Q
 
 
-def _form(P: Floats, conic: Floats, Q: Floats) -> Floats:
-    a, b, c, d, e, f = conic
-    x = a * Q[0] + b * Q[1] + c * Q[2]
-    y = b * Q[0] + d * Q[1] + e * Q[2]
-    z = c * Q[0] + e * Q[1] + f * Q[2]
-    return np.asarray(P[0] * x + P[1] * y + P[2] * z)
-
-
-def _scaled(ratios: Floats, cosines: Floats, squared: Floats) -> Floats:
-    """Ratios made distances by the sum of the three cosine laws."""
-    x, y, z = ratios
-    total = 2 * (x * x + y * y + z * z)
-    total -= 2 * (x * y * cosines[0] + x * z * cosines[1] + y * z * cosines[2])
-    return np.asarray(ratios * (np.sign(x) * np.sqrt(squared.sum(axis=0) / total)))
-
-
-def _polish(found: Floats, cosines: Floats, squared: Floats) -> tuple[Floats, Mask]:
-    """Newton steps on the three cosine laws, and which solutions satisfy them in the end."""
-    x = found
+def _polished(
+    x: Floats, which: Indices, cosines: Floats, squared: Floats
+) -> tuple[Floats, Indices]:
+    """Newton steps on the three cosine laws, and the solutions that satisfy them in the end."""
+    o = np.zeros_like(x[0])
     for _ in range(_POLISHING):
-        (a, b, d), J = _law_residuals(x, cosines, squared)
-        # rows (J0 J1 0), (J2 0 J3), (0 J4 J5) by Cramer's rule
-        determinant = -J[0] * J[3] * J[4] - J[1] * J[2] * J[5]
-        step = np.array(
-            [
-                -J[3] * J[4] * a - J[1] * J[5] * b + J[1] * J[3] * d,
-                -J[2] * J[5] * a + J[0] * J[5] * b - J[0] * J[3] * d,
-                J[2] * J[4] * a - J[0] * J[4] * b - J[1] * J[2] * d,
-            ]
-        )
-        step = np.clip(step / determinant, -0.1 * x, 0.1 * x)
-        x = x - np.where(np.isfinite(step), step, 0.0)
-    residual, _ = _law_residuals(x, cosines, squared)
-    exact = (np.abs(residual) <= _INEXACT * squared.max(axis=0)).all(axis=0)
-    return x, exact & (x > 0).all(axis=0)
+        sides, (a, b, c, d, e, f) = _sides_squared(x, cosines)
+        J = np.array([[a, b, o], [c, o, d], [o, e, f]])
+        cofactors = _cofactors(J)
+        step = (cofactors * (sides - squared)[:, None]).sum(axis=0)
+        step /= 2 * (J[0] * cofactors[0]).sum(axis=0)
+        x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
+    off = np.abs(_sides_squared(x, cosines)[0] - squared)
+    exact = ((off <= _INEXACT * squared.max(axis=0)) & (x > 0)).all(axis=0)
+    return x[:, exact], which[exact]
 
 
-def _law_residuals(x: Floats, cosines: Floats, squared: Floats) -> tuple[Floats, list[Floats]]:
-    """Residuals (3, K) of the laws of sides 01, 02, 12, and their slopes by either distance."""
-    residuals, slopes = [], []
+def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, list[Floats]]:
+    """Sides squared (3, K) by the cosine laws, and half their slopes by either distance."""
+    sides, slopes = np.empty_like(x), []
     for k, (i, j) in enumerate(SIDES):
-        along_i, along_j = x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]
-        residuals.append(x[i] * along_i + x[j] * along_j - squared[k])
-        slopes += [2 * along_i, 2 * along_j]
-    return np.array(residuals), slopes
+        slopes += [x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]]
+        sides[k] = x[i] * slopes[-2] + x[j] * slopes[-1]
+    return sides, slopes
