@@ -358,8 +358,8 @@ _SEARCH = (
     Mutant(
         "search-triangles-turned-back",
         "search/alignment.py",
-        "(flat_body.conj() * flat_world)",
-        "(flat_body * flat_world.conj())",
+        "c, s = turn.real, turn.imag",
+        "c, s = turn.real, -turn.imag",
         "guesses from three points are turned the wrong way",
     ),
     Mutant(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
+
+Complex: TypeAlias = NDArray[np.complex128]
 
 _TINY = np.finfo(np.float64).tiny
 _FLAT = 1e-9  # sine of the angle at a corner, below which a triangle has no plane
@@ -26,31 +30,39 @@ def align_triples(body: Floats, world: Floats) -> Floats:
         T_world_object: centres coincide, planes coincide, and within the plane the turn is the
         least-squares one.
     """
-    centre_body, centre_world = body.mean(axis=0), world.mean(axis=0)
-    plane_body, normal_body = _axes(body)
-    plane_world, normal_world = _axes(world)
-    flat_body = (plane_body * (body - centre_body)).sum(axis=1)
-    flat_world = (plane_world * (world - centre_world)).sum(axis=1)
-    turn = (flat_body.conj() * flat_world).sum(axis=0)
+    (x, y, z), side, third = _shape(body)
+    axes, side_world, third_world = _shape(world)
+    # between the corners as seen from their centres, in the planes
+    turn = side * side_world + third.conj() * third_world
+    turn -= (side + third).conj() * (side_world + third_world) / 3
     length = np.abs(turn)
     turn = np.where(length < _TINY, 1.0, turn / np.maximum(length, _TINY))
-    R = (plane_world.conj()[:, None] * (turn * plane_body)).real
-    R += normal_world[:, None] * normal_body
-    t = centre_world - (R * centre_body).sum(axis=1)
+    c, s = turn.real, turn.imag
+    R = axes[0][:, None] * (c * x - s * y)
+    R += axes[1][:, None] * (s * x + c * y)
+    R += axes[2][:, None] * z
+    t = world.mean(axis=0) - np.einsum("ijk,jk->ik", R, body.mean(axis=0))
     return from_parts(R.transpose(2, 0, 1), t.T)
 
 
-def _axes(triangles: Floats) -> tuple[NDArray[np.complex128], Floats]:
-    """Axes x + iy of the planes (3, K), x along the first side, and their normals (3, K)."""
-    x = _unit(triangles[1] - triangles[0])
-    x = np.where(x.any(axis=0), x, np.eye(3)[:, :1])  # two at one place: any direction
-    second = triangles[2] - triangles[0]
+def _shape(triangles: Floats) -> tuple[tuple[Floats, Floats, Floats], Floats, Complex]:
+    """Axes (3, K each), the first along the first side, the second in the plane.
+
+    With them, the first side's length (K,) and the third corner in the plane, as x + iy.
+    """
+    side, second = triangles[1] - triangles[0], triangles[2] - triangles[0]
+    length = np.sqrt(_dot(side, side))
+    x = side / np.maximum(length, _TINY)
+    x[0, length == 0] = 1.0  # two at one place: any direction
     across = cross(x, second)
-    flat = (across**2).sum(axis=0) <= _FLAT**2 * (second**2).sum(axis=0)
+    height = np.sqrt(_dot(across, across))
+    third = _dot(x, second) + 1j * height
+    flat = height <= _FLAT * np.abs(third)
     if flat.any():  # three in a row: any plane through them
         across = np.where(flat, cross(x, np.eye(3)[:, np.abs(x).argmin(axis=0)]), across)
-    z = _unit(across)
-    return x + 1j * cross(z, x), z
+        height = np.sqrt(_dot(across, across))
+    z = across / np.maximum(height, _TINY)
+    return (x, cross(z, x), z), length, third
 
 
 def cross(a: Floats, b: Floats) -> Floats:
@@ -60,5 +72,5 @@ def cross(a: Floats, b: Floats) -> Floats:
     )
 
 
-def _unit(vectors: Floats) -> Floats:
-    return np.asarray(vectors / np.maximum(np.sqrt((vectors**2).sum(axis=0)), _TINY))
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])

@@ -16,6 +16,8 @@ from mixpose.search.spread import far_apart
 from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
 
+_FIRST, _SECOND = np.transpose(SIDES)
+
 
 def from_three_rays(problem: SearchProblem, rays: Rays) -> Kind:
     """Poses from triples of one camera's rays."""
@@ -80,8 +82,8 @@ def _perspective(
 ) -> Floats:
     distance2 = ((features[:, None] - features) ** 2).sum(axis=-1)
     between = rays.directions @ rays.directions.T
-    cosines = np.array([between[detections[i], detections[j]] for i, j in SIDES])
-    squared = np.array([distance2[corners[i], corners[j]] for i, j in SIDES])
+    cosines = between[detections[_FIRST], detections[_SECOND]]
+    squared = distance2[corners[_FIRST], corners[_SECOND]]
     distances, which = depths(cosines, squared)
     # smaller than this in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
@@ -102,12 +104,9 @@ def _orthographic(
     body = np.take(features.T, corners, axis=1).swapaxes(0, 1)
     seen = np.take(rays.origins.T, detections, axis=1).swapaxes(0, 1)
     tolerance = 3 * min_pixels * rays.offset
-    rise = []
-    for i, j in SIDES:
-        side, flat = body[j] - body[i], seen[j] - seen[i]
-        length2, flat2 = (side * side).sum(axis=0), (flat * flat).sum(axis=0)
-        possible = np.sqrt(flat2) <= np.sqrt(length2) + tolerance
-        rise.append(np.where(possible, np.sqrt(np.maximum(length2 - flat2, 0.0)), np.nan))
+    length, flat = (np.linalg.norm(each[_SECOND] - each[_FIRST], axis=1) for each in (body, seen))
+    rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
+    rise[flat > length + tolerance] = np.nan
     direction = rays.directions[0][:, None]
     poses = []
     for sign in (1.0, -1.0):

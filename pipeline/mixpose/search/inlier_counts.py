@@ -26,7 +26,6 @@ from mixpose.sensors import Rays
 Integers: TypeAlias = NDArray[np.int32]
 
 _NEARNESS = 256  # a cell holds label * 256 + nearness
-_WORD = 63  # labels in one word of bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,17 +156,8 @@ def count_inliers(
                 outward = (axes[..., :3] @ body.normals.T).reshape(3, -1)
                 met = np.where(image.faced(world, outward), met, 0)
             met = met.reshape(shape)
-            counts[k, part] = _distinct(met >> 8, image.count)
+            labels = np.sort(met >> 8, axis=1)
+            labels[:, 1:] *= labels[:, 1:] != labels[:, :-1]
+            counts[k, part] = np.count_nonzero(labels, axis=1)
             near[part] += (met & 255).sum(axis=1) * (1.0 / _NEARNESS)
     return counts, near
-
-
-def _distinct(labels: Integers, count: int) -> Floats:
-    """Number of different labels above 0 in each row (H, n)."""
-    total = np.zeros(len(labels))
-    for first in range(1, count + 1, _WORD):
-        table = np.zeros(count + 1, dtype=np.uint64)
-        own = np.arange(first, min(first + _WORD, count + 1))
-        table[own] = np.uint64(1) << (own - first).astype(np.uint64)
-        total += np.bitwise_count(np.bitwise_or.reduce(table[labels], axis=1))
-    return total

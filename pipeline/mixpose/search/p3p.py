@@ -74,14 +74,16 @@ def _cofactors(A: Floats) -> Floats:
 def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     """A real γ with det(D1 + γ D2) = 0 (K,), of three the one farthest from the others."""
     A1, A2 = _cofactors(D1), _cofactors(D2)
-    d, c, b, a = ((A * D).sum(axis=(0, 1)) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2)))
+    d, c, b, a = (
+        np.einsum("ijk,ijk->k", A, D) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2))
+    )
     a = np.where(a == 0, np.finfo(np.float64).tiny, a / 3)
     b, c, d = b / a, c / a, d / (3 * a)
     p, q = c - b * b / 3, (2 * b * b / 27 - c / 3) * b + d
     # from beyond the root on the side of −q, which stands alone, Newton steps fall short of it
     x = np.where(q <= 0, 1.0, -1.0) * (np.sqrt(np.maximum(-p, 0.0) * 4 / 3) + np.cbrt(np.abs(q)))
     x -= b / 3
-    for _ in range(10):
+    for _ in range(7):
         step = (((x + b) * x + c) * x + d) / ((3 * x + 2 * b) * x + c)
         x -= np.where(np.isfinite(step), step, 0.0)
     return np.where(np.isfinite(x), x, 0.0)
@@ -109,7 +111,7 @@ def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
     by, most = _crossed(line), np.abs(line).argmax(axis=0)
     P = np.where(most == 0, by[:, 1], by[:, 0])
     Q = np.where(most == 2, by[:, 1], by[:, 2])
-    CP, CQ = ((C * each).sum(axis=1) for each in (P, Q))
+    CP, CQ = (np.einsum("ijk,jk->ik", C, each) for each in (P, Q))
     a, b, c = (Q * CQ).sum(axis=0), (P * CQ).sum(axis=0), (P * CP).sum(axis=0)
     square = b * b - a * c
     square = np.where(square < -_ROUNDING * b * b, np.nan, np.maximum(square, 0.0))
@@ -127,7 +129,7 @@ def _polished(
         sides, (a, b, c, d, e, f) = _sides_squared(x, cosines)
         J = np.array([[a, b, o], [c, o, d], [o, e, f]])
         cofactors = _cofactors(J)
-        step = (cofactors * (sides - squared)[:, None]).sum(axis=0)
+        step = np.einsum("ijk,ik->jk", cofactors, sides - squared)
         step /= 2 * (J[0] * cofactors[0]).sum(axis=0)
         x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
     off = np.abs(_sides_squared(x, cosines)[0] - squared)

@@ -101,21 +101,15 @@ class Candidate:
     evidence: float
 
 
-@dataclass(frozen=True)
-class SearchReport:
+class SearchReport(NamedTuple):
     """What a search cost: guesses made, tested on all features and sensors, and refined."""
 
     made: int = 0
     tested: int = 0
     refined: int = 0
 
-    def __add__(self, other: SearchReport) -> SearchReport:
-        made, tested, refined = self.made, self.tested, self.refined
-        return SearchReport(made + other.made, tested + other.tested, refined + other.refined)
 
-
-@dataclass(frozen=True)
-class SearchState:
+class SearchState(NamedTuple):
     """Where a search with a limited budget goes on in the next frame.
 
     `kind` of guess, after the first, which is tried in every frame, and batches of it tried.
@@ -125,8 +119,7 @@ class SearchState:
     batch: int = 0
 
 
-@dataclass(frozen=True)
-class SearchResult:
+class SearchResult(NamedTuple):
     """Candidates, best first, what they cost, and where to go on while none convinces."""
 
     candidates: list[Candidate]
