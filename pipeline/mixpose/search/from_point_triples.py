@@ -18,9 +18,8 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.records import Floats
-from mixpose.search.alignment import align_triples
-from mixpose.search.p3p import SIDES
 from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.three_points import SIDES, align_triples
 from mixpose.search.triangulation import Indices, TriangulatedPoints
 
 _FIRST, _SECOND = np.transpose(SIDES)

@@ -9,10 +9,9 @@ from math import comb, perm
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.search.alignment import align_triples
-from mixpose.search.p3p import SIDES, depths
 from mixpose.search.problem import Kind, SearchProblem
 from mixpose.search.spread import far_apart
+from mixpose.search.three_points import SIDES, align_triples, depths
 from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
 

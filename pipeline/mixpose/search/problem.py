@@ -84,17 +84,12 @@ class Kind(NamedTuple):
     poses: Callable[[Any], Floats]
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A pose that may explain the views.
+class Candidate(NamedTuple):
+    """A pose (4, 4) that may explain the views.
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    evidence : float
-        What candidates are ranked by: logarithm of the odds that this is not chance; with ranges
-        among the sensors, the matched objective at the finest blur, summed over views, every
-        detection counting alike.
+    Candidates are ranked by `evidence`: logarithm of the odds that this is not chance; with ranges
+    among the sensors, the matched objective at the finest blur, summed over views, every detection
+    counting alike.
     """
 
     T_world_object: Floats

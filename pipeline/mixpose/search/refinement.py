@@ -13,7 +13,7 @@ from mixpose.body import Body
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-from mixpose.search.budget import DescentOptions
+from mixpose.search.budget import SearchBudget
 
 
 class Stage(NamedTuple):
@@ -34,7 +34,7 @@ class Descent:
     views: Sequence[View]
     body: Body
     free: NDArray[np.bool_]
-    options: DescentOptions
+    budget: SearchBudget
     _objectives: dict[tuple[float, ...], MatchedObjective] = field(default_factory=dict)
 
     def objective(self, factors: tuple[float, ...] = ()) -> MatchedObjective:
@@ -62,17 +62,17 @@ class Descent:
                 # of shares k/n, not of their squares: what counts is how many features are met
                 values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
                 poses = poses[np.argsort(-values, kind="stable")]
-            poses = poses[unlike(self.body, poses, self.options.same)[: stage.survivors]]
+            poses = poses[unlike(self.body, poses, self.budget.same)[: stage.survivors]]
         return poses
 
     def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:
         """One damped Newton step of every pose."""
-        model, free, most = objective.slopes(poses), self.free, self.options.max_turn
+        model, free, most = objective.slopes(poses), self.free, self.budget.max_turn
         A = model.curvature[:, free][:, :, free]
         diagonal = np.einsum("hkk->hk", A)
         largest = diagonal.max(axis=1, keepdims=True)
         scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + np.finfo(np.float64).tiny))
-        A = A * scale[:, :, None] * scale[:, None, :] + self.options.damping * np.eye(A.shape[1])
+        A = A * scale[:, :, None] * scale[:, None, :] + self.budget.damping * np.eye(A.shape[1])
         b = scale * model.gradient[:, free]
         twists = np.zeros((len(poses), 6))
         twists[:, free] = scale * np.linalg.solve(A, b[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""Poses of three points from three rays that meet in one centre (P3P), in bulk.
+"""Poses from three points of the body and their places, or rays that meet in one centre (P3P).
 
 The distances λ along the rays solve three quadratic equations
 ``λ_i² + λ_j² − 2 λ_i λ_j cos_ij = d_ij²``.  Two combinations without constant term are conics in
@@ -12,17 +12,81 @@ runs over long rows.
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.records import Floats
-from mixpose.search.alignment import cross
+from mixpose.rigid import from_parts
 from mixpose.search.triangulation import Indices
 
+Complex: TypeAlias = NDArray[np.complex128]
+
+_TINY = np.finfo(np.float64).tiny
+_FLAT = 1e-9  # sine of the angle at a corner, below which a triangle has no plane
 _POLISHING = 2  # Newton steps on the distances
 _ROUNDING = 1e-9  # a discriminant this little below zero is a double root
 _INEXACT = 1e-3  # share of the squared distances that a solution may miss them by
 
 SIDES = ((0, 1), (0, 2), (1, 2))
+
+
+def align_triples(body: Floats, world: Floats) -> Floats:
+    """Rigid motions that bring triangles onto triangles of about the same shape.
+
+    Parameters
+    ----------
+    body, world : (3, 3, K) array
+        Corners of the triangles: corner, coordinate, triangle.
+
+    Returns
+    -------
+    (K, 4, 4) array
+        T_world_object: centres coincide, planes coincide, and within the plane the turn is the
+        least-squares one.
+    """
+    (x, y, z), side, third = _shape(body)
+    axes, side_world, third_world = _shape(world)
+    # between the corners as seen from their centres, in the planes
+    turn = side * side_world + third.conj() * third_world
+    turn -= (side + third).conj() * (side_world + third_world) / 3
+    length = np.abs(turn)
+    turn = np.where(length < _TINY, 1.0, turn / np.maximum(length, _TINY))
+    c, s = turn.real, turn.imag
+    R = axes[0][:, None] * (c * x - s * y)
+    R += axes[1][:, None] * (s * x + c * y)
+    R += axes[2][:, None] * z
+    t = world.mean(axis=0) - np.einsum("ijk,jk->ik", R, body.mean(axis=0))
+    return from_parts(R.transpose(2, 0, 1), t.T)
+
+
+def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, Complex]:
+    """Axes (3, K each), the first side's length (K,), and the third corner in the plane, x + iy."""
+    side, second = triangles[1] - triangles[0], triangles[2] - triangles[0]
+    length = np.sqrt(_dot(side, side))
+    x = side / np.maximum(length, _TINY)
+    x[0, length == 0] = 1.0  # two at one place: any direction
+    across = cross(x, second)
+    height = np.sqrt(_dot(across, across))
+    third = _dot(x, second) + 1j * height
+    flat = height <= _FLAT * np.abs(third)
+    if flat.any():  # three in a row: any plane through them
+        across = np.where(flat, cross(x, np.eye(3)[:, np.abs(x).argmin(axis=0)]), across)
+        height = np.sqrt(_dot(across, across))
+    z = across / np.maximum(height, _TINY)
+    return (x, cross(z, x), z), length, third
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Cross products of vectors (3, ...)."""
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
@@ -77,7 +141,7 @@ def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     d, c, b, a = (
         np.einsum("ijk,ijk->k", A, D) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2))
     )
-    a = np.where(a == 0, np.finfo(np.float64).tiny, a / 3)
+    a = np.where(a == 0, _TINY, a / 3)
     b, c, d = b / a, c / a, d / (3 * a)
     p, q = c - b * b / 3, (2 * b * b / 27 - c / 3) * b + d
     # from beyond the root on the side of −q, which stands alone, Newton steps fall short of it
