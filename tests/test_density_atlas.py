@@ -10,7 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import Atlas
-from mixpose.density.atlas import MAX_PAGES, PAGE, REACH
+from mixpose.density.atlas import MOST_OWN, REACH, TILE
+from mixpose.density.pages import MAX_PAGES
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -202,46 +203,64 @@ def test_grey_values_drawn_finely_have_their_gradients_to_the_last_digits() -> N
         np.testing.assert_allclose(gradient, slope, atol=2e-5 * C.max())
 
 
-def test_pages_are_drawn_half_a_page_around_a_place_and_no_farther() -> None:
+def test_few_places_have_tiles_that_they_stay_in_for_half_a_tile() -> None:
     points = far_apart(12, side=3)
     atlas = points_only(points, STEPS_PER_SIGMA)
-    half = PAGE / 2 * SIGMA / STEPS_PER_SIGMA
-    pending = int(np.count_nonzero(atlas.table < 0))
+    half = TILE / 2 * SIGMA / STEPS_PER_SIGMA
     looked_up(atlas, points)
-    drawn = pending - int(np.count_nonzero(atlas.table < 0))
-    assert drawn == 4 * len(points)
+    drawn = atlas.values
+    assert drawn.size == len(points) * (TILE + 3) ** 2 * 3
     for turn in np.linspace(0, 2 * np.pi, 9):
-        looked_up(atlas, points + 0.99 * half * np.array([np.cos(turn), np.sin(turn)]))
-    assert pending - int(np.count_nonzero(atlas.table < 0)) == drawn
+        # tiles are drawn around whole cells
+        looked_up(atlas, points + 0.95 * half * np.array([np.cos(turn), np.sin(turn)]))
+        assert atlas.values is drawn
+    looked_up(atlas, points + 1.05 * half)
+    assert atlas.values is not drawn
+
+
+def test_few_places_and_many_are_looked_up_alike() -> None:
+    rng = np.random.default_rng(14)
+    points = far_apart(14, side=4)
+    y = np.repeat(points, 12, axis=0)
+    y += rng.uniform(-5, 5, y.shape) * SIGMA
+    assert len(y) > MOST_OWN
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    value, gradient = looked_up(atlas, y)
+    for some in np.split(np.arange(len(y)), 4):
+        few, slope = looked_up(atlas, y[some])
+        # coordinates in an array of some hundred rows are rounded to 2e-5 cells
+        np.testing.assert_allclose(few, value[some], atol=1e-5 * value.max())
+        np.testing.assert_allclose(slope, gradient[some], atol=1e-5 * value.max() / SIGMA)
 
 
 def test_many_detections_looked_up_a_few_at_a_time_are_all_there() -> None:
     # more pages than one column of the array takes, in pieces of one row and of several
-    points = far_apart(13, side=18)
+    points = far_apart(13, side=40)
     atlas = points_only(points, STEPS_PER_SIGMA)
-    assert atlas.values.shape[1] > atlas.plane.side
     rng = np.random.default_rng(13)
     top = peak(len(points))
-    for some in np.split(rng.permutation(len(points)), [1, 3, 10, 40, 41, 100]):
+    for some in np.split(rng.permutation(len(points)), [1, 3, 10, 40, 41, 500]):
         y = points[some] + rng.uniform(-0.5, 0.5, (len(some), 2)) * SIGMA
         value, _ = looked_up(atlas, y)
         off = 2 * spline_error(STEPS_PER_SIGMA, THIRD) * top
         np.testing.assert_allclose(value, exact(points, y)[0], atol=off)
     np.testing.assert_allclose(looked_up(atlas, points)[0], top, rtol=0.02)
+    assert atlas.values.shape[1] > TILE + 3
 
 
 def test_pages_join_without_a_seam() -> None:
     points = far_apart(6, side=4)
     atlas = points_only(points, STEPS_PER_SIGMA)
     step = SIGMA / STEPS_PER_SIGMA
-    plane = atlas.plane
-    borders = (plane.origin[0] + plane.page * np.arange(1, plane.shape[0])) * step
+    # pages begin at whole ones from sensor coordinates 0
+    borders = np.arange(0.0, points[:, 0].max(), TILE * step)
     beside = 1e-4 * step
     crossed = 0
     for x in borders:
         near = points[np.abs(points[:, 0] - x) < 2 * SIGMA]
         left, right = (near.copy() for _ in range(2))
         left[:, 0], right[:, 0] = x - beside, x + beside
+        left, right = (np.tile(one, (MOST_OWN, 1)) for one in (left, right))
         crossed += len(near)
         (a, da), (b, db) = looked_up(atlas, left), looked_up(atlas, right)
         # on either side of a border, 2e-4 of a cell apart, a value changes by its slope and no
@@ -305,10 +324,13 @@ def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> Non
         value, _ = looked_up(atlas, near)
         # cells begin elsewhere, along two axes, each
         np.testing.assert_allclose(value, expected, rtol=4 * spline_error(STEPS_PER_SIGMA, THIRD))
-        assert len(atlas.table) < 1.1 * MAX_PAGES
+        many, _ = looked_up(atlas, np.tile(near, (MOST_OWN, 1)))
+        np.testing.assert_allclose(many[: len(near)], value, rtol=1e-5)
+        assert len(atlas.pages.table) < 1.1 * MAX_PAGES
         assert atlas.values.nbytes < 2e6
-    several = rng.uniform(-1e7, 1e7, (20, 2))
-    assert points_only(several, STEPS_PER_SIGMA).values.nbytes < 1e6
+    several = points_only(rng.uniform(-1e7, 1e7, (20, 2)), STEPS_PER_SIGMA)
+    looked_up(several, np.tile(near, (MOST_OWN, 1)))
+    assert several.values.nbytes < 2e6
 
 
 @pytest.mark.parametrize("steps", STEPS)

@@ -29,32 +29,36 @@ FRAMES = 4
 
 @dataclass
 class Spy:
-    """Atlases that were drawn, and arrays and maps that cv2.remap was called with."""
+    """Atlases that were drawn, and the places (L, H, n, 2) that cv2.remap looked up in them."""
 
     drawn: list[Atlas] = field(default_factory=list)
-    calls: list[tuple[Any, Any, Any]] = field(default_factory=list)
+    places: list[tuple[Atlas, Floats]] = field(default_factory=list)
 
     def forget(self) -> None:
         self.drawn.clear()
-        self.calls.clear()
+        self.places.clear()
 
     def places_in(self, atlas: Atlas) -> list[Floats]:
-        """Maps (n, 2) of the look-ups in an atlas."""
-        return [
-            np.stack([np.ravel(u), np.ravel(v)], axis=1)
-            for values, u, v in self.calls
-            if values is atlas.values
-        ]
+        return [y for one, y in self.places if one is atlas]
 
 
 @pytest.fixture
 def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
     found = Spy()
-    remap = cv2.remap
+    remapped: list[Any] = []
+    remap, look_up = cv2.remap, Atlas.look_up
 
-    def recorded(values: Any, u: Any, v: Any, *others: Any, **named: Any) -> Any:
-        found.calls.append((values, np.array(u), np.array(v)))
-        return remap(values, u, v, *others, **named)
+    def recorded(values: Any, *others: Any, **named: Any) -> Any:
+        remapped.append(values)
+        return remap(values, *others, **named)
+
+    def looked_up(self: Atlas, y: Floats) -> Floats:
+        remapped.clear()
+        sampled = look_up(self, y)
+        assert len(remapped) == 1
+        assert remapped[0] is self.values
+        found.places.append((self, y.copy()))
+        return sampled
 
     def drawn(*arguments: Any, **named: Any) -> Atlas:
         atlas = Atlas(*arguments, **named)
@@ -62,6 +66,7 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
         return atlas
 
     monkeypatch.setattr("mixpose.density.grid.cv2.remap", recorded)
+    monkeypatch.setattr(Atlas, "look_up", looked_up)
     monkeypatch.setattr(observation, "Atlas", drawn)
     return found
 
@@ -81,17 +86,11 @@ def test_every_pose_is_looked_up_in_drawn_densities_by_remap(name: str, spy: Spy
         assert estimate.T_world_object is not None
         at_pose, around = 0, 0
         y = predicted(views, session.body, estimate.T_world_object)
-        drawn = list(spy.drawn)
-        for atlas in drawn:
-            if len(atlas.per_unit) != len(views):
-                continue
-            calls = spy.places_in(atlas)
-            before = len(spy.calls)
-            atlas.look_up(y)
-            maps = np.stack([np.ravel(each) for each in spy.calls[before][1:]], axis=1)
-            del spy.calls[before:]
-            around += len(calls)
-            at_pose += sum(np.array_equal(one, maps) for one in calls)
+        for atlas in spy.drawn:
+            if len(atlas.per_unit) == len(views):
+                places = spy.places_in(atlas)
+                around += len(places)
+                at_pose += sum(np.array_equal(one, y) for one in places)
         looked_up.append((at_pose, around))
         spy.forget()
 

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import peak
-from mixpose.fit.free_features import Matching, fit_freed, own_peaks
-from mixpose.fit.misfit import SensorDensity, misfit
+from mixpose.fit.misfit import Matching, SensorDensity, fit_freed, misfit, own_peaks
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.sensors import ParallelBeam
 

@@ -59,6 +59,11 @@ class PointPattern:
         if (weights < 0).any():
             raise ValueError(f"weights: found {weights.min():g}; allowed: 0 or more")
 
+    @property
+    def dimension(self) -> int:
+        """m, the number of sensor coordinates."""
+        return int(self.points.shape[1])
+
 
 @dataclass(frozen=True)
 class GridPattern:
@@ -77,6 +82,11 @@ class GridPattern:
     values: NDArray[np.float32]
     origin: Floats
     step: float
+
+    @property
+    def dimension(self) -> int:
+        """m, the number of sensor coordinates."""
+        return len(self.origin)
 
 
 Pattern: TypeAlias = PointPattern | GridPattern

@@ -6,11 +6,11 @@ from mutation.mutant import Mutant
 
 _ATLAS = (
     Mutant(
-        "density-second-detection-of-a-page-lost",
+        "density-second-detection-of-a-tile-lost",
         "density/atlas.py",
-        "place = np.arange(len(number)) - np.searchsorted(number, number)",
-        "place = np.zeros_like(number)",
-        "of two detections on one page only one is there",
+        "place = np.arange(len(of)) - np.searchsorted(of, of)",
+        "place = np.zeros_like(of)",
+        "of two detections on one tile only one is there",
     ),
     Mutant(
         "density-drawn-too-narrowly",
@@ -36,8 +36,8 @@ _ATLAS = (
     Mutant(
         "density-look-up-blurs-once-more",
         "density/atlas.py",
-        "self._sigma = math.sqrt(n**2 - _SPLINE)",
-        "self._sigma = n",
+        "drawn = math.sqrt(n**2 - _SPLINE)",
+        "drawn = n",
         "peaks of densities are too low by what a spline blurs",
     ),
     Mutant(
@@ -55,15 +55,15 @@ _ATLAS = (
         "places of features are drawn to cells",
     ),
     Mutant(
-        "density-pages-on-one-side-only",
+        "density-tiles-that-are-left",
         "density/atlas.py",
-        "self._squares_of(index - 0.5 * self.plane.page)",
-        "self._squares_of(index)",
-        "a fit that goes on by a pixel draws its densities twice",
+        "<= 0.5 * TILE",
+        "<= 2.0 * TILE",
+        "a fit that goes on by some pixels looks up what another feature has",
     ),
     Mutant(
         "density-pages-begin-anywhere",
-        "density/atlas.py",
+        "density/pages.py",
         "origin = page * np.floor((lower - (reach + page + 0.5)) / page)",
         "origin = lower - (reach + page + 0.5)",
         "the last digits of a pose change with detections that have no part in it",

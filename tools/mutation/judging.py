@@ -74,8 +74,8 @@ _FIELDS = (
     Mutant(
         "judgement-markers-off-are-noise",
         "judgement/moments.py",
-        "seen[:, 3] = markers.squares",
-        "seen[:, 3] = 0.0",
+        "(by_rest**2).sum(axis=(1, 2, 3))",
+        "0.0",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(

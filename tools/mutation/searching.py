@@ -84,8 +84,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-companions-in-world-axes",
         "tracking/companion.py",
-        "turned = T_world_other[:3, :3] ** 2",
-        "turned = np.eye(3)",
+        "variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2",
+        "variances.reshape(2, 3)",
         "what is known of a body beside another does not turn with it",
         (_SCENES,),
     ),
@@ -230,7 +230,7 @@ _PROPOSALS = (
 _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
-        "tracking/reflection.py",
+        "tracking/recognition.py",
         "close)) > judged.log_evidence + ahead:",
         "close)) > 1e9:",
         "the body in a window is taken for the body",
@@ -238,7 +238,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
-        "tracking/reflection.py",
+        "tracking/recognition.py",
         "close)) > judged.log_evidence + ahead:",
         "close)) > -1e9:",
         "a flat body with a hidden marker is never sure",
@@ -246,7 +246,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-bodies-nearly-flat-are-their-mirror-images",
-        "tracking/reflection.py",
+        "tracking/recognition.py",
         "bool(extents[2] < _FLAT * extents[0])",
         "bool(extents[2] < 0.9 * extents[0])",
         "the body in a window is taken for the body",
@@ -254,7 +254,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-a-body-given-mirrored-passes",
-        "tracking/reflection.py",
+        "tracking/recognition.py",
         "return any(_evidence(mirror, start) > own + ahead for start in starts)",
         "return False",
         "few markers of a body given mirrored are met by chance, and the pose is ok",
@@ -262,7 +262,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-few-markers-are-a-mirror-image",
-        "tracking/reflection.py",
+        "tracking/recognition.py",
         "return any(_evidence(mirror, start) > own + ahead for start in starts)",
         "return any(_evidence(mirror, start) > -1e9 for start in starts)",
         "a body whose markers are hidden beside false points is never sure",

@@ -1,4 +1,4 @@
-"""Densities g_l of where features are: blur, normalisation, windows, pages, levels of blur."""
+"""Densities g_l of where features are: blur, normalisation, windows, tiles, levels of blur."""
 
 from __future__ import annotations
 

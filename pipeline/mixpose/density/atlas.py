@@ -1,29 +1,34 @@
-"""Densities of all sensors as one image, drawn where they are looked up.
+"""Densities of all sensors as images, drawn where they are looked up.
 
 A density is nearly empty: detections are few, and a grid fine enough for gradients has millions of
-points.  So the plane of every sensor is divided into square pages.  A page is drawn when it is
-looked up for the first time, all pages of all sensors lie in one array (an atlas), and a table says
-where.  `cv2.remap` looks all sensors up at once, values and gradients together.
+points.  So small tiles of it are drawn, and all tiles of all sensors lie in one array (an atlas),
+which `cv2.remap` looks up at once, values and gradients together.  Few places, as those of a pose
+that a fit begins from, have tiles of their own, in which they stay while it moves a little.  For
+many the plane of every sensor is divided into pages: tiles that are drawn when they are looked up
+for the first time, and are found by a table.
 
 Cells hold coefficients of quadratic B-splines, so that what is looked up bends smoothly from cell
 to cell.  At a place d cells beside the nearest one, such a spline is the mean of four bilinear
 look-ups, d² + 1/4 of a cell to either side along each axis.
 
 Arrays have a leading axis L over sensors.  A sensor of one coordinate has 0 as its second, and its
-pages have equal rows.
+tiles have equal rows.  Cells are counted from sensor coordinates 0, so that a density is the same
+whatever is seen beside it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.density.blur import factors, mass, reduced
-from mixpose.density.grid import FAR, remap
+from mixpose.density.grid import remap
+from mixpose.density.pages import Pages, Plane
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -34,27 +39,22 @@ REACH = 4.25
 """Standard deviations around a detection that are drawn: features farther apart draw each other by
 less than 1e-3 σ_ε."""
 
-PAGE = 12
-"""Cells along the side of a page: three standard deviations of detections.  Four such pages around
-a place reach half a page beyond it, as far as a fit moves; larger ones are drawn for little use."""
+TILE = 24
+"""Cells along the part of a tile that is looked up: six standard deviations of detections.  Half of
+it is as far as a fit moves; larger ones are drawn for little use."""
 
-MIN_GRID_PAGE = 18
+MIN_GRID_TILE = 18
 """The same of grey values alone, at least; as a rule a standard deviation."""
 
-MANY_PAGES = 40_000
-"""Pages of a sensor's plane from which they become larger, up to what a detection fills."""
-
-MAX_PAGES = 400_000
-"""Pages of a sensor's plane; detections that are too far from their middle for it are left out,
-and pages of grey values are larger."""
+MOST_OWN = 128
+"""Places that have tiles of their own: those of more are often on pages that are drawn already."""
 
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
-_AT_ONCE = 100_000  # cells that are drawn together: what is made for them stays in the cache
-_PENDING = -1  # in the table: not drawn yet
+_AT_ONCE = 300_000  # cells or pairs that are worked on together: they stay in the cache
+_BESIDE = 2.0  # cells beside a place that are looked up, at most
 _SIDES = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
 _QUARTERS = np.full(4, 0.25, dtype=np.float32)
-_BESIDE = 2.0  # cells beside a place that are looked up, at most
 
 
 class Atlas:
@@ -72,71 +72,44 @@ class Atlas:
     Attributes
     ----------
     values : (rows, columns, 3) float32
-        Pages with one cell more on every side, which look-ups reach: the density as a share of a
-        lone detection's peak, and its gradient per standard deviation.
-    table : (L · squares,) int
-        Number of the page of each square of a plane, plane after plane and row by row; 0 where
-        there is nothing, negative where nothing was looked up yet.
+        Tiles that were looked up last, with one cell more on every side: the density as a share
+        of a lone detection's peak, and its gradient per standard deviation.
     per_unit : (L, 1, 1, 2) float64
         Cells per sensor unit; 0 for the missing coordinate of ranges.
-    plane : Plane
-        Of every sensor; they lie below one another.
+    tile : int
+        Cells along the part of a tile that is looked up.
     """
 
     def __init__(
         self, patterns: Sequence[Pattern], sigmas: Sequence[float], steps_per_sigma: float
     ) -> None:
-        L, n, reach = len(patterns), steps_per_sigma, REACH * steps_per_sigma + _BESIDE
-        dimensions = [_dimension(pattern) for pattern in patterns]
-        self._is_flat = np.array(dimensions) == 1
-        self._sigma = math.sqrt(n**2 - _SPLINE)  # what is drawn, in cells
-        widths = [sigma * self._sigma / n for sigma in sigmas]
-        tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
-        across = [(n / sigma, (m - 1) * n / sigma) for sigma, m in zip(sigmas, dimensions)]
-        self.per_unit = np.array(across)[:, None, None]
-        units = [(top, top / w, top / w) for top, w in zip(tops, widths)]
-        self._units = np.array(units)[:, None, None]
-        self._grids: dict[int, tuple[Pattern, float, float]] = {}
-        corners: dict[int, Floats] = {}
+        dimensions = tuple([pattern.dimension for pattern in patterns])
+        self._scale = scale = _Scale.of(dimensions, tuple(sigmas), steps_per_sigma)
+        self.per_unit = scale.per_unit
+        self.values = np.zeros((0, 0, 3), dtype=np.float32)
+        points = [pattern for pattern in patterns if isinstance(pattern, PointPattern)]
+        self._most = max([len(pattern.points) for pattern in points], default=0)
+        self._q = np.full((len(patterns), self._most, 2), np.inf)
+        self._share = np.zeros((len(patterns), self._most), dtype=np.float32)
+        self._grids: dict[int, tuple[GridPattern, float, float]] = {}
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
-                small, left = reduced(pattern, widths[k])
+                small, left = reduced(pattern, scale.widths[k])
                 self._grids[k] = small, left, mass(small)
-                corners[k] = _corners(pattern) * across[k]
-        detections = _Detections.of(patterns, self.per_unit)
-        self.plane = plane = Plane.of(detections.q, corners, reach)
-        self._cells = np.arange(plane.side, dtype=np.float32) * np.float32(1 / self._sigma)
-        self._lower = np.zeros((L, 1, 1, 2))
-        self._lower[:, 0, 0, 1] = plane.shape[1] * plane.page * np.arange(L)
-        self._upper = self._lower + (np.array(plane.shape) * plane.page - 1e-3)
-        self._origin = plane.origin - self._lower
-        self._detections = detections = detections.on(plane, reach, self._origin)
-        self.table = np.zeros(L * plane.squares, dtype=np.int32)
-        self.table[detections.squares] = _PENDING
-        for k, both in corners.items():
-            (u, v), (last_u, last_v) = plane.squares_of(both + np.array([[-reach], [reach]]))
-            squares = self.table.reshape(L, *plane.shape[::-1])[k]
-            squares[v : last_v + 1, u : last_u + 1] = _PENDING
-        self._most = detections.squares.size + len(corners) * plane.squares
-        self._columns = self._most * plane.side // _LARGEST + 1
-        self._drawn = self._columns  # the first row is of squares without anything
-        self.values = np.zeros((plane.side, self._columns * plane.side, 3), dtype=np.float32)
-        # from a place in the planes to one in the array, by page; from nothing out of the array
-        self._shifts = np.array([(FAR, FAR)] * self._columns)
+            else:
+                count = len(pattern.points)
+                self._q[k, :count] = pattern.points * scale.per_unit[k, 0, 0]
+                self._share[k, :count] = pattern.weights / pattern.weights.sum()
+        self.tile = max(math.ceil(steps_per_sigma), MIN_GRID_TILE) if self._grids else TILE
+        self._own: _Tiles | None = None
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
-        index -= self._origin
-        np.maximum(index, self._lower, out=index)
-        np.minimum(index, self._upper, out=index)
-        squares = self._squares_of(index)
-        number = self.table[squares]
-        if number.min(initial=0) < 0:
-            pending = number < 0
-            self._draw(np.unique(squares[pending] if self._grids else self._around(index[pending])))
-            number = self.table[squares]
-        index += self._shifts[number]
+        if self._grids or index.size > 2 * MOST_OWN:
+            self._to_pages(index)
+        else:
+            self._to_own_tiles(index)
         maps = index.reshape(-1, 2).T
         beside = maps - np.rint(maps)
         beside *= beside
@@ -145,247 +118,161 @@ class Atlas:
         around += maps[:, None]
         u, v = around.reshape(2, -1).astype(np.float32)
         sampled = _QUARTERS @ remap(self.values, u, v).reshape(4, -1)
-        return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._units)
+        return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._scale.units)
 
-    def _squares_of(self, index: Floats) -> Indices:
-        """Squares of the table (...,) that hold places (..., 2) in cells."""
-        columns_rows = (index * (1.0 / self.plane.page)).astype(np.intp)
-        return np.asarray(columns_rows @ np.array([1, self.plane.shape[0]]))
+    def _to_own_tiles(self, index: Floats) -> None:
+        """Turn places in cells into those in tiles around them, in place."""
+        tiles = self._own
+        if tiles is None or not tiles.hold(index):
+            middles = np.rint(index)
+            flat = middles.reshape(-1, 2)
+            sensors = np.arange(len(index)).repeat(len(flat) // len(index))
+            drawn = self._drawn(sensors, flat, *self._near(sensors, flat))
+            side = drawn.shape[1]
+            shifts = 0.5 * (side - 1) - flat
+            shifts[:, 1] += side * np.arange(len(flat))
+            values = drawn.reshape(-1, side, 3)
+            tiles = self._own = _Tiles(middles, shifts.reshape(index.shape), values)
+        index += tiles.shifts
+        self.values = tiles.values
 
-    def _around(self, index: Floats) -> Indices:
-        """The four squares around places (P, 2) in cells, those that are pending.
+    def _to_pages(self, index: Floats) -> None:
+        """Turn places in cells into those on pages, in place."""
+        at_once = max(_AT_ONCE // max((self.tile + 3) ** 2, self._most), 1)
+        self.pages.find(index, self._drawn_pages, at_once)
+        self.values = self.pages.values
 
-        Fits go on a little, and drawing once is cheaper than drawing twice.
-        """
-        columns = self.plane.shape[0]
-        first = self._squares_of(index - 0.5 * self.plane.page)
-        squares = first[:, None] + np.array([0, 1, columns, columns + 1])
-        return np.asarray(squares[self.table[squares] < 0])
+    @cached_property
+    def pages(self) -> Pages:
+        """For many places, on planes that hold all that is seen."""
+        q = self._q[np.isfinite(self._q[..., 0])]
+        plane = Plane.of(q, [self._corners(k) for k in self._grids], self.tile, self._scale.reach)
+        self.tile = plane.page
+        return Pages(plane, len(self._q))
 
-    def _draw(self, squares: Indices) -> None:
-        """Draw the pages of pending squares of the table, none of which is twice."""
-        side, columns = self.plane.side, self._columns
-        at_once = max(_AT_ONCE // side**2, columns)
-        if len(squares) > at_once:  # pages of as many detections are drawn together
-            reached = np.bincount(self._detections.squares.ravel(), minlength=len(self.table))
-            squares = squares[np.argsort(reached[squares], kind="stable")]
-        self._reserve(len(squares))
-        while len(squares):
-            row, column = divmod(self._drawn, columns)
-            whole = 0 if column else min(len(squares), at_once) // columns
-            count = whole * columns or min(len(squares), columns - column)
-            some, squares = squares[:count], squares[count:]
-            room = self.values[row * side : (row + max(whole, 1)) * side]
-            room = room.reshape(-1, side, columns, 3 * side).swapaxes(1, 2)
-            pages = room if whole else room[:, column : column + count]
-            number = np.arange(self._drawn, self._drawn + count)
-            self.table[some] = number
-            corner = _across(some, self.plane.shape[0])
-            corner *= self.plane.page
-            corner -= 1.0
-            shifts = _across(number, columns)
-            shifts *= side
-            self._shifts[self._drawn : self._drawn + count] = shifts - corner
-            self._draw_detections(corner, pages)
-            for k in self._grids:
-                for i in np.flatnonzero(some // self.plane.squares == k).tolist():
-                    page = pages[i // pages.shape[1], i % pages.shape[1]]
-                    page[...] = self._of_grid(k, corner[i]).reshape(page.shape)
-            self._drawn += count
+    def _corners(self, sensor: int) -> Floats:
+        """Corners (2, 2) of a grid, in cells."""
+        pattern = self._grids[sensor][0]
+        corners = np.zeros((2, 2))
+        size = np.array(pattern.values.shape[::-1])[: pattern.dimension] - 1
+        corners[:, : pattern.dimension] = pattern.origin + [[0.0], [pattern.step]] * size
+        return np.asarray(corners * self.per_unit[sensor, 0, 0])
 
-    def _reserve(self, pages: int) -> None:
-        """Make room for further pages."""
-        side, columns = self.plane.side, self._columns
-        rows = -(-(self._drawn + pages) // columns)
-        if rows * side > len(self.values):
-            # so large that allocators keep it from frame to frame; memory that is not written to
-            # is free
-            most = max(min(4 * rows, self._most // columns + 2), rows)
-            values = np.empty((most * side, *self.values.shape[1:]), dtype=np.float32)
-            values[: len(self.values)] = self.values
-            shifts = np.empty((most * columns, 2))
-            shifts[: len(self._shifts)] = self._shifts
-            self.values, self._shifts = values, shifts
+    def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
+        """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
+        away = self._q[sensors] - middles[:, None]
+        np.abs(away, out=away)
+        near = away < 0.5 * self.tile + self._scale.reach
+        of, which = np.nonzero(near[..., 0] & near[..., 1])
+        return of, which
 
-    def _draw_detections(self, corner: Floats, pages: Singles) -> None:
-        """Draw pages with corners (P, 2) in cells, the next ones, in place.
+    def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
+        """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections `_near` them.
 
-        They hold exact Gaussians: sums, over the detections that reach a page, of products of one
+        They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
         """
-        side, found, count = self.plane.side, self._detections, len(corner)
-        number = self.table[found.squares] - self._drawn
-        of, which = np.nonzero(number >= 0)
-        number = number[of, which]
-        order = np.argsort(number, kind="stable")
-        of, number = of[order], number[order]
-        place = np.arange(len(number)) - np.searchsorted(number, number)  # in its page
+        count, side, scale = len(middles), self.tile + 3, self._scale
+        place = np.arange(len(of)) - np.searchsorted(of, of)
         most = int(place.max(initial=0)) + 1
-        begin = (found.q[of] - corner[number]) * (1 / self._sigma)
-        away = begin.astype(np.float32)[..., None] - self._cells
+        sensor = sensors[of]
+        begin = (self._q[sensor, which] - middles[of]) * (1 / scale.sigma)
+        cells = (np.arange(side, dtype=np.float32) - 0.5 * (side - 1)) * (1 / scale.sigma)
+        away = begin.astype(np.float32)[..., None] - cells.astype(np.float32)
         bells = np.exp(np.float32(-0.5) * away * away)
-        if self._is_flat.any():  # rows that are all alike
-            flat = self._is_flat[found.sensor[of]]
+        if scale.is_flat is not None:  # rows that are all alike
+            flat = scale.is_flat[sensor]
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
-        bells[:, 1] *= found.share[of, None]
+        bells[:, 1] *= self._share[sensor, which, None]
         slopes = bells * away
-        along_v = np.empty((len(number), 2, side), dtype=np.float32)
-        along_v[:, 0], along_v[:, 1] = bells[:, 1], slopes[:, 1]
-        along_u = np.zeros((len(number), 2, side, 3), dtype=np.float32)
-        along_u[:, 0, :, 0] = along_u[:, 1, :, 2] = bells[:, 0]
-        along_u[:, 0, :, 1] = slopes[:, 0]
-        if len(number) < count * most:
-            slots = most * number + place
-            along_v, along_u = (_spread(one, slots, count * most) for one in (along_v, along_u))
-        rows = along_v.reshape(*pages.shape[:2], 2 * most, side).swapaxes(2, 3)
-        np.matmul(rows, along_u.reshape(*pages.shape[:2], 2 * most, 3 * side), out=pages)
+        slots = most * of + place
+        along_v = np.zeros((count * most, 2, side), dtype=np.float32)
+        along_v[slots, 0], along_v[slots, 1] = bells[:, 1], slopes[:, 1]
+        along_u = np.zeros((count * most, 2, side, 3), dtype=np.float32)
+        along_u[slots, 0, :, 0] = along_u[slots, 1, :, 2] = bells[:, 0]
+        along_u[slots, 0, :, 1] = slopes[:, 0]
+        rows = along_v.reshape(count, 2 * most, side).swapaxes(1, 2)
+        return np.asarray(rows @ along_u.reshape(count, 2 * most, 3 * side))
 
-    def _of_grid(self, sensor: int, corner: Floats) -> Singles:
-        """A page (side, side, 3) of grey values or a profile, which begins at a corner (2,)."""
+    def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
+        """Those of pages around places (P, 2) in cells on which there is something, and they."""
+        of, which = self._near(sensors, middles)
+        is_filled = np.zeros(len(sensors), dtype=np.bool_)
+        is_filled[of] = True
+        reach = 0.5 * self.tile + self._scale.reach
+        for k in self._grids:
+            lower, upper = self._corners(k)
+            inside = (middles > lower - reach) & (middles < upper + reach)
+            is_filled |= (sensors == k) & inside.all(axis=1)
+        filled = np.flatnonzero(is_filled)
+        sensors, middles = sensors[filled], middles[filled]
+        tiles = self._drawn(sensors, middles, np.searchsorted(filled, of), which)
+        for i, k in enumerate(sensors.tolist()):
+            if k in self._grids:
+                tiles[i] = self._of_grid(k, middles[i])
+        return filled, tiles
+
+    def _of_grid(self, sensor: int, middle: Floats) -> Singles:
+        """A tile (side, 3 side) of grey values or a profile."""
         pattern, sigma, total = self._grids[sensor]
-        cells = corner + self._origin[sensor, 0, 0] + np.arange(self.plane.side)[:, None]
+        side, flat = self.tile + 3, pattern.dimension == 1
+        cells = middle + (np.arange(side) - 0.5 * (side - 1))[:, None]
         u, v = (cells / self.per_unit[sensor, 0, 0, 0]).T
-        flat = bool(self._is_flat[sensor])
         layers = factors(pattern, sigma, u, None if flat else v, total).layers(gradient=True)
-        page = np.zeros((self.plane.side, self.plane.side, 3), dtype=np.float32)
+        tile = np.zeros((side, side, 3), dtype=np.float32)
         for channel, layer in enumerate(layers[: 2 if flat else 3]):
-            page[..., channel] = layer / self._units[sensor, 0, 0, channel]
-        return page
+            tile[..., channel] = layer / self._scale.units[sensor, 0, 0, channel]
+        return tile.reshape(side, 3 * side)
 
 
-def _spread(rows: Singles, slots: Indices, count: int) -> Singles:
-    """Rows in some of several slots, and zeros in the others."""
-    spread = np.zeros((count, *rows.shape[1:]), dtype=np.float32)
-    spread[slots] = rows
-    return spread
+class _Tiles(NamedTuple):
+    """Tiles of their own around places (L, H, n, 2) in cells: shifts from there to the array."""
+
+    middles: Floats
+    shifts: Floats
+    values: Singles
+
+    def hold(self, index: Floats) -> bool:
+        """Whether as many places are still on their tiles."""
+        if self.middles.shape != index.shape:
+            return False
+        return float(np.abs(index - self.middles).max(initial=0.0)) <= 0.5 * TILE
 
 
-def _across(numbers: Indices, columns: int) -> Floats:
-    """Columns and rows (n, 2) of what is numbered row by row."""
-    found = np.empty((len(numbers), 2))
-    np.divmod(numbers, columns, out=(found[:, 1], found[:, 0]), casting="unsafe")
-    return found
-
-
-class Plane(NamedTuple):
-    """The plane of every sensor: origin in cells, pages along u and v, and cells along a page.
-
-    `is_cut` where some detections are too far away for it.
-    """
-
-    origin: Floats
-    shape: tuple[int, int]
-    page: int
-    is_cut: bool = False
-
-    @property
-    def squares(self) -> int:
-        """Number of pages."""
-        return self.shape[0] * self.shape[1]
-
-    @property
-    def side(self) -> int:
-        """Cells along a page that is drawn, with those around it."""
-        return self.page + 3
-
-    def squares_of(self, q: Floats) -> Indices:
-        """Columns and rows (..., 2) of squares that hold places (..., 2) in cells."""
-        return np.floor((q - self.origin) * (1.0 / self.page)).astype(np.intp)
-
-    @classmethod
-    def of(cls, q: Floats, corners: Mapping[int, Floats], reach: float) -> Plane:
-        """A plane that holds detections (D, 2), and corners (2, 2) of grids, of all sensors.
-
-        In cells.  Pages begin at whole ones from sensor coordinates 0, so that a density is the
-        same whatever is seen beside it.  There is a rim of squares with nothing.
-        """
-        page = max(math.ceil(reach / REACH), MIN_GRID_PAGE) if corners else PAGE
-        grids = np.concatenate(list(corners.values())) if corners else q
-        places = q if len(q) else grids
-        lower, upper = places.min(axis=0), places.max(axis=0)
-        if len(q) and _count(lower, upper, page) > MANY_PAGES:
-            several = math.ceil(page * math.sqrt(_count(lower, upper, page) / MANY_PAGES))
-            page = min(several, math.ceil(2 * reach))
-        is_cut = len(q) > 0 and _count(lower, upper, page) > MAX_PAGES
-        if is_cut:
-            middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
-            lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
-        if corners:
-            lower = np.minimum(lower, grids.min(axis=0))
-            upper = np.maximum(upper, grids.max(axis=0))
-            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
-        # half a cell is left, lest rounding puts a place on a square of the rim
-        origin = page * np.floor((lower - (reach + page + 0.5)) / page)
-        columns, rows = ((upper - lower + 2 * reach) / page).tolist()
-        return cls(origin, (int(columns) + 5, int(rows) + 5), page, is_cut)
-
-
-def _count(lower: Floats, upper: Floats, page: int) -> float:
-    """Pages of a box in cells, about."""
-    columns, rows = ((upper - lower) / page + 5).tolist()
-    return float(columns * rows)
-
-
-class _Detections(NamedTuple):
-    """Detections of all sensors, and the squares of the table that they reach.
+class _Scale(NamedTuple):
+    """What cells are in units of L sensors, and densities in those of the array.
 
     Attributes
     ----------
-    q : (D, 2) float64
-        Places in cells, from sensor coordinates 0 or from the corner of the first plane.
-    share : (D,) float32
-        Of the sensor's density.
-    sensor : (D,) int
-    squares : (D, S) int
+    per_unit : (L, 1, 1, 2) float64
+        As `Atlas` has it.
+    widths : list of float
+        Standard deviations that are drawn, in sensor units: look-ups blur by the rest.
+    sigma, reach : float
+        The same in cells, and how far around a detection it is drawn.
+    units : (L, 1, 1, 3) float64
+        Of the channels.
+    is_flat : (L,) bool or None
+        Sensors of one coordinate, where there are any.
     """
 
-    q: Floats
-    share: Singles
-    sensor: Indices
-    squares: Indices
+    per_unit: Floats
+    widths: list[float]
+    sigma: float
+    reach: float
+    units: Floats
+    is_flat: NDArray[np.bool_] | None
 
     @classmethod
-    def of(cls, patterns: Sequence[Pattern], per_unit: Floats) -> _Detections:
-        """All detections, not on a plane yet."""
-        found = {k: one for k, one in enumerate(patterns) if isinstance(one, PointPattern)}
-        if not found:
-            none = np.zeros(0, dtype=np.intp)
-            return cls(np.zeros((0, 2)), none.astype(np.float32), none, none[:, None])
-        counts = np.array([len(one.points) for one in found.values()])
-        sensor = np.array(list(found)).repeat(counts)
-        q = np.concatenate([_in_plane(one.points) for one in found.values()])
-        weights = np.concatenate([one.weights for one in found.values()])
-        share = weights / np.bincount(sensor, weights)[sensor]
-        q *= per_unit[sensor, 0, 0]
-        return cls(q, share.astype(np.float32), sensor, sensor[:, None])
-
-    def on(self, plane: Plane, reach: float, origin: Floats) -> _Detections:
-        """The same on planes with origins (L, 1, 1, 2), but those too far away for theirs."""
-        q, share, sensor, _ = self
-        first = plane.squares_of(q - reach)
-        beside = np.arange(int(2 * reach / plane.page) + 2)
-        if plane.is_cut:
-            inside = ((first >= 1) & (first < np.array(plane.shape) - len(beside))).all(axis=1)
-            sensor, q, share, first = sensor[inside], q[inside], share[inside], first[inside]
-        begin = plane.squares * sensor + first @ np.array([1, plane.shape[0]])
-        squares = begin[:, None] + np.add.outer(plane.shape[0] * beside, beside).ravel()
-        return _Detections(q - origin[sensor, 0, 0], share, sensor, squares)
-
-
-def _dimension(pattern: Pattern) -> int:
-    if isinstance(pattern, PointPattern):
-        return int(pattern.points.shape[1])
-    return len(pattern.origin)
-
-
-def _corners(pattern: GridPattern) -> Floats:
-    """Corners (2, 2) of a grid."""
-    size = np.array(pattern.values.shape[::-1])[: len(pattern.origin)] - 1
-    return _in_plane(np.array([pattern.origin, pattern.origin + size * pattern.step]))
-
-
-def _in_plane(places: Floats) -> Floats:
-    """Places (K, 2), with 0 for a missing coordinate."""
-    if places.shape[1] == 2:
-        return places
-    return np.concatenate([places, np.zeros_like(places)], axis=1)
+    @lru_cache(maxsize=64)
+    def of(cls, dimensions: tuple[int, ...], sigmas: tuple[float, ...], n: float) -> _Scale:
+        """For blurs of standard deviations sigmas, of n cells each."""
+        drawn = math.sqrt(n**2 - _SPLINE)
+        widths = [sigma * drawn / n for sigma in sigmas]
+        across = [(n / sigma, (m - 1) * n / sigma) for sigma, m in zip(sigmas, dimensions)]
+        tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
+        units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
+        is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
+        per_unit = np.array(across)[:, None, None]
+        reach = REACH * n + _BESIDE
+        return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)

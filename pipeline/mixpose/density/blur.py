@@ -121,15 +121,13 @@ def mass(pattern: Pattern) -> float:
     return absolute * pattern.step ** len(pattern.origin)
 
 
-def reduced(pattern: Pattern, sigma: float) -> tuple[Pattern, float]:
+def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
     """A grid on fewer points where a wide blur leaves nothing between them, and the blur left.
 
     Points are averaged by a triangle (a box run over the pixels, then blocks): blocks alone would
     move a feature to the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off
     the blur.
     """
-    if isinstance(pattern, PointPattern):
-        return pattern, sigma
     factor = odd_factor(sigma / (_SAMPLES_PER_SIGMA * pattern.step))
     if factor == 1:
         return pattern, sigma
@@ -180,8 +178,12 @@ def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = F
     if is_empty(pattern):
         shape = (*window.shape, 3) if gradient else window.shape
         return Density(np.zeros(shape, dtype=np.float32), window, sigma)
-    small, left = reduced(pattern, sigma)
-    made = factors(small, left, window.axis(0), window.axis(1) if m == 2 else None, mass(small))
+    if isinstance(pattern, GridPattern):
+        pattern, sigma_left = reduced(pattern, sigma)
+    else:
+        sigma_left = sigma
+    v = window.axis(1) if m == 2 else None
+    made = factors(pattern, sigma_left, window.axis(0), v, mass(pattern))
     layers = made.layers(gradient=gradient)
     values = merge(layers[: 1 + m]) if gradient else layers[0]
     return Density(values, window, sigma)

@@ -1,15 +1,9 @@
 """ε, what the extraction errs by: how large it is, as offsets of features show it.
 
 At a blur σ a feature r away from its prediction pulls with r exp(−r²/4σ²), as in robust least
-squares with the loss of Welsch.  At σ = 1.5 s, s being the standard deviation of the offsets, that
-is 95 % as efficient as least squares where all offsets are normal, and an offset of 6 s is as good
-as out.  Offsets weighted so have the variance q with 1/q = 1/s² + 1/2σ²: both sides of
-
-    σ = 1.5 s,      s² = q / (1 − q / 2σ²)
-
-follow from one another, from the session's σ_ε down to where they agree.  Where many offsets are
-not noise, as those of merged spots, they agree at a wide blur, too; so they are also sought from
-what is known upwards, and the likelier noise counts.  Lengths are in σ_ε of their sensor.
+squares with the loss of Welsch.  Offsets of standard deviation s, weighted so, have the variance q
+with 1/q = 1/s² + 1/2σ².  σ = 1.5 s and s² = q / (1 − q / 2σ²) follow from one another, from σ_ε
+down and from what is known upwards, to where they agree.  Lengths are in σ_ε of their sensor.
 """
 
 from __future__ import annotations
@@ -22,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
+from mixpose.records import Floats
 
-Floats: TypeAlias = NDArray[np.float64]
 Indices: TypeAlias = NDArray[np.intp]
 
 _NOTHING = 1e-12
@@ -94,47 +88,22 @@ def sums_of(noises: Sequence[Noise]) -> Floats:
 
 
 class Offsets(NamedTuple):
-    """Offsets of K features in L sensors.
+    """Offsets of K features in L sensors."""
 
-    Attributes
-    ----------
-    squared : (K,) float64
-        In σ_ε².
-    shares : (K,) float64
-        How far each feature was met.
-    sensor : (K,) int
-    dimensions : (L,) int
-        Coordinates of each sensor.
-    finest : (L,) float64
-        Narrowest blur of each sensor, in σ_ε.
-    """
-
-    squared: Floats
-    shares: Floats
-    sensor: Indices
-    dimensions: Indices
-    finest: Floats
+    squared: Floats  # (K,) in σ_ε²
+    shares: Floats  # (K,) how far each feature was met
+    sensor: Indices  # (K,)
+    dimensions: Indices  # (L,) coordinates of each sensor
+    finest: Floats  # (L,) narrowest blur of each sensor, in σ_ε
 
 
 class Seen(NamedTuple):
-    """What offsets show.
+    """What offsets show."""
 
-    Attributes
-    ----------
-    own : (2, L) float64
-        Squares, in σ_ε², and degrees of freedom of each sensor's noise in this frame.
-    variances : (L,) float64
-        Of each sensor's noise, together with what was known.
-    blurs : (L,) float64
-        In σ_ε.
-    before : (L,) float64
-        Blurs by what was known of the noise before the frame.
-    """
-
-    own: Floats
-    variances: Floats
-    blurs: Floats
-    before: Floats
+    own: Floats  # (2, L) squares, in σ_ε², and degrees of freedom of each sensor in this frame
+    variances: Floats  # (L,) of each sensor's noise, together with what was known
+    blurs: Floats  # (L,) in σ_ε
+    before: Floats  # (L,) blurs by what was known of the noise before the frame
 
 
 def errors_seen(

@@ -1,15 +1,14 @@
 """Which features of a predicted mixture a pattern has something at, and how far off.
 
-For detections, the nearest ones, each taken once; two features whose images run together share
-the one detection in their middle.  For grey values and profiles, the pull of what is left of the
-density once the neighbours' share of it is taken off.
+For detections, the nearest ones, each taken once; for grey values and profiles, the pull of what is
+left of the density once the neighbours' share of it is taken off.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.density.observation import Observation
 from mixpose.density.overlap import peak
-from mixpose.records import GridPattern, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, GridPattern, PointPattern
 
 _ALIKE = 0.01  # of a height: features are told apart from a seventh of C's deviation on
 
@@ -57,25 +54,12 @@ class AssociationRules:
 
 
 class FeaturesMet(NamedTuple):
-    """What a pattern has at n predicted features.
+    """What a pattern has at n predicted features."""
 
-    Attributes
-    ----------
-    shares : (n,) float64
-        How far each feature was met, 0 to its weight.
-    offsets : (n, m) float64
-        Observed minus predicted place, sensor units; of features that run together, of their
-        middle.
-    partner : (n,) int
-        The feature that one shares its detection with; itself where it shares none.
-    detections : (n,) int
-        The detection that each was met by; -1 for none, and where the pattern has none.
-    """
-
-    shares: Floats
-    offsets: Floats
-    partner: NDArray[np.intp]
-    detections: NDArray[np.intp]
+    shares: Floats  # (n,) how far each was met, 0 to its weight
+    offsets: Floats  # (n, m) observed minus predicted place; of two that run together of the middle
+    partner: NDArray[np.intp]  # (n,) the feature that one shares its detection with, or itself
+    detections: NDArray[np.intp]  # (n,) by which each was met; -1 for none
 
     @classmethod
     def none(cls, y: Floats) -> FeaturesMet:
@@ -120,9 +104,9 @@ def features_met(
         return _residuals(y, weights, variance, sampled, amplitude, rules, unlike)
     reach = rules.reach_squared * (variance + np.broadcast_to(wide, len(y)))
     found = _nearest(observation.pattern, y, weights, reach)
-    if not rules.merged or np.count_nonzero(found.shares) == len(y):
-        return found
-    return _run_together(found, y, weights, reach)
+    if rules.merged and np.count_nonzero(found.shares) < len(y):
+        _run_together(found, y, weights, reach)
+    return found
 
 
 def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:
@@ -144,14 +128,13 @@ def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -
     return found
 
 
-def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: Floats) -> FeaturesMet:
+def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: Floats) -> None:
     """Let two features share a detection that lies nearer to their middle than to either.
 
     Images that overlap are detected as one, in the middle.  The two count as one feature that was
     met there: half of each, with the offset of their middle.
     """
-    shares, offsets, partner = found.shares.copy(), found.offsets.copy(), found.partner.copy()
-    detections = found.detections.copy()
+    shares, offsets, partner, detections = found
     single = shares > 0
     for i in np.flatnonzero(shares == 0).tolist():
         seen = np.flatnonzero(single)
@@ -170,7 +153,6 @@ def _run_together(found: FeaturesMet, y: Floats, weights: Floats, reach: Floats)
         partner[pair] = pair[::-1]
         detections[pair] = detections[pair[1]]
         single[pair[1]] = False
-    return FeaturesMet(shares, offsets, partner, detections)
 
 
 def _residuals(
@@ -188,26 +170,25 @@ def _residuals(
     amplitude of its own about `amplitude`.  What is left of the gradient once all are taken off is
     the pull on this feature alone.
     """
-    top = peak(variance, y.shape[1])
+    found, n, top = FeaturesMet.none(y), len(y), peak(variance, y.shape[1])
     away = y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
-    alone = np.arange(len(y))
     rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
     # at one place features cannot be told apart: they are taken to be alike
     widened = bells + _ALIKE * top * np.diag(weights)
-    amplitudes = amplitude + (np.linalg.solve(widened, rest) if unlike else np.zeros(len(y)))
+    amplitudes = amplitude + (np.linalg.solve(widened, rest) if unlike else np.zeros(n))
     predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
     own = amplitudes * weights * top if unlike else rest + amplitude * weights * top
-    nothing = np.full(len(y), -1)
     # what the better half of the features looks like on its own
-    full = float(np.median(np.sort(own)[len(own) // 2 :]))
+    full = float(np.median(np.sort(own)[n // 2 :]))
     if full <= 0:
-        return FeaturesMet(np.zeros(len(y)), np.zeros(y.shape), alone, nothing)
+        return found
     shares = np.clip(own / full, 0.0, 1.0)
-    shares = np.where(shares > rules.min_share, shares, 0.0) * weights
+    is_met = shares > rules.min_share
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(own, rules.min_share * full)[:, None]
-    return FeaturesMet(shares, np.where(shares[:, None] > 0, offsets, 0.0), alone, nothing)
+    found.shares[is_met], found.offsets[is_met] = (shares * weights)[is_met], offsets[is_met]
+    return found
 
 
 def crowding(points: Floats, lower: Floats, upper: Floats, smallest: float) -> Floats:

@@ -33,8 +33,8 @@ MOST_CELLS = 1_500_000
 """Grid points of a dense window; a larger one gets coarser."""
 
 MOST_SIGMAS = 4000.0
-"""Extent of features over the narrowest blur at which they are drawn: pages are 12 σ wide, and a
-plane has 400 000 of them."""
+"""Extent of features over the narrowest blur at which they are drawn: pages are 8.5 σ wide, and a
+plane has 250 000 of them."""
 
 _MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 
@@ -70,9 +70,7 @@ class Observation:
     @property
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
-        if isinstance(self.pattern, PointPattern):
-            return int(self.pattern.points.shape[1])
-        return len(self.pattern.origin)
+        return self.pattern.dimension
 
     @property
     def cell(self) -> float | None:

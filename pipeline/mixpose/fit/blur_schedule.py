@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.objective import View, project_body
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,9 @@ def blur_schedule(
     counts = np.maximum(at.seen[:, 0].sum(axis=1), 1)
     spreads = np.sqrt((variances * at.seen[:, 0]).sum(axis=1) / counts / dimensions).tolist()
     finest = [view.observation.sigma for view in views]
-    widest = [min(spread, _widest(view, rules)) for spread, view in zip(spreads, views)]
+    extents = [float(np.subtract(*view.observation.extent[::-1]).max()) for view in views]
+    each = zip(spreads, finest, extents, strict=True)
+    widest = [min(spread, max(rules.widest * extent, fine)) for spread, fine, extent in each]
     largest = max(wide / fine for wide, fine in zip(widest, finest, strict=True))
     count = max(int(np.ceil(np.log(max(largest, 1.0)) / np.log(rules.ratio))), 0)
     shares = [k / max(count, 1) for k in range(count, -1, -1)]
@@ -72,8 +71,3 @@ def blur_schedule(
         [fine * max(wide / fine, 1.0) ** share for wide, fine in zip(widest, finest)]
         for share in shares
     ]
-
-
-def _widest(view: View, rules: ScheduleRules) -> float:
-    lower, upper = view.observation.extent
-    return max(rules.widest * float((upper - lower).max()), view.observation.sigma)

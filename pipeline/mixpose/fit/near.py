@@ -21,9 +21,8 @@ from mixpose.constants import constant
 from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood, sums_of
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
-from mixpose.fit.misfitting_body import believed
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import NormalPrior, has_likelihood
+from mixpose.fit.prior import NormalPrior, believed, has_likelihood
 from mixpose.objective import (
     MatchedObjective,
     Objective,
@@ -288,16 +287,16 @@ def _to_the_noise(
 
 
 class _Met(NamedTuple):
-    """Where K features are met.
+    """Where the features are met in each sensor; without share where they are not.
 
     Attributes
     ----------
     offsets : Offsets
-    away : (K, 2) float64
+    away : (L, n, 2) float64
         The offsets themselves, in σ_ε.
-    J : (K, 2, 6) float64
+    J : (L, n, 2, 6) float64
         Of the features by the pose, in σ_ε.
-    places : list of (n, m) float64
+    places : list of (k, m) float64
         Of all features that a sensor sees, in its units.
     """
 
@@ -309,8 +308,7 @@ class _Met(NamedTuple):
     def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
         """Whether no offset is larger than noise of variances (L,) lets it be."""
         squared, shares, sensor, _, _ = self.offsets
-        clear = squared <= (errors.outlying**2 * variances)[sensor]
-        return bool((clear | (shares == 0)).all())
+        return not shares[squared > (errors.outlying**2 * variances)[sensor]].any()
 
     def moved(
         self, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
@@ -318,11 +316,10 @@ class _Met(NamedTuple):
         """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
         squared, shares, sensor, _, _ = self.offsets
         now, then = (np.exp(-0.25 * squared / one[sensor] ** 2) for one in (blurs, narrower))
-        weights, J = shares / variances[sensor], self.J[..., free]
-        pull = ((weights * (then - now))[:, None] * self.away).ravel()
-        rows = ((weights * then)[:, None, None] * J).reshape(len(pull), -1)
-        J = J.reshape(len(pull), -1)
-        gradient = pull @ J
+        weights = shares / variances[sensor]
+        J = self.J[..., free].reshape(2 * len(shares), -1)
+        gradient = (weights * (then - now)).repeat(2) * self.away.ravel() @ J
+        rows = (weights * then).repeat(2)[:, None] * J
         return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])
 
 
@@ -340,23 +337,23 @@ def _met(
     assert isinstance(ascent.last, Quadratic), "an ascent of the matched objective"
     assert ascent.last.match is not None
     at, sampled, _ = ascent.last.match
-    sensor, feature = np.nonzero(at.seen[:, 0] & (sampled[:, 0, :, 0] > 0))
-    here = sampled[sensor, 0, feature]
-    J = at.J[sensor, 0, feature] / sigmas[sensor, None, None]
-    scale = objective.variances[sensor, 0] / (here[:, 0] * sigmas[sensor])
-    away = here[:, 1:] * scale[:, None]
+    seen, C, y = at.seen[:, 0], sampled[:, 0, :, 0], at.y[:, 0]
+    J = at.J[:, 0] / sigmas[:, None, None, None]
+    is_near = C > 0
+    scale = objective.variances / (np.where(is_near, C, 1.0) * sigmas[:, None])
+    away = sampled[:, 0, :, 1:] * scale[..., None]
     if ascent.step is not None:
         away -= J @ ascent.step
-    squared = (away * away).sum(axis=1)
-    shares = np.where(squared < errors.met**2, at.weights[sensor, 0, feature], 0.0)
+    squared = (away * away).sum(axis=2)
+    is_near &= squared < errors.met**2
+    shares = at.weights[:, 0] * is_near
     dimensions = objective.projection.dimensions
-    places = [
-        y[0, seen[0], :m] for y, seen, m in zip(at.y, at.seen, dimensions.tolist(), strict=True)
-    ]
+    places = [one[of, :m] for one, of, m in zip(y, seen, dimensions.tolist(), strict=True)]
     finest = [
         view.observation.narrowest(errors.narrowest, one)
         for view, one in zip(objective.views, places, strict=True)
     ]
     least = np.minimum(np.maximum(errors.blur * beside, finest), 1.0)
-    offsets = Offsets(squared, shares, sensor, dimensions, least)
+    sensor = np.arange(len(C)).repeat(C.shape[1])
+    offsets = Offsets(squared.ravel(), shares.ravel(), sensor, dimensions, least)
     return _Met(offsets, away, J, places)

@@ -1,30 +1,34 @@
-"""The most probable pose, where it is known how far off the start may be.
+"""Grey values and profiles: the most probable pose, also of a body that does not fit.
 
-The matched objective of a sensor is ⟨g, h⟩² / ⟨h, h⟩, the energy of its density g that a pose
-explains.  Under white noise half of it over the noise of a cell is the log-likelihood, with the
-amplitude at its best.  To this the Gaussian prior of the start is added, and the sum is maximised.
-
-Under heavy noise the sum has several maxima.  They are sought from the start, from the maximum of
-the objective through the blurs, and from the points of the cubature rule of third degree, which
-has the mean and the covariance of the prior; the highest is taken.
+Under white noise half of the energy ⟨g, h⟩² / ⟨h, h⟩ that a pose explains, over the noise of a
+cell, is the log-likelihood with the amplitude at its best; the Gaussian prior of the start comes on
+top.
+Under heavy noise the sum has several maxima: they are sought from the maximum of the objective, and
+from the points of the cubature rule of third degree, which has mean and covariance of the prior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from mixpose.objective import AmplitudesObjective, MatchedObjective, Quadratic, View
-from mixpose.objective.matched import FINE_STEPS, value_error
+from mixpose.fit.misfit import MisfitRules, SensorDensity, fit_freed, misfit
+from mixpose.objective import (
+    AmplitudesObjective,
+    MatchedObjective,
+    Quadratic,
+    View,
+    matched_objective,
+)
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.rigid import perturb, twist_between
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
+from mixpose.rigid import perturb, transform, twist_between
 
 _NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
 _DRAWN = 1e-6  # of the energy: a part in a thousand of heights, which drawing may be off by
@@ -73,21 +77,11 @@ class NormalPrior:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """Log-likelihood of densities with noise in every cell.
+    """Log-likelihood of densities with noise in every cell."""
 
-    Attributes
-    ----------
-    objective : MatchedObjective
-        In nats.
-    shares : (L,) float64
-        Of each sensor's energy ⟨g, g⟩, explained by the pose: ⟨g, h⟩² / (⟨g, g⟩ ⟨h, h⟩).
-    noise : (L,) float64
-        Variance of a cell's noise times the size of a cell, per sensor.
-    """
-
-    objective: MatchedObjective
-    shares: Floats
-    noise: Floats
+    objective: MatchedObjective  # in nats
+    shares: Floats  # (L,) of each sensor's energy ⟨g, g⟩, explained by the pose
+    noise: Floats  # (L,) variance of a cell's noise times the size of a cell
 
     @property
     def is_alone(self) -> bool:
@@ -107,53 +101,32 @@ def has_likelihood(views: Sequence[View]) -> bool:
 def likelihood_at(
     objective: MatchedObjective, T_world_object: Floats, misfit: float = 1.0
 ) -> Likelihood:
-    """The log-likelihood; what is left at a pose (4, 4) is taken for noise.
+    """The log-likelihood; what an objective at σ_ε leaves at a pose (4, 4) is taken for noise.
 
-    Parameters
-    ----------
-    objective : MatchedObjective
-        At σ_ε of sensors with noise in their cells.
-    T_world_object : (4, 4) array
-    misfit : float
-        A factor on the variance of the noise: χ² per degree of freedom of a body that does not fit.
+    `misfit` is a factor on the variance of the noise: χ² per degree of freedom of a body that does
+    not fit.
     """
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
-    cells = np.array([view.observation.cells for view in objective.views])
-    noise = cell_variances(objective.energies[:, 0], shares, cells)
+    noise = cell_variances(objective.energies[:, 0], shares, _cells(objective))
     weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
 
 def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) -> Floats:
-    """Variance of a cell's noise times the size of a cell (L,), from the energy left unexplained.
-
-    Parameters
-    ----------
-    energies : (L,) array
-        ⟨g, g⟩, the integral of g² over all cells.
-    shares : (L,) array
-        Of it, explained.
-    cells : (L,) int
-        Their number.
-    """
+    """Variance of a cell's noise times its size (L,): the unexplained of energies, over cells."""
     # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
     return np.asarray(np.maximum(1 - shares, 1e-9) * energies / cells)
+
+
+def _cells(objective: MatchedObjective) -> NDArray[np.intp]:
+    return np.array([view.observation.cells for view in objective.views])
 
 
 def most_probable(
     objective: MatchedObjective, T_world_object: Floats, prior: NormalPrior, misfit: float = 1.0
 ) -> Floats:
-    """The pose (4, 4) that maximises likelihood and prior.
-
-    Parameters
-    ----------
-    objective : MatchedObjective
-        As `likelihood_at` has it, and `misfit`.
-    T_world_object : (4, 4) array
-        A maximum of the objective.
-    prior : NormalPrior
-    """
+    """The pose (4, 4) that maximises likelihood and prior, from a maximum of the objective."""
     T = T_world_object
     likelihood = likelihood_at(objective, T, misfit)
     if not likelihood.is_alone:
@@ -164,49 +137,88 @@ def most_probable(
     return _highest(likelihood_at(objective, T, misfit), prior, [T], _NATS)
 
 
-def with_amplitudes(
+def believed(
     objective: MatchedObjective,
     T_world_object: Floats,
     prior: NormalPrior,
-    spread: float,
-    believed: float,
-    misfit: float = 1.0,
-) -> tuple[Floats, Floats]:
-    """The most probable pose (4, 4) near another where features are not equally bright.
+    rules: MisfitRules = MisfitRules(),
+) -> tuple[Floats, bool]:
+    """The most probable pose, or the fit to freed features of a body that does not fit.
 
     Parameters
     ----------
     objective : MatchedObjective
-        As `likelihood_at` has it.
+        At σ_ε of sensors with noise in their cells.
     T_world_object : (4, 4) array
-        The most probable pose if they were.
+        A maximum of the objective.
     prior : NormalPrior
-    spread : float
-        Of their amplitudes, relative.
-    believed : float
-        Probability up to which what unlike amplitudes explain more is taken for noise.
-    misfit : float
-        As `likelihood_at` has it.
+    rules : MisfitRules
 
     Returns
     -------
     (4, 4) array
-        The same pose where they are equally bright.
-    (L,) array
-        Variance of a cell's noise times the size of a cell, per sensor.
+    bool
+        Whether features were freed.
+    """
+    body = objective.projection.body
+    points = body.nodes.points
+    T = most_probable(objective, T_world_object, prior)
+    T_unlike, noises = with_amplitudes(objective, T, prior, rules)
+    if not objective.projection.project(T[None]).seen.all() or len(points) != len(body):
+        return T_unlike, False
+    densities = _densities(objective, noises)
+    ratio = misfit(densities, transform(T_unlike, points), int(prior.free.sum()), rules)
+    if ratio == 1:
+        return T_unlike, False
+    sigmas = [view.observation.sigma for view in objective.views]
+    # to look for peaks everywhere
+    rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
+    starts = [T, *prior.points()]
+    T_freed = fit_freed(_densities(rough, noises), points, starts, prior.free)
+    if T_freed is not None:
+        return T_freed, True
+    # what is left at features is no noise of cells: in a body that does not fit it is as large
+    T = most_probable(objective, T, prior, ratio)
+    return with_amplitudes(objective, T, prior, rules, ratio)[0], False
+
+
+def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
+    """The densities that an objective has drawn."""
+
+    def sampled(sensor: int, y: Floats) -> Floats:
+        padded = np.zeros((len(objective.views), 1, len(y), 2))
+        padded[sensor, 0, :, : y.shape[1]] = y
+        return objective.atlas.look_up(padded)[sensor, 0, :, : 1 + y.shape[1]]
+
+    variances, views = objective.variances[:, 0].tolist(), objective.views
+    return [
+        SensorDensity(view.sensor, partial(sampled, k), v, noise, view.observation.extent)
+        for k, (view, v, noise) in enumerate(zip(views, variances, noises.tolist(), strict=True))
+    ]
+
+
+def with_amplitudes(
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    prior: NormalPrior,
+    rules: MisfitRules,
+    misfit: float = 1.0,
+) -> tuple[Floats, Floats]:
+    """The most probable pose near the one of equally bright features, and the noise (L,) of cells.
+
+    The same pose where they are equally bright; `misfit` as `likelihood_at` has it.
     """
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
-    noise = equal
-    cells = np.array([view.observation.cells for view in objective.views])
+    noise, cells = equal, _cells(objective)
     smallest = _DRAWN * objective.energies[:, 0] / cells
     for _ in range(_ROUNDS):
-        unlike = AmplitudesObjective(objective, noise, spread)
+        unlike = AmplitudesObjective(objective, noise, rules.unlike)
         noise = np.maximum(unlike.unexplained(T) / cells, smallest)
-        T = _climbed(AmplitudesObjective(objective, misfit * noise, spread), prior, T, _NATS).state
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T, _NATS).state
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
-    if gain < float(chdtri(freedom, 1 - believed)):
+    if gain < float(chdtri(freedom, 1 - rules.believed)):
         return T_world_object, equal
     return T, noise
 

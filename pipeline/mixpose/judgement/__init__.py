@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from mixpose.judgement.acceptance import (
+    APART,
     AcceptanceRules,
     Verdict,
+    contradict,
     convinces,
     decide,
     insert,
+    is_far_off,
     is_possible,
     is_sure,
 )
 from mixpose.judgement.association import Association, Matches, associate
-from mixpose.judgement.contradiction import APART, contradict, is_far_off
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,9 @@ from mixpose.density import (
     surplus,
 )
 from mixpose.objective import Match, MatchedObjective, in_image
-from mixpose.records import PointPattern
+from mixpose.records import Floats, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -141,39 +138,17 @@ class Matches:
 
     Every feature has a place, also where a sensor does not have it in view, and every sensor M
     coordinates; what is not there has no share, no Jacobian and no offset.
-
-    Attributes
-    ----------
-    dimensions : (L,) int
-        Coordinates of each sensor.
-    weights : (K, L, N) float64
-        Of the features in view; 0 of the others.
-    shares : (K, L, N) float64
-        How far each was met, 0 to its weight.
-    places : (K, L, N, M) float64
-        Where they are predicted, sensor units.
-    offsets : (K, L, N, M) float64
-        Observed minus predicted place, in σ_ε.
-    J : (K, L, N, M, 6) float64
-        Jacobian of the predicted places by the pose, in σ_ε; its first three columns are by the
-        place of the feature in the world.
-    crowd : (K, L) float64
-        Observed features per m-th power of σ_ε.
-    count : (K, L) float64
-        Number of observed features.
-    unseen : (K, L) float64
-        Sum of the weights of the features that face a sensor outside its view.
     """
 
-    dimensions: NDArray[np.intp]
-    weights: Floats
-    shares: Floats
-    places: Floats
-    offsets: Floats
-    J: Floats
-    crowd: Floats
-    count: Floats
-    unseen: Floats
+    dimensions: NDArray[np.intp]  # (L,) coordinates of each sensor
+    weights: Floats  # (K, L, N) of the features in view; 0 of the others
+    shares: Floats  # (K, L, N) how far each was met, 0 to its weight
+    places: Floats  # (K, L, N, M) where they are predicted, sensor units
+    offsets: Floats  # (K, L, N, M) observed minus predicted place, in σ_ε
+    J: Floats  # (K, L, N, M, 6) of the places by the pose, in σ_ε; first by the place in the world
+    crowd: Floats  # (K, L) observed features per m-th power of σ_ε
+    count: Floats  # (K, L) number of observed features
+    unseen: Floats  # (K, L) weight of the features that face a sensor outside its view
 
     @classmethod
     def of(cls, each: Sequence[Sequence[Association]]) -> Matches:

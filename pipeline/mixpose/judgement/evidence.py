@@ -1,32 +1,15 @@
-"""How sure it is that the body is there at all.
+"""How sure it is that the body is there at all, and not mere clutter.
 
-Either the body is there at this pose, or everything seen is clutter.  The log of the odds is a sum
-over the features in view.  Clutter is either false in one sensor alone, and then
+The log of the odds is a sum over the features in view.  With the probability of detection P_D, the
+noise s and the density ρ of observed features in a sensor, or ρ₃ of points in space that cameras
+see together, at a distance of d standard deviations by their information A,
 
-    met:      ln P_D + ln N(offset; 0, s²) − ln ρ,       missed:   ln (1 − P_D),
+    met:  ln P_D + ln N(offset; 0, s²) − ln ρ,    missed:  ln (1 − P_D),
+    met together:  − d²/2 + ½ ln det(A / 2π) − ln ρ₃;
 
-with the probability of detection P_D and the density ρ of observed features; or it is a point in
-space, a screw or another body's marker, which several cameras see where they see it.  However many
-they are, that is one coincidence.  With the information A about the point's place, and d its
-distance from the feature in standard deviations,
-
-    met together:   − d²/2 + ½ ln det(A / 2π) − ln ρ₃,
-
-and cameras that miss the feature miss such a point as well.  The density ρ₃ of points in space is
-that of the camera with the fewest detections, over a depth of the body's size.  The explanation
-that makes clutter likelier counts, feature by feature.  A feature that no sensor meets is covered,
-and counts as missed twice at most.
-
-A pose is chosen to fit, and pays for that freedom in one of two ways; the cheaper counts.
-
-* By volume: the odds are integrated over the pose by Laplace's method, + ½ ln det(2π Cov)
-  + ln p(pose).  The prior p is flat over everything that can be seen, or Student's distribution
-  around what a track predicts.
-* By count: a pose is fixed by as many features as it has coordinates (three in a camera).  These
-  fit whatever they are, so they earn nothing, and the logarithm of the number of ways to choose
-  them among what was observed is taken off.
-
-The more clutter there is, the more features must agree.
+what makes clutter likelier counts, feature by feature.  A pose was chosen to fit, and pays for it
+by volume, + ½ ln det(2π Cov) + ln p(pose), or by count: features that fix it earn nothing, and cost
+the logarithm of the ways to choose them.  See *Evidence* in `docs/method.md`.
 """
 
 from __future__ import annotations
@@ -34,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +26,7 @@ from scipy.special import gammaln
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.association import Matches
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -85,37 +67,18 @@ class DetectionModel:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a pose before its frame.
+    """What is known of a pose before its frame."""
 
-    Attributes
-    ----------
-    log_density : float
-        Logarithm of the probability density of the pose, per length and radian of each free
-        direction.
-    spread : (6,) float64
-        How uncertain each direction is; matters where the data leave one open.
-    """
-
-    log_density: float
-    spread: Floats
+    log_density: float  # of its probability, per length and radian of each free direction
+    spread: Floats  # (6,) how uncertain it is; matters where the data leave a direction open
 
 
 class Odds(NamedTuple):
-    """Evidence of K poses before they pay for having been chosen.
+    """Evidence of K poses before they pay for having been chosen, each (K,)."""
 
-    Attributes
-    ----------
-    gained : (K,) float64
-        Of the features that are met.
-    missed : (K,) float64
-        Of those that are not, and of those out of view; negative.
-    coordinates : (K,) float64
-        Number of coordinates that tell anything: three for a point in space.
-    """
-
-    gained: Floats
-    missed: Floats
-    coordinates: Floats
+    gained: Floats  # of the features that are met
+    missed: Floats  # of those that are not, and of those out of view; negative
+    coordinates: Floats  # number of them that tell anything: three for a point in space
 
 
 def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -> Prior:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import project_body
+from mixpose.records import Floats
 from mixpose.sensors import Sensor
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 def expected_covariance(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +14,9 @@ from mixpose.density import AssociationRules
 from mixpose.judgement.association import Association, Matches, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.moments import inverses
-from mixpose.judgement.noise import (
-    FrameNoise,
-    NoiseModel,
-    Residuals,
-    information_of,
-    noises_of,
-)
+from mixpose.judgement.noise import NoiseModel, Residuals, information_of, noises_of
 from mixpose.objective import MatchedObjective
-from mixpose.records import SensorReport
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, SensorReport
 
 
 @dataclass(frozen=True)
@@ -98,38 +89,17 @@ class Judged:
 
 @dataclass(frozen=True)
 class Case:
-    """A pose that is to be judged, and what was known before.
+    """A pose that is to be judged, and what was known before."""
 
-    Attributes
-    ----------
-    objective : MatchedObjective
-        At σ_ε of every sensor.
-    T_world_object : (4, 4) float64
-    before : Residuals
-        Of the frames before.
-    prior : Prior or None
-        What was known of the pose; None: nothing.
-    unmet : sequence of Association
-        Other sensors, which count as if they had met nothing.
-    """
-
-    objective: MatchedObjective
-    T_world_object: Floats
-    before: Residuals = Residuals()
-    prior: Prior | None = None
-    unmet: Sequence[Association] = ()
+    objective: MatchedObjective  # at σ_ε of every sensor
+    T_world_object: Floats  # (4, 4)
+    before: Residuals = Residuals()  # of the frames before
+    prior: Prior | None = None  # what was known of the pose; None: nothing
+    unmet: Sequence[Association] = ()  # other sensors, which count as if they had met nothing
 
 
 def judge(case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()) -> Judged:
-    """Judge a pose by the matched densities at the finest blur.
-
-    Parameters
-    ----------
-    case : Case
-    free : (6,) bool
-        Directions that were estimated.
-    rules : JudgementRules
-    """
+    """Judge a pose, estimated in free directions (6,), by matched densities at the finest blur."""
     return judge_together([case], free, rules)[0]
 
 
@@ -141,72 +111,67 @@ def judge_together(
     pairs = [
         associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
     ]
-    found = [associations for associations, _ in pairs]
-    matches = Matches.of(found)
-    noises = noises_of(found, matches, free, [one.before for one in cases], rules.noise)
+    each = [associations for associations, _ in pairs]
+    found = Matches.of(each)
+    noises = noises_of(each, found, free, [one.before for one in cases], rules.noise)
     variances = np.array([noise.variances for noise in noises])
+    evidence, bent = _evidence(cases, each, found, variances, free, rules.detection)
+    parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
+    return [
+        Judged(
+            T_world_object=case.T_world_object,
+            sensors={one.name: SensorReport(True, one.explained, one.rms) for one in own},
+            score=sum(math.sqrt(one.explained) for one in own) / len(own),
+            coverage=sum(one.coverage for one in own) / len(own),
+            measurements=sum(one.measurements for one in own),
+            covariance=noise.covariance,
+            lasting=noise.lasting,
+            log_evidence=log_odds,
+            residuals=noise.remembered,
+            associations=tuple(own),
+            value=value,
+            surplus=noise.surplus,
+            bent=apart,
+        )
+        for case, (own, value), noise, log_odds, apart in parts
+    ]
+
+
+def _evidence(
+    cases: Sequence[Case],
+    each: Sequence[Sequence[Association]],
+    found: Matches,
+    variances: Floats,
+    free: NDArray[np.bool_],
+    detection: DetectionModel,
+) -> tuple[Floats, Floats]:
+    """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
     bodies = [one.objective.projection.body for one in cases]
-    whole, widened = matches, variances
+    whole, widened = found, variances
     blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
     if any(blind):
-        whole = Matches.of([[*own, *others] for own, others in zip(found, blind, strict=True)])
+        whole = Matches.of([[*own, *others] for own, others in zip(each, blind, strict=True)])
         widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
     priors = [
-        one.prior or flat_prior(body, free, rules.detection)
+        one.prior or flat_prior(body, free, detection)
         for one, body in zip(cases, bodies, strict=True)
     ]
     sizes = np.array([2 * body.radius for body in bodies])
-    beside = whole, widened, free, priors, sizes, rules.detection
-    evidence = log_evidence(*beside, information_of(matches, variances))
-    spreads = _spreads(cases, matches.weights.shape[2])
+    beside = whole, widened, free, priors, sizes, detection
+    evidence = log_evidence(*beside, information_of(found, variances))
     bent = np.zeros((len(cases), 6, 6))
-    if spreads is not None:
+    if any(body.spread for body in bodies):
+        spreads = np.zeros((len(cases), whole.shares.shape[2], 3, 3))
+        for own, body, case in zip(spreads, bodies, cases, strict=True):
+            turned = body.node_spreads(case.T_world_object)[: len(own)]
+            own[: len(turned)] = turned
         # rigid as a rule, and bent now and then: as often the one as the other
-        information = information_of(matches, variances, spreads)
+        information = information_of(whole, widened, spreads)
         at_all = spreads.any(axis=(1, 2, 3))
         both = np.logaddexp(evidence, log_evidence(*beside, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)
-        inner = inverses(information[:, free][..., free])
-        bent[np.ix_(at_all, free, free)] = inner[at_all]
-    parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
-    return [_judged(*each) for each in parts]
-
-
-def _judged(
-    case: Case,
-    associated: tuple[list[Association], float],
-    noise: FrameNoise,
-    evidence: float,
-    bent: Floats,
-) -> Judged:
-    found, value = associated
-    count = len(found)
-    return Judged(
-        T_world_object=case.T_world_object,
-        sensors={one.name: SensorReport(True, one.explained, one.rms) for one in found},
-        score=sum(math.sqrt(one.explained) for one in found) / count,
-        coverage=sum(one.coverage for one in found) / count,
-        measurements=sum(one.measurements for one in found),
-        covariance=noise.covariance,
-        lasting=noise.lasting,
-        log_evidence=evidence,
-        residuals=noise.remembered,
-        associations=tuple(found),
-        value=value,
-        surplus=noise.surplus,
-        bent=bent,
-    )
-
-
-def _spreads(cases: Sequence[Case], most: int) -> Floats | None:
-    """Covariances (K, N, 3, 3) of the bodies' features in the world; None where all are exact."""
-    if not any(case.objective.projection.body.spread for case in cases):
-        return None
-    spreads = np.zeros((len(cases), most, 3, 3))
-    for own, case in zip(spreads, cases, strict=True):
-        turned = case.objective.projection.body.node_spreads(case.T_world_object)
-        own[: len(turned)] = turned[:most]
-    return spreads
+        bent[np.ix_(at_all, free, free)] = inverses(information[:, free][..., free])[at_all]
+    return evidence, bent
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:

@@ -1,32 +1,21 @@
 """Errors that last: fields by which the features of a sensor are off in all frames alike.
 
-A camera that was turned after its calibration, a wrong focal length or lens move the features of a
-sensor by much the same field in every frame.  Of it a pose takes most for its own; what is left
-shows a little of it in each frame, which adds up.  With the fields of all sensors as columns P, of
-sizes γ in σ_ε, and R what a pose leaves of errors, the residuals r of a frame have the information
-PᵀWRP about γ, and the vector PᵀWr.  With their sums A and v over the frames so far, slowly fading,
-and γ normal with the deviation d before,
-
-    S = (A + 1/d²)⁻¹,      γ̂ = S v.
-
-Where vᵀγ̂ is larger than chance makes it, something lasts: the second moment of γ is then γ̂γ̂ᵀ + S,
-and the covariance of a pose has what that moves it by.  What changes from frame to frame is then
-sought in r − RPγ̂.
+Of fields, columns P of sizes γ in σ_ε, the residuals r of a frame have the information PᵀWRP and
+the vector PᵀWr, with R what a pose leaves of errors.  With their fading sums A and v, and γ normal
+with the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance makes it,
+something lasts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from mixpose.constants import constant
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 @dataclass(frozen=True)
@@ -39,18 +28,6 @@ class LastingRules:
     memory: float = constant(0.99, "per frame, of what was seen before: 100 frames count")
     by_chance: float = constant(0.999, "frames that show as little where nothing lasts")
     rigs: int = constant(4, "sets of sensors that are told apart, the last ones that were seen")
-
-
-class Sizes(NamedTuple):
-    """Sizes γ̂ (q,) of fields in σ_ε, and their covariance S (q, q)."""
-
-    mean: Floats
-    covariance: Floats
-
-    @property
-    def moments(self) -> Floats:
-        """Second moments (q, q) in σ_ε²."""
-        return np.asarray(self.covariance + np.outer(self.mean, self.mean))
 
 
 @dataclass(frozen=True)
@@ -71,21 +48,18 @@ class Lasting:
     information: Floats
     vector: Floats
 
-    def after(self, before: Sequence[Lasting], rules: LastingRules) -> Lasting:
-        """What a frame says, with what the same sensors showed before it."""
+    def after(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
+        """What a frame says, with what the same sensors showed before it, then what others did."""
+        information, vector = self.information, self.vector
+        others = [one for one in before if one.names != self.names]
         for one in before:
             if one.names == self.names and len(one.vector) == len(self.vector):
-                information = rules.memory * one.information + self.information
-                return Lasting(self.names, information, rules.memory * one.vector + self.vector)
-        return self
+                information = rules.memory * one.information + information
+                vector = rules.memory * one.vector + vector
+        return (Lasting(self.names, information, vector), *others[: rules.rigs - 1])
 
-    def kept(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
-        """With what was seen by others."""
-        others = [one for one in before if one.names != self.names]
-        return (self, *others[: rules.rigs - 1])
-
-    def sizes(self, rules: LastingRules) -> Sizes | None:
-        """How large the fields are; None where there may be none."""
+    def sizes(self, rules: LastingRules) -> tuple[Floats, Floats] | None:
+        """Fields γ̂ (q,) in σ_ε and their second moments (q, q); None where there may be none."""
         if not rules.deviation:
             return None
         S = np.linalg.inv(self.information + np.eye(len(self.vector)) / rules.deviation**2)
@@ -93,4 +67,4 @@ class Lasting:
         degrees = float((S * self.information).sum())
         if self.vector @ sizes <= chdtri(max(degrees, 1.0), 1 - rules.by_chance):
             return None
-        return Sizes(sizes, np.asarray(S))
+        return sizes, np.asarray(S + np.outer(sizes, sizes))

@@ -6,15 +6,14 @@ The formulae stand in `noise`; here they are worked out for K frames at once.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.judgement.association import Association, Matches
 from mixpose.judgement.lasting import Lasting
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 LEAST = 1e-6  # degrees of freedom: less is as good as none
 _MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
@@ -22,18 +21,10 @@ _LEAST_EIGENVALUE = 1e-14  # of an information matrix of diagonal 1: float64 tel
 
 
 class Moments(NamedTuple):
-    """Sums over frames, from which the variances of independent errors and of fields follow.
+    """Sums over frames, from which the variances of independent errors and of fields follow."""
 
-    Attributes
-    ----------
-    seen : (4,) float64
-        rᵀWr and |P_kᵀWr|².
-    expected : (4, 4) float64
-        Of these, by unit variances of each kind.
-    """
-
-    seen: Floats = np.zeros(4)
-    expected: Floats = np.zeros((4, 4))
+    seen: Floats = np.zeros(4)  # rᵀWr and |P_kᵀWr|²
+    expected: Floats = np.zeros((4, 4))  # of these, by unit variances of each kind
 
     def joined(self, other: Moments, memory: float) -> Moments:
         """Add those of another frame."""
@@ -41,35 +32,16 @@ class Moments(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """What one frame shows.
-
-    Attributes
-    ----------
-    moments : Moments
-    parts : (4, k, k) float64
-        Covariances that unit variances of each kind make.
-    lasting : Lasting
-        What it says of fields that last.
-    by_fields : (k, q) float64
-        How these move the pose.
-    by_calibration : (k, K) float64
-        How calibrations do that are off by a standard deviation in one thing each.
-    rest : (R, 1 + q) float64
-        Weighted residuals, and what a pose leaves of the fields that may last.
-    fields : (R, q) float64
-        Those that change.
-    kinds : (q, 2) float64
-        Which of them are offsets, and which turn, scale and shear: 1 or 0.
-    """
+    """What one frame shows."""
 
     moments: Moments
-    parts: Floats
-    lasting: Lasting
-    by_fields: Floats
-    by_calibration: Floats
-    rest: Floats
-    fields: Floats
-    kinds: Floats
+    parts: Floats  # (4, k, k) covariances that unit variances of each kind make
+    lasting: Lasting  # what it says of fields that last
+    by_fields: Floats  # (k, q) how these move the pose
+    by_calibration: Floats  # (k, K) how calibrations do, off by a deviation in one thing each
+    rest: Floats  # (R, 1 + q) weighted residuals, and what a pose leaves of fields that may last
+    fields: Floats  # (R, q) those that change
+    kinds: Floats  # (q, 2) which of them are offsets, and which turn, scale and shear: 1 or 0
 
     def without(self, sizes: Floats) -> Moments:
         """Moments of what is left where fields of sizes (q,) are taken off."""
@@ -86,19 +58,9 @@ def frames_of(
     free: NDArray[np.bool_],
     outlying: float,
 ) -> list[Frame]:
-    """What K frames show.
+    """What K frames show, associated by frame and sensor, for noise (K, L) in σ_ε².
 
-    Parameters
-    ----------
-    each : sequence of sequence of Association
-        By frame and sensor.
-    found : Matches
-        The same.
-    variances : (K, L) array
-        Of the noise of each sensor, in σ_ε².
-    free : (6,) bool
-    outlying : float
-        Standard deviations of the noise beyond which detections are left out.
+    Detections are left out that are farther off than `outlying` standard deviations of the noise.
     """
     squared = (found.offsets * found.offsets).sum(axis=3)
     clear = squared <= outlying**2 * variances[..., None]
@@ -114,18 +76,22 @@ def frames_of(
     drawn = inverse @ (J.swapaxes(1, 2) @ fields)
     left = fields - J @ drawn
     information, vector = left.swapaxes(1, 2) @ left, (left.swapaxes(1, 2) @ r)[..., 0]
-    markers = _of_markers(_in_noise(rows[..., :3], found), J, r, left, inverse)
+    # how features move with the body, by the root mean square of those in view
+    counts = 3 * np.count_nonzero(found.weights, axis=2) @ found.dimensions
+    moved = np.sqrt((rows[..., :3] ** 2).sum(axis=(1, 2, 3, 4)) / np.maximum(counts, 1))
+    shift = rows[..., :3] / np.maximum(moved, LEAST)[:, None, None, None, None]
+    pulls = (fields.swapaxes(1, 2) @ r)[..., 0]
+    seen, expected, part = _moments(shift, J, r, left, pulls, information, kinds, inverse)
+    expected[:, 0, 0] = (shares * found.dimensions[:, None]).sum(axis=(1, 2)) - J.shape[2]
     of_fields = (drawn[:, None] * kinds.T[:, None]) @ drawn.swapaxes(1, 2)[:, None]
-    parts = np.concatenate([inverse[:, None], of_fields, markers.part[:, None]], axis=1)
-    degrees = (shares * found.dimensions[:, None]).sum(axis=(1, 2)) - J.shape[2]
-    moments = _moments(r, degrees, fields, information, kinds, markers)
+    parts = np.concatenate([inverse[:, None], of_fields, part[:, None]], axis=1)
     # the noise of the sensor that each field is of
     sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)
     information /= sizes[:, :, None] * sizes[:, None]
     names = tuple(one.name for one in each[0])
     return [
         Frame(
-            moments[k] if degrees[k] > 0 else Moments(),
+            Moments(seen[k], expected[k]) if expected[k, 0, 0] > 0 else Moments(),
             parts[k],
             Lasting(names, information[k], vector[k] / sizes[k]),
             drawn[k] / sizes[k],
@@ -159,65 +125,41 @@ def _fields(places: Floats, shares: Floats, dimensions: NDArray[np.intp]) -> tup
     return fields.reshape(frames, sensors * n * most, -1), kinds
 
 
-class _OfMarkers(NamedTuple):
-    """K_3k for each field (K, q), tr K_33 and |K_33|² (K,), |P_3ᵀWr|² (K,), and their part."""
+def _moments(
+    shift: Floats,
+    J: Floats,
+    r: Floats,
+    left: Floats,
+    pulls: Floats,
+    information: Floats,
+    kinds: Floats,
+    inverse: Floats,
+) -> tuple[Floats, Floats, Floats]:
+    """Moments seen (K, 4) and expected (K, 4, 4), but for tr R, and the markers' part (K, k, k).
 
-    by_fields: Floats
-    once: Floats
-    own: Floats
-    squares: Floats
-    part: Floats
-
-
-def _of_markers(shift: Floats, J: Floats, r: Floats, left: Floats, inverse: Floats) -> _OfMarkers:
-    """Moments of what markers are off by, of which P_3 has three columns each: one by one."""
+    Of what markers are off by, P_3 has three columns each: one by one.
+    """
     frames, sensors, n, most, _ = shift.shape
+    count, by_marker = J.shape[2], (frames, n, sensors * most, -1)
     columns = np.concatenate([J, r, shift.reshape(frames, -1, 3), left], axis=2)
-    columns = columns.reshape(frames, sensors, n, most, -1)
-    by_marker = (frames, n, sensors * most, -1)
-    columns = columns.swapaxes(1, 2).reshape(by_marker)
+    columns = columns.reshape(frames, sensors, n, most, -1).swapaxes(1, 2).reshape(by_marker)
     own = shift.swapaxes(1, 2).reshape(by_marker).swapaxes(2, 3) @ columns
-    count = J.shape[2]
     by_pose, by_rest, by_shift, by_fields = np.split(own, [count, count + 1, count + 4], axis=3)
     taken, flat = by_pose @ inverse[:, None], by_pose.reshape(frames, -1, count)
     drawn = inverse @ flat.swapaxes(1, 2)
-    spread = drawn @ flat
-    within = by_shift - 2 * taken @ by_pose.swapaxes(2, 3)
+    spread, within = drawn @ flat, by_shift - 2 * taken @ by_pose.swapaxes(2, 3)
     K = (within * by_shift).sum(axis=(1, 2, 3)) + (spread * spread.swapaxes(1, 2)).sum(axis=(1, 2))
     once = by_shift.sum(axis=1).trace(axis1=1, axis2=2) - (taken * by_pose).sum(axis=(1, 2, 3))
-    # the part is not less than nothing where a direction is hardly determined
-    part = drawn @ drawn.swapaxes(1, 2)
-    return _OfMarkers(
-        (by_fields**2).sum(axis=(1, 2)), once, K, (by_rest**2).sum(axis=(1, 2, 3)), part
-    )
-
-
-def _moments(
-    r: Floats,
-    degrees: Floats,
-    fields: Floats,
-    information: Floats,
-    kinds: Floats,
-    markers: _OfMarkers,
-) -> list[Moments]:
-    """Moments of K frames."""
-    seen, expected = np.zeros((len(r), 4)), np.zeros((len(r), 4, 4))
-    seen[:, 0], expected[:, 0, 0] = (r * r).sum(axis=(1, 2)), degrees
-    seen[:, 1:3] = (fields.swapaxes(1, 2) @ r)[..., 0] ** 2 @ kinds
-    seen[:, 3] = markers.squares
-    once = information.diagonal(axis1=1, axis2=2) @ kinds
-    expected[:, 0, 1:] = expected[:, 1:, 0] = np.column_stack([once, markers.once])
+    seen, expected = np.zeros((frames, 4)), np.zeros((frames, 4, 4))
+    seen[:, 0], seen[:, 3] = (r * r).sum(axis=(1, 2)), (by_rest**2).sum(axis=(1, 2, 3))
+    seen[:, 1:3] = pulls**2 @ kinds
+    of_fields = information.diagonal(axis1=1, axis2=2) @ kinds
+    expected[:, 0, 1:] = expected[:, 1:, 0] = np.column_stack([of_fields, once])
     expected[:, 1:3, 1:3] = kinds.T @ information**2 @ kinds
-    both = np.column_stack([markers.by_fields @ kinds, markers.own])
+    both = np.column_stack([(by_fields**2).sum(axis=(1, 2)) @ kinds, K])
     expected[:, 3, 1:] = expected[:, 1:, 3] = both
-    return [Moments(*pair) for pair in zip(seen, expected, strict=True)]
-
-
-def _in_noise(shift: Floats, found: Matches) -> Floats:
-    """How features move with the body (K, L, N, M, 3), by the root mean square in view."""
-    sizes = 3 * np.count_nonzero(found.weights, axis=2) @ found.dimensions
-    roots = np.sqrt((shift * shift).sum(axis=(1, 2, 3, 4)) / np.maximum(sizes, 1))
-    return np.asarray(shift / np.maximum(roots, LEAST)[:, None, None, None, None])
+    # the part is not less than nothing where a direction is hardly determined
+    return seen, expected, drawn @ drawn.swapaxes(1, 2)
 
 
 def _doubts(each: Sequence[Association], scale: Floats, J: Floats) -> Floats:

@@ -1,31 +1,21 @@
 """What detections err by, as residuals show it, and the covariance of a pose that follows.
 
-Offsets of the met features from their prediction are of two kinds.  What the extraction errs by is
-independent from feature to feature, with a variance s_0².  What a calibration, a clock or a lens
-errs by is alike in all features of a sensor: a field over its coordinates, an offset (s_1²) and
-what turns, scales and shears the features' image (s_2²).  What the body errs by is alike in all
-sensors: three coordinates of each marker (s_3²).  With weights W, the matrix R = 1 − J (JᵀWJ)⁻¹ JᵀW
-that a pose leaves of errors, and the fields P_1, P_2 and P_3 as columns, let
-K_jk = P_jᵀ W R P_k.  The residuals r have the expectations
+Errors are independent from feature to feature (variance s_0²), fields that all features of a sensor
+have in common: offsets (s_1²), and what turns, scales and shears (s_2²), or of a marker, alike in
+all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, fields P_k and K_jk = P_jᵀWR P_k,
 
     rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
-(C. R. Henderson's method of moments).  Their sums over the frames so far, fading, give the four
-variances, in units of each sensor's noise.  Most of a field a pose takes for its own; the
-covariance has it back:
-
-    s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹,         A = JᵀWJ.
-
-With ν degrees of freedom the estimate itself is uncertain: the covariance is enlarged so that its
-95 % ellipsoid is that of the F distribution with (d, ν) degrees, d directions being free.  For
-many degrees of freedom nothing is added.
+is expected of residuals r (C. R. Henderson's method of moments), and the covariance of a pose is
+s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as the F distribution says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeAlias
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +27,7 @@ from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, poole
 from mixpose.judgement.association import Association, Matches
 from mixpose.judgement.lasting import Lasting, LastingRules
 from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 _LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
 
@@ -99,35 +88,17 @@ class Residuals:
     @property
     def total(self) -> Noise:
         """Noise of all sensors."""
-        total = Noise()
-        for one in self.noise.values():
-            total = total.joined(one)
-        return total
+        return reduce(Noise.joined, self.noise.values(), Noise())
 
 
-@dataclass(frozen=True)
-class FrameNoise:
-    """The noise that a frame goes by.
+class FrameNoise(NamedTuple):
+    """The noise that a frame goes by."""
 
-    Attributes
-    ----------
-    variances : (L,) float64
-        Of each sensor, in σ_ε²; the typical one counts, too.
-    covariance : (6, 6) float64
-        Zero where the pose is not free.
-    lasting : (6, 6) float64
-        Of it, what lasts from frame to frame and leaves velocities alone.
-    remembered : Residuals
-        For the next frame.
-    surplus : float
-        How many times larger residuals are than those before them let chance make them.
-    """
-
-    variances: Floats
-    covariance: Floats
-    lasting: Floats
-    remembered: Residuals
-    surplus: float
+    variances: Floats  # (L,) of each sensor, in σ_ε²; the typical one counts, too
+    covariance: Floats  # (6, 6) zero where the pose is not free
+    lasting: Floats  # (6, 6) of it, what lasts from frame to frame and leaves velocities alone
+    remembered: Residuals  # for the next frame
+    surplus: float  # how many times larger residuals are than those before let chance make them
 
 
 def noises_of(
@@ -187,8 +158,8 @@ def _frame_noise(
     model: NoiseModel,
 ) -> FrameNoise:
     lasting = frame.lasting.after(before.lasting, model.fields)
-    sizes = lasting.sizes(model.fields)
-    own = frame.moments if sizes is None else frame.without(sizes.mean)
+    sizes = lasting[0].sizes(model.fields)
+    own = frame.moments if sizes is None else frame.without(sizes[0])
     moments = before.moments.joined(own, model.memory)
     met = float(np.mean([one.met for one in associations]))
     variances, of_fields = _shares(moments, own, met, model)
@@ -198,12 +169,11 @@ def _frame_noise(
     inner += frame.by_calibration @ frame.by_calibration.T
     covariance, steady = np.zeros((2, 6, 6))
     if sizes is not None:
-        steady[np.ix_(free, free)] = frame.by_fields @ sizes.moments @ frame.by_fields.T
+        steady[np.ix_(free, free)] = frame.by_fields @ sizes[1] @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
     covariance += steady
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
-    kept = lasting.kept(before.lasting, model.fields)
-    remembered = Residuals({**before.noise, **noise}, moments, kept)
+    remembered = Residuals({**before.noise, **noise}, moments, lasting)
     return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
 
 

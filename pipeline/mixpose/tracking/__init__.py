@@ -7,9 +7,8 @@ from mixpose.tracking.delays import UNKNOWN_S
 from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
 from mixpose.tracking.proposers.stepped_aside import ASIDE
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.single_frame import estimate_pose
 from mixpose.tracking.track import Prediction, Track, predict
-from mixpose.tracking.tracker import Tracker
+from mixpose.tracking.tracker import Tracker, estimate_pose
 
 __all__ = [
     "ASIDE",

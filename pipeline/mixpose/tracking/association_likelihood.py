@@ -186,7 +186,7 @@ class AssociationLikelihood:
 
     @property
     def knows_detections(self) -> bool:
-        """As `Likelihood` has it."""
+        """Whether each feature's detection is known, so that one may be left out."""
         return False
 
     @cached_property

@@ -8,17 +8,13 @@ How often they part company nobody knows: what the body's own track expects coun
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.judgement import Prior, nearest_alike
-from mixpose.rigid import inverse, perturb, twist_between
+from mixpose.rigid import Floats, inverse, perturb, twist_between
 from mixpose.tracking.motion import MotionRules
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -52,23 +48,17 @@ class Companion:
         squares = before.squares + (away**2 * (1 - 1 / n) - before.squares) / n
         return cls(perturb(before.T_other_object, away / n), squares, n)
 
-    def variances(self, body: Body, rules: MotionRules) -> Floats:
-        """Of the next pose about the mean (6,), in the axes of the other body.
-
-        What is guessed before anything is known counts as some frames.
-        """
-        turn = np.radians(rules.unknown_rotation_deg)
-        guess = np.repeat([rules.unknown_distance * body.radius, turn], 3) ** 2
-        n, few = self.count, rules.known_from
-        spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
-        return np.asarray(np.maximum(spread, rules.steady(body) ** 2))
-
     def expected(
         self, T_world_other: Floats, body: Body, rules: MotionRules
     ) -> tuple[Floats, Floats]:
-        """Where the body is expected beside the other one, and standard deviations (6,) of that."""
-        turned = T_world_other[:3, :3] ** 2
-        wide = self.variances(body, rules).reshape(2, 3) @ turned.T
+        """Where the body is expected beside the other one, and standard deviations (6,) of that.
+
+        What is guessed before anything is known counts as some frames.
+        """
+        n, few, guess = self.count, rules.known_from, rules.guess(body) ** 2
+        spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
+        variances = np.maximum(spread, rules.steady(body) ** 2)
+        wide = variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2
         return T_world_other @ self.T_other_object, np.sqrt(wide.ravel())
 
 

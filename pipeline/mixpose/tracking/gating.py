@@ -23,7 +23,6 @@ from mixpose.records import PointPattern
 from mixpose.sensors import Sensor
 from mixpose.tracking.track import Prediction, SensorTally
 
-Floats: TypeAlias = NDArray[np.float64]
 Box: TypeAlias = tuple[int, int, int, int]
 Tallies: TypeAlias = Mapping[str, SensorTally]
 
@@ -76,29 +75,22 @@ class Expectation:
         and the features' images, but at least 40 px, around them.  Cameras that will not see the
         body have none; a body of one feature, whose size in the image nothing tells, neither.
         """
-        if self._projection is None or not np.isfinite(self._feature_reach):
+        if self._projection is None or not predictions or not np.isfinite(self._feature_reach):
             return {}
-        boxes: dict[str, Box] = {}
-        for prediction in predictions:
-            at = self._projection.project(prediction.T_world_object[None])
-            y, J, seen = at.y[:, 0], at.J[:, 0], at.seen[:, 0, :, None]
-            variances = (prediction.uncertainty * self._free) ** 2
-            by_shift = J[..., :3]
-            scales = np.sqrt(np.einsum("lnij,lnij->ln", by_shift, by_shift).max(axis=1))
-            margins = self._rules.reach * np.sqrt(J**2 @ variances)
-            margins += np.maximum(scales * self._feature_reach, self._rules.min_margin_px)[
-                :, None, None
-            ]
-            lower = np.where(seen, y - margins, np.inf).min(axis=1).tolist()
-            upper = np.where(seen, y + margins, -np.inf).max(axis=1).tolist()
-            for name, low, high in zip(self.names, lower, upper, strict=True):
-                if low[0] > high[0]:
-                    continue
-                u0, v0 = (math.floor(end) for end in low)
-                u1, v1 = (math.ceil(end) + 1 for end in high)
-                a, b, c, d = boxes.get(name, (u0, v0, u1, v1))
-                boxes[name] = (min(a, u0), min(b, v0), max(c, u1), max(d, v1))
-        return boxes
+        at = self._projection.project(np.array([one.T_world_object for one in predictions]))
+        uncertainty = np.array([one.uncertainty for one in predictions])
+        by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self._free) ** 2)
+        scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
+        rims = np.maximum(scales * self._feature_reach, self._rules.min_margin_px)
+        margins = self._rules.reach * np.sqrt(by_pose) + rims[..., None, None]
+        seen = at.seen[..., None]
+        lower = np.where(seen, at.y - margins, np.inf).min(axis=(1, 2)).tolist()
+        upper = np.where(seen, at.y + margins, -np.inf).max(axis=(1, 2)).tolist()
+        return {
+            name: (math.floor(u0), math.floor(v0), math.ceil(u1) + 1, math.ceil(v1) + 1)
+            for name, (u0, v0), (u1, v1) in zip(self.names, lower, upper, strict=True)
+            if u0 <= u1
+        }
 
 
 def is_convincing(tallies: Tallies, cameras: Sequence[str], share: float) -> bool:

@@ -27,7 +27,7 @@ from mixpose.judgement.moments import inverses
 from mixpose.objective import View
 from mixpose.rigid import Floats, perturb
 from mixpose.sensors import Motion, moments
-from mixpose.tracking.course import Expected
+from mixpose.tracking.motion import Expected
 
 if TYPE_CHECKING:
     from mixpose.tracking.likelihood import FrameData

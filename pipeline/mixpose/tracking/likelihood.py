@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,9 @@ from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.association_likelihood import AssociationLikelihood, are_associated
 from mixpose.tracking.companion import either
-from mixpose.tracking.course import Expected, unknown
 from mixpose.tracking.delays import is_timed
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
+from mixpose.tracking.motion import Expected, unknown
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
 
@@ -69,23 +69,6 @@ class Start:
     blur: float = 1.0
 
 
-class Likelihood(Protocol):
-    """What one frame says of a pose."""
-
-    @property
-    def knows_detections(self) -> bool:
-        """Whether each feature's detection is known, so that one may be left out."""
-        ...
-
-    def fit(self, start: Start) -> Fit:
-        """Climb to the most likely pose near a start."""
-        ...
-
-    def judge(self, fit: Fit, start: Start) -> Judged:
-        """Judge a pose that was climbed to from a start."""
-        ...
-
-
 @dataclass
 class SearchLog:
     """What the search of a frame cost, and where it goes on in the next."""
@@ -101,16 +84,13 @@ class Begun(NamedTuple):
     ----------
     objective : MatchedObjective
         At σ_ε.
-    ascent : Ascent or None
-        On it; None if it leads nowhere.
     fit : Fit or None
-        That it led to, where it was climbed with others'.
+        That this was climbed to with others'.
     judged : Judged or None
         The pose of that fit.
     """
 
     objective: MatchedObjective
-    ascent: Ascent[Floats] | None = None
     fit: Fit | None = None
     judged: Judged | None = None
 
@@ -119,11 +99,10 @@ class Begun(NamedTuple):
 class FrameData:
     """A frame, and what is known before it.
 
-    `log` is written by the proposer that searches.  `elapsed` is the time since the last pose,
-    seconds, None where it is not known.  Where views see the body in motion as of the common time,
-    `still` is the frame with the sensors as they stand.
-    `begun` is the climb from the first prediction, where several bodies were fitted together.
-    `beside` is where another body lets it expect that was not seen where it was expected.
+    `log` is written by the proposer that searches.  Where views see the body in motion as of the
+    common time, `still` is the frame with the sensors as they stand.  `begun` is the climb from the
+    first prediction, where several bodies were fitted together.  `beside` is where another body
+    lets it expect that was not seen where it was expected.
     """
 
     views: Sequence[View]
@@ -135,11 +114,10 @@ class FrameData:
     T_reference: Floats | None
     start_uncertainty: Floats
     rules: Rules
+    frame: int
+    time_s: float | None
     begun: Begun | None = None
     log: SearchLog = field(default_factory=SearchLog)
-    elapsed: float | None = None
-    frame: int = 0
-    time_s: float | None = None
     still: FrameData | None = None
     beside: Prediction | None = None
 
@@ -147,6 +125,11 @@ class FrameData:
     def free(self) -> NDArray[np.bool_]:
         """Directions that are estimated."""
         return free_mask(self.options)
+
+    @property
+    def elapsed(self) -> float | None:
+        """Seconds since the last pose, where they are known."""
+        return self.track.seconds_until(self.time_s)
 
     @cached_property
     def noise(self) -> list[Noise]:
@@ -208,7 +191,7 @@ class FrameData:
     def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
         """The velocity that the frames before let expect of a pose, or near it."""
         elapsed, rules = self.elapsed, self.rules.course
-        nothing = unknown(self.body.radius, rules)
+        nothing = unknown(self.body, rules)
         branch = nearest_branch(self.track, T_world_object, self.body)
         if branch is None or not elapsed:
             return nothing
@@ -247,20 +230,18 @@ class MatchedLikelihood:
 
     @property
     def knows_detections(self) -> bool:
-        """As `Likelihood` has it."""
+        """Whether each feature's detection is known, so that one may be left out."""
         return self.data.options.objective == "matched"
 
-    def fit(self, start: Start) -> Fit:
-        """Ascend the session's objective through narrowing blurs."""
+    def fit(self, start: Start, begun: Ascent[Floats] | None = None) -> Fit:
+        """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
         data, uncertainty = self.data.without(start.left_out), start.uncertainty
         climbed = self.climbed.setdefault(frozenset(start.left_out), [])
-        timed, begun = is_timed(data.views), None
-        if data.begun and data.predictions and start.prediction is data.predictions[0]:
-            begun = data.begun.ascent
-            if data.begun.fit is not None:
-                return data.begun.fit
+        timed = is_timed(data.views)
+        if data.begun and data.begun.fit and start.prediction is data.predictions[0]:
+            return data.begun.fit
         given = data.given(start.T_world_object) if self.knows_detections else 0.0
 
         def climb(seen: FrameData, T_start: Floats, beside: float = 0.0) -> Fit:
@@ -303,17 +284,16 @@ class MatchedLikelihood:
         prior = data.prior(T if start.T_moved is None else start.T_moved)
         case = Case(data.finest, T, data.track.residuals, prior, others)
         judged = judge(case, data.free, data.rules.judgement)
-        reports = {
-            one.name: SensorReport(False, one.explained, one.rms, start.left_out[one.name])
-            for one in others
-        }
         if motion is not None:
             judged = with_motion_unknown(judged, data, motion)
-        return replace(
-            judged,
-            sensors=judged.sensors | reports,
-            associations=(*judged.associations, *others),
-        )
+        sensors = dict(judged.sensors)
+        for one in others:
+            why = start.left_out[one.name]
+            sensors[one.name] = SensorReport(False, one.explained, one.rms, why)
+        return replace(judged, sensors=sensors, associations=(*judged.associations, *others))
+
+
+Likelihood: TypeAlias = MatchedLikelihood | AssociationLikelihood
 
 
 def likelihood_of(data: FrameData) -> Likelihood:

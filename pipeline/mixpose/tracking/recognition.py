@@ -1,35 +1,42 @@
-"""Whether a body was told from things that have markers alike.
+"""Whether it is the body that was seen, or what has markers alike: another thing, a mirror image.
 
 Three markers in space are met by every thing that has three in the same places.  A body of more,
-alone in its session, is known once others of it are met, and stays so while it is followed.
+alone in its session, is known once others of it are met, and stays so while it is followed.  To one
+camera another thing may look like the body by chance.  As it moves as one, it does so for several
+frames, and what the track expects then tells nothing.
 
-To one camera another thing may look like the body by chance.  As it moves as one, it does so for
-several frames, and what the track expects then tells nothing.
+In a window or a polished floor, or where a body is given mirrored, there is its mirror image.  Any
+three markers of that lie as three of the body do, a fourth and a fifth may by chance, and markers
+that are nearly in a plane all do.  So where features are missed, and detections about the body
+belong to none, its mirror image is a rival: reflected in the plane nearest to the features met,
+which it leaves where they are.  Where few are met, it is looked for everywhere, in the first
+frames.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from functools import lru_cache
 
-from mixpose.judgement import Judged
-from mixpose.tracking.likelihood import FrameData
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.judgement import Judged, is_far_off
+from mixpose.tracking.likelihood import FrameData, SearchLog, Start, likelihood_of
+from mixpose.tracking.proposers.searched import candidates_of, starts_at
+from mixpose.tracking.track import Track
 
 TRIANGLE = "three markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
+MIRRORED = "it shows the body's mirror image"
 
 _CORNERS = 3
+_FLAT = 1e-6  # thickness by length, below which no camera tells one side's markers from the other's
 
 
 def is_alone(data: FrameData, judged: Judged, sensors: int) -> bool:
-    """Whether one of several sensors meets a body that no frame was sure of, as this one is not.
-
-    Parameters
-    ----------
-    data : FrameData
-    judged : Judged
-    sensors : int
-        With a frame, also those that saw nothing.
-    """
+    """Whether one of some sensors with a frame meets a body that none was sure of, as this."""
     lonely = sensors > 1 and sum(one.met > 0 for one in judged.associations) == 1
     return lonely and is_from_doubt(data, judged)
 
@@ -46,13 +53,83 @@ def is_known(data: FrameData, judged: Judged) -> bool:
     """Whether a pose is the body's, by what it meets or by where it was expected."""
     if any(one.J.shape[1] == 1 for one in judged.associations):
         return True  # ranges are no markers in space
-    sensors = np.zeros(len(data.body.nodes.points))
-    for one in judged.associations:
-        sensors[one.features[one.shares > 0]] += 1
-    others = np.sort(sensors)[:-_CORNERS]
+    others = np.sort(_met(judged, data.body))[:-_CORNERS]
     # one sensor of several may meet a marker by chance
     if not len(others) or others.sum() >= max(len(data.views) / 2, 1):
         return True
     if not data.track.known or data.track.misses:
         return False
     return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())
+
+
+def is_reflection(data: FrameData, judged: Judged) -> bool:
+    """Whether the frame shows the body's mirror image rather than the body."""
+    if not data.body.is_exact or not judged.associations or _is_flat(data.body):
+        return False
+    ahead, met = data.rules.acceptance.standing_out, _met(judged, data.body)
+    # of these the mirror image may meet more than the body
+    if sum(min(one.missed, one.surplus) for one in judged.associations) > 0.5:
+        close = data.start_uncertainty / data.rules.proposals.narrowing**2
+        # one camera alone may have met a feature by chance
+        sharp = met >= min(2, met.max())
+        flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
+        near = replace(data, body=flat, begun=None)
+        if _evidence(near, Start(judged.T_world_object, close)) > judged.log_evidence + ahead:
+            return True
+    if not _is_by_chance(data, judged):
+        return False
+    # wherever it is found, and nothing known of either
+    track = Track(residuals=data.track.residuals)
+    # what explains more than this pose is met by the first guesses already
+    options = replace(data.options, search="live")
+    nothing = replace(data, predictions=(), beside=None, begun=None)
+    alone = replace(nothing, track=track, log=SearchLog(), options=options)
+    own = _evidence(alone, Start(judged.T_world_object))
+    mirror = replace(alone, body=_reflected(data.body, met >= 0))
+    least = own - data.rules.search.outdone
+    found = [one for one in candidates_of(mirror) if one.evidence > least]
+    starts = starts_at(mirror, found)
+    return any(_evidence(mirror, start) > own + ahead for start in starts)
+
+
+@lru_cache(maxsize=16)
+def _is_flat(body: Body) -> bool:
+    """Whether a turn brings the body onto its mirror image."""
+    extents = np.linalg.svd(body.means - body.means.mean(axis=0), compute_uv=False)
+    return len(extents) < 3 or bool(extents[2] < _FLAT * extents[0])
+
+
+def _is_by_chance(data: FrameData, judged: Judged) -> bool:
+    """Whether features may be met by chance: few, others missed or these far off, early on."""
+    rules, seen = data.rules, judged.associations
+    if judged.measurements - 6 > rules.proposals.by_chance:
+        return False
+    if data.track.believed >= rules.proposals.believed or any(one.J.shape[1] != 2 for one in seen):
+        return False
+    before, noise = data.track.residuals.total, rules.judgement.noise
+    return any(one.missed > 0.5 for one in seen) or is_far_off(
+        seen, before, rules.acceptance, noise
+    )
+
+
+def _evidence(data: FrameData, start: Start) -> float:
+    likelihood = likelihood_of(data)
+    return likelihood.judge(likelihood.fit(start), start).log_evidence
+
+
+def _met(judged: Judged, body: Body) -> NDArray[np.intp]:
+    """By how many sensors each node of a body was met (N,)."""
+    found = [one.features[one.shares > 0] for one in judged.associations]
+    return np.bincount(np.concatenate(found), minlength=len(body.nodes.points))
+
+
+def _reflected(body: Body, near: NDArray[np.bool_]) -> Body:
+    """The body reflected in the plane nearest to some of its features."""
+    points = body.means
+    centre = points[near].mean(axis=0)
+    normal = np.linalg.svd(points[near] - centre)[2][-1]
+    mirrored = points - 2 * ((points - centre) @ normal)[:, None] * normal
+    outward = body.normals
+    if outward is not None:
+        outward = outward - 2 * (outward @ normal)[:, None] * normal
+    return Body(body.name, tuple(PointFeature(one) for one in mirrored), outward)

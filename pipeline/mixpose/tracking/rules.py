@@ -9,8 +9,7 @@ from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.association_likelihood import RangeRules
-from mixpose.tracking.course import CourseRules
-from mixpose.tracking.motion import MotionRules
+from mixpose.tracking.motion import CourseRules, MotionRules
 from mixpose.tracking.static_clutter import StaticRules
 
 

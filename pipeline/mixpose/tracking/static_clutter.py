@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +16,7 @@ from scipy.spatial import cKDTree
 from mixpose.constants import constant
 from mixpose.objective import View
 from mixpose.records import PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.rigid import Floats
 
 
 @dataclass(frozen=True)
@@ -38,23 +36,20 @@ class StaticClutter:
 
     Attributes
     ----------
-    places : mapping of str to (K, m) float64
-        By sensor.
-    counts : mapping of str to (K,) int
+    places : mapping of str to ((K, m) float64, (K,) int)
+        By sensor, with their counts.
     """
 
-    places: Mapping[str, Floats] = field(default_factory=dict)
-    counts: Mapping[str, NDArray[np.intp]] = field(default_factory=dict)
+    places: Mapping[str, tuple[Floats, NDArray[np.intp]]] = field(default_factory=dict)
 
     def learnt(self, views: Sequence[View], rules: StaticRules) -> StaticClutter:
         """What is remembered after one more frame without the body."""
-        places, counts = dict(self.places), dict(self.counts)
+        places = dict(self.places)
         for view in views:
             pattern = view.observation.pattern
             if not isinstance(pattern, PointPattern):
                 continue
-            old = places.get(view.name, pattern.points[:0])
-            count = counts.get(view.name, np.zeros(0, dtype=np.intp))
+            old, count = places.get(view.name, (pattern.points[:0], np.zeros(0, dtype=np.intp)))
             near = _nearest(old, pattern.points, rules.same * view.observation.sigma)
             met = np.isin(np.arange(len(old)), near)
             count = np.minimum(count + np.where(met, 1, -1), 2 * rules.frames)
@@ -63,24 +58,24 @@ class StaticClutter:
             count = np.concatenate([count, np.ones(len(fresh), dtype=np.intp)])
             kept = np.argsort(-count, kind="stable")[: rules.most]
             kept = kept[count[kept] > 0]
-            places[view.name], counts[view.name] = joined[kept], count[kept]
-        return StaticClutter(places, counts)
+            places[view.name] = joined[kept], count[kept]
+        return StaticClutter(places)
 
     def without(self, views: Sequence[View], rules: StaticRules) -> list[View]:
         """The views without static detections."""
-        return [self._moving(view, rules) for view in views]
-
-    def _moving(self, view: View, rules: StaticRules) -> View:
-        pattern = view.observation.pattern
-        if not isinstance(pattern, PointPattern) or view.name not in self.places:
-            return view
-        static = self.places[view.name][self.counts[view.name] >= rules.frames]
-        near = _nearest(static, pattern.points, rules.same * view.observation.sigma)
-        moving = near == len(static)
-        if moving.all():
-            return view
-        rest = PointPattern(pattern.points[moving], pattern.weights[moving])
-        return replace(view, observation=replace(view.observation, pattern=rest))
+        moving = list(views)
+        for k, view in enumerate(views):
+            pattern = view.observation.pattern
+            if not isinstance(pattern, PointPattern) or view.name not in self.places:
+                continue
+            places, counts = self.places[view.name]
+            static = places[counts >= rules.frames]
+            near = _nearest(static, pattern.points, rules.same * view.observation.sigma)
+            alone = near == len(static)
+            if not alone.all():
+                rest = PointPattern(pattern.points[alone], pattern.weights[alone])
+                moving[k] = replace(view, observation=replace(view.observation, pattern=rest))
+        return moving
 
 
 def _nearest(places: Floats, points: Floats, reach: float) -> NDArray[np.intp]:

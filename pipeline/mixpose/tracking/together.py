@@ -13,7 +13,7 @@ from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Sta
 
 
 def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
-    """The frames of several bodies with what is climbed from their first predictions.
+    """The frames of several bodies with what is climbed from their first predictions, and judged.
 
     Parameters
     ----------
@@ -23,44 +23,35 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
         Of all that these sensors see.
     """
     begun = [
-        Begun(matched_objective(one.views, one.body, one.sigmas, shared=shared)) for one in frames
-    ]
-    some = [k for k, one in enumerate(frames) if _is_climbed(one)]
-    if len(some) > 1:
-        ascents = fit_together(
-            [begun[k].objective for k in some],
-            [frames[k].predictions[0].T_world_object for k in some],
-            frames[some[0]].free,
-            frames[some[0]].rules.fit,
+        one
+        if is_timed(one.views)
+        else replace(
+            one, begun=Begun(matched_objective(one.views, one.body, one.sigmas, shared=shared))
         )
-        for k, ascent in zip(some, ascents, strict=True):
-            begun[k] = begun[k]._replace(ascent=ascent)
-    together = [
-        one if is_timed(one.views) else replace(one, begun=each)
-        for one, each in zip(frames, begun, strict=True)
+        for one in frames
     ]
-    return _judged(together, [k for k in some if begun[k].ascent is not None])
-
-
-def _judged(frames: list[FrameData], some: Sequence[int]) -> list[FrameData]:
-    """The frames, and of some of them the pose that the first prediction leads to, judged."""
+    some = [k for k, one in enumerate(begun) if _is_climbed(one)]
     if len(some) < 2:
-        return frames
-    cases, fits = [], []
-    for k in some:
-        data, first = frames[k], frames[k].predictions[0]
-        start = Start(first.T_world_object, first.uncertainty, first)
-        fits.append(MatchedLikelihood(data).fit(start))
-        T = nearest_alike(fits[-1].T_world_object, data.body, data.T_reference)
-        cases.append(Case(data.finest, T, data.track.residuals, data.prior(T)))
-    data = frames[some[0]]
-    judged = judge_together(cases, data.free, data.rules.judgement)
-    found = list(frames)
-    for k, fit, one in zip(some, fits, judged, strict=True):
-        begun = frames[k].begun
-        assert begun is not None
-        found[k] = replace(frames[k], begun=begun._replace(fit=fit, judged=one))
-    return found
+        return begun
+    first = begun[some[0]]
+    ascents = fit_together(
+        [begun[k].finest for k in some],
+        [begun[k].predictions[0].T_world_object for k in some],
+        first.free,
+        first.rules.fit,
+    )
+    fits, cases = {}, []
+    for k, ascent in zip(some, ascents, strict=True):
+        if ascent is not None:
+            data, expected = begun[k], begun[k].predictions[0]
+            start = Start(expected.T_world_object, expected.uncertainty, expected)
+            fits[k] = MatchedLikelihood(data).fit(start, ascent)
+            T = nearest_alike(fits[k].T_world_object, data.body, data.T_reference)
+            cases.append(Case(data.finest, T, data.track.residuals, data.prior(T)))
+    judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
+    for (k, fit), one in zip(fits.items(), judged, strict=True):
+        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, one))
+    return begun
 
 
 def _is_climbed(data: FrameData) -> bool:

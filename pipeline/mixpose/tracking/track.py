@@ -15,9 +15,8 @@ from mixpose.judgement import Prior, Residuals, nearest_alike
 from mixpose.rigid import Floats, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.companion import Companion
-from mixpose.tracking.course import Course, CourseRules
 from mixpose.tracking.delays import DelayEvidence
-from mixpose.tracking.motion import MotionRules, RandomWalk
+from mixpose.tracking.motion import Course, CourseRules, MotionRules, RandomWalk
 from mixpose.tracking.static_clutter import StaticClutter
 
 
@@ -109,6 +108,10 @@ class Track:
     known: bool = False
     clutter: StaticClutter = StaticClutter()
     companions: Mapping[str, Companion] = field(default_factory=dict)
+
+    def seconds_until(self, time_s: float | None) -> float | None:
+        """Seconds since the last pose; None where either has no time."""
+        return None if time_s is None or self.time_s is None else time_s - self.time_s
 
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
@@ -249,7 +252,7 @@ def follow(
             if deviation is not None and before and elapsed <= course_rules.longest_s:
                 course = before.followed(moved, deviation, elapsed, course_rules)
         if deviation is not None:
-            course = course or Course.begun(deviation, body.radius, course_rules)
+            course = course or Course.begun(deviation, body, course_rules)
         branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
     return replace(
         track,
@@ -264,9 +267,8 @@ def follow(
 
 def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
     """Time since the last pose: seconds where both frames have times, else frames."""
-    if time_s is not None and track.time_s is not None:
-        return time_s - track.time_s
-    return float(frame - (track.frame or 0))
+    seconds = track.seconds_until(time_s)
+    return float(frame - (track.frame or 0)) if seconds is None else seconds
 
 
 def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:

@@ -7,6 +7,7 @@ everywhere else, and invents nothing.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,13 +20,21 @@ from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert, is_sure
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
-from mixpose.rigid import Floats
+from mixpose.rigid import Floats, is_rigid
+from mixpose.threads import one_blas_thread
 from mixpose.tracking.delays import is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
+from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.proposers.stepped_aside import ASIDE, is_a_step
-from mixpose.tracking.recognition import ALONE, TRIANGLE, is_alone, is_known
-from mixpose.tracking.reflection import MIRRORED, is_reflection
+from mixpose.tracking.recognition import (
+    ALONE,
+    MIRRORED,
+    TRIANGLE,
+    is_alone,
+    is_known,
+    is_reflection,
+)
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
@@ -82,7 +91,8 @@ class Tracker:
             Half-widths of where to look around the start; None: 5° and a tenth of the radius.
         rules : Rules
         """
-        start = rules.motion.start(body)
+        motion = rules.motion
+        start = per_kind(body, motion.start_distance, motion.start_rotation_deg)
         if distance is not None:
             start[:3] = distance
         if rotation_deg is not None:
@@ -196,14 +206,9 @@ class Tracker:
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
             start = Start(one.T_world_object, close, left_out=left_out)
-            judged = likelihood.judge(likelihood.fit(start), start)
-            found.append(replace(judged, proposer=one.proposer))
-        if not fitted:
-            return sorted(found, key=lambda one: -one.log_evidence)
-        distinct: list[Judged] = []
-        for one in found:
-            insert(distinct, one, self.body, self.free, self.rules.acceptance)
-        return distinct
+            judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=one.proposer)
+            insert(found, judged, self.body, self.free, self.rules.acceptance)
+        return found
 
     def estimate(
         self, data: FrameData, views: Sequence[View], verdict: Verdict, ranked: Sequence[Judged]
@@ -276,10 +281,7 @@ class Tracker:
         """A frame, and what is known before it; arguments as of `advance`."""
         views = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
-        elapsed = None
-        if time_s is not None and track.time_s is not None:
-            elapsed = time_s - track.time_s
-        views = track.delays.applied(views, time_s, elapsed)
+        views = track.delays.applied(views, time_s, track.seconds_until(time_s))
         data = FrameData(
             views=views,
             body=self.body,
@@ -290,7 +292,6 @@ class Tracker:
             T_reference=predictions[0].T_world_object if predictions else self.T_start,
             start_uncertainty=self.start_uncertainty,
             rules=self.rules,
-            elapsed=elapsed,
             frame=frame,
             time_s=time_s,
         )
@@ -318,3 +319,50 @@ def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
         body.labels[i]: length if met else None
         for i, met, length in zip(offsets.features, offsets.met, lengths, strict=True)
     }
+
+
+def estimate_pose(
+    views: Sequence[View],
+    model: Body,
+    start: Floats | None = None,
+    options: EstimatorOptions | None = None,
+) -> Estimate:
+    """Estimate one pose.
+
+    Parameters
+    ----------
+    views : sequence of View
+        Sensors with what they observed.
+    model : Body
+    start : (4, 4) array or None
+        T_world_object near the pose; without it the pose is searched for everywhere.
+    options : EstimatorOptions or None
+
+    Returns
+    -------
+    Estimate
+        Of frame 0.
+
+    Raises
+    ------
+    ValueError
+        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
+    """
+    _check(views, start)
+    tracker = Tracker.create(model, options or EstimatorOptions(), start)
+    began = time.perf_counter()
+    with one_blas_thread():
+        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def _check(views: Sequence[View], start: Floats | None) -> None:
+    """Refuse arrays that cannot be meant, before they go astray in the search."""
+    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
+        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
+    for view in views:
+        found, allowed = view.observation.dimension, view.sensor.dimension
+        if found != allowed:
+            raise ValueError(
+                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
+            )

@@ -1,0 +1,148 @@
+"""The planes of sensors, divided into pages that are drawn when they are looked up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.density.grid import FAR
+
+Floats: TypeAlias = NDArray[np.float64]
+Singles: TypeAlias = NDArray[np.float32]
+Indices: TypeAlias = NDArray[np.intp]
+
+MAX_PAGES = 250_000
+"""Pages of a sensor's plane; detections that are too far from their middle for it are left out,
+and pages of grey values are larger."""
+
+_LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
+_PENDING = -1  # in the table: not drawn yet
+
+
+class Plane(NamedTuple):
+    """The plane of every sensor: origin in cells, pages along u and v, and cells along a page."""
+
+    origin: Floats
+    shape: tuple[int, int]
+    page: int
+
+    @property
+    def squares(self) -> int:
+        """Number of pages."""
+        return self.shape[0] * self.shape[1]
+
+    @classmethod
+    def of(cls, q: Floats, corners: Sequence[Floats], page: int, reach: float) -> Plane:
+        """A plane that holds detections (D, 2), and corners (2, 2) of grids, of all sensors.
+
+        In cells.  There is a rim of pages with nothing.
+        """
+        grids = np.concatenate([np.zeros((0, 2)), *corners])
+        places = q if len(q) else grids
+        lower, upper = places.min(axis=0), places.max(axis=0)
+        if len(q) and _count(lower, upper, page) > MAX_PAGES:
+            middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
+            lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
+        if corners:
+            lower = np.minimum(lower, grids.min(axis=0))
+            upper = np.maximum(upper, grids.max(axis=0))
+            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
+        # half a cell is left, lest rounding puts a place on a page of the rim
+        origin = page * np.floor((lower - (reach + page + 0.5)) / page)
+        columns, rows = ((upper - lower + 2 * reach) / page).tolist()
+        return cls(origin, (int(columns) + 5, int(rows) + 5), page)
+
+
+def _count(lower: Floats, upper: Floats, page: int) -> float:
+    """Pages of a box in cells, about."""
+    columns, rows = ((upper - lower) / page + 5).tolist()
+    return float(columns * rows)
+
+
+class Pages:
+    """Pages of L sensors that were drawn so far, in one array.
+
+    Attributes
+    ----------
+    plane : Plane
+    table : (L * squares,) int32
+        Number of the page of each square of a plane, plane after plane and row by row; 0 where
+        there is nothing, negative where nothing was looked up yet.
+    values : (rows, columns, 3) float32
+        Pages with one cell more on every side, which look-ups reach.
+    """
+
+    def __init__(self, plane: Plane, sensors: int) -> None:
+        self.plane = plane
+        self.table = np.full(sensors * plane.squares, _PENDING, dtype=np.int32)
+        self._first = plane.squares * np.arange(sensors)[:, None, None]
+        side = plane.page + 3
+        columns = len(self.table) * side // _LARGEST + 1
+        self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
+        self._drawn = 1
+        # from a place in the plane to one in the array, by page; from nothing out of the array
+        self._shifts = np.full((columns, 2), FAR)
+
+    @property
+    def values(self) -> Singles:
+        """The array that pages lie in."""
+        rows, side, columns, _ = self._room.shape
+        return self._room.reshape(rows * side, columns * side, 3)
+
+    def find(
+        self,
+        index: Floats,
+        draw: Callable[[Indices, Floats], tuple[Indices, Singles]],
+        at_once: int,
+    ) -> None:
+        """Turn places (L, H, n, 2) in cells into those in `values`, in place.
+
+        Parameters
+        ----------
+        draw : callable
+            Of sensors (P,) and the middles (P, 2) of pages: those on which there is something,
+            and what is on them, (F, side, 3 side).
+        at_once : int
+            Pages that it is to draw at once, at most.
+        """
+        plane = self.plane
+        end = plane.origin + np.array(plane.shape) * plane.page - 1e-3
+        np.clip(index, plane.origin, end, out=index)
+        columns_rows = ((index - plane.origin) * (1.0 / plane.page)).astype(np.intp)
+        squares = columns_rows @ np.array([1, plane.shape[0]]) + self._first
+        number = self.table[squares]
+        if number.min(initial=0) < 0:
+            pending = np.unique(squares[number < 0])
+            for some in np.array_split(pending, -(-len(pending) // at_once)):
+                sensors, place = np.divmod(some, plane.squares)
+                rows, columns = np.divmod(place, plane.shape[0])
+                middles = plane.origin + plane.page * (np.stack([columns, rows], axis=1) + 0.5)
+                filled, pages = draw(sensors, middles)
+                self.table[some] = 0
+                self.table[some[filled]] = self._kept(pages, middles[filled])
+            number = self.table[squares]
+        index += self._shifts[number]
+
+    def _kept(self, pages: Singles, middles: Floats) -> Indices:
+        """Numbers of pages (F, side, 3 side) that are put into the array."""
+        rows, side, columns, _ = self._room.shape
+        numbers = np.arange(self._drawn, self._drawn + len(pages))
+        self._drawn += len(pages)
+        if self._drawn > rows * columns:
+            # so large that allocators keep it from frame to frame; memory that is not written to
+            # is free
+            most = min(4 * -(-self._drawn // columns), _LARGEST // side)
+            room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
+            room[:rows] = self._room
+            shifts = np.empty((most * columns, 2))
+            shifts[: len(self._shifts)] = self._shifts
+            self._room, self._shifts = room, shifts
+        row, column = np.divmod(numbers, columns)
+        self._room[row, :, column] = pages
+        corners = np.stack([column, row], axis=1) * side
+        self._shifts[numbers] = corners + 0.5 * (side - 1) - middles
+        return numbers
