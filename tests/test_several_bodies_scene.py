@@ -32,7 +32,7 @@ from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, ove
 from mixpose.search import SearchResult, search_frame
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Companion, Rules, Track, Tracker
-from mixpose.tracking.companion import either
+from mixpose.tracking.track import either
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 TOOL = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [10, -30, 45], [35, 30, -40.0]])

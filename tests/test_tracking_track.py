@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
@@ -10,14 +12,22 @@ from scipy.stats import t as student
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import AcceptanceRules, Case, DetectionModel, Residuals, flat_prior, judge
+from mixpose.judgement import (
+    AcceptanceRules,
+    Case,
+    DetectionModel,
+    Prior,
+    Residuals,
+    flat_prior,
+    judge,
+)
 from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Prediction, Track, Tracker, predict
 from mixpose.tracking.motion import MotionRules, RandomWalk
-from mixpose.tracking.track import Branch, Found, follow, prior_of
+from mixpose.tracking.track import Branch, Found, follow
 
 Floats = NDArray[np.float64]
 
@@ -36,14 +46,14 @@ def moved(frame: float) -> Floats:
 
 
 def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
-    found = [Found(T, 1.0 / len(places)) for T in places]
-    return follow(track, EIGHT, found, frame, time_s, RULES)
+    data = Tracker.create(EIGHT, EstimatorOptions()).data(track, frame, time_s, [])
+    return follow(data, [Found(T, 1.0 / len(places)) for T in places])
 
 
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
-    predictions = [Prediction(TRUTH, NARROW, 1.0)]
-    anywhere = flat_prior(body, ALL_FREE, MODEL)
-    prior = prior_of(T, predictions, body, ALL_FREE, misses, RULES, anywhere)
+    track = Track((branch(),), frame=0, misses=misses)
+    data = Tracker.create(body, EstimatorOptions()).data(track, 1, None, [])
+    prior = replace(data, predictions=[Prediction(TRUTH, NARROW, 1.0)]).prior(T)
     return prior.log_density, prior.spread
 
 
@@ -109,9 +119,7 @@ def test_one_detection_where_a_feature_is_predicted_is_no_pose(
 ) -> None:
     y = pinhole_cameras[0].project(transform(TRUTH, EIGHT.means))[0]
     views = [view_of("0", pinhole_cameras[0], y[:1])]
-    predictions = [Prediction(TRUTH, NARROW, 1.0)]
-    anywhere = flat_prior(EIGHT, ALL_FREE, MODEL)
-    prior = prior_of(TRUTH, predictions, EIGHT, ALL_FREE, 0, RULES, anywhere)
+    prior = Prior(*prior_near(TRUTH))
     judged = judge(Case(matched_objective(views, EIGHT, [1.5]), TRUTH, prior=prior), ALL_FREE)
     # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
     assert judged.log_evidence < 7 * np.log(0.25) + 10

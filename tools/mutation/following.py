@@ -21,13 +21,13 @@ _PREDICTION = (
     Mutant(
         "tracking-predictions-without-tails",
         "tracking/track.py",
-        "if prediction.is_prior:",
+        "if self.is_prior:",
         "if True:",
         "a body that turns suddenly is lost",
     ),
     Mutant(
         "tracking-prior-as-wide-as-the-world",
-        "tracking/track.py",
+        "tracking/likelihood.py",
         "return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])",
         "return Prior(float(np.logaddexp.reduce(terms)), anywhere.spread)",
         "a pose near its prediction that meets one feature has high evidence",
@@ -59,7 +59,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-never-surprised",
-        "tracking/track.py",
+        "tracking/likelihood.py",
         "surprise = min(rules.surprise * (1 + misses), 1.0)",
         "surprise = 1e-300",
         "a body that was carried elsewhere is never believed there",
@@ -67,7 +67,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-as-surprised-after-misses",
-        "tracking/track.py",
+        "tracking/likelihood.py",
         "surprise = min(rules.surprise * (1 + misses), 1.0)",
         "surprise = min(rules.surprise, 1.0)",
         "after an occlusion the body is believed where it was",
@@ -75,9 +75,9 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-prediction-of-one-symmetric-pose",
-        "tracking/track.py",
-        "nearest_alike(T_world_object, body, prediction.T_world_object),",
-        "T_world_object,",
+        "tracking/likelihood.py",
+        "T = nearest_alike(T_world_object, self.body, one.T_world_object)",
+        "T = T_world_object",
         "a pose that looks as predicted counts as unexpected",
         (_TRACK,),
     ),
@@ -150,7 +150,7 @@ _MOTION = (
     ),
     Mutant(
         "tracking-clocks-with-nothing-in-common-believed",
-        "tracking/delays.py",
+        "tracking/in_motion.py",
         "if all(abs(view.delay) <= longest for view in applied):",
         "if all(abs(view.delay) <= 1e99 for view in applied):",
         "sensors of clocks that began at different times are moved away",

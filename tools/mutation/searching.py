@@ -67,7 +67,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-companions-for-nothing",
-        "tracking/companion.py",
+        "tracking/track.py",
         "share = rules.beside *",
         "share = 1e-9 *",
         "a limb that is lost is not found again by where it was beside the next one",
@@ -75,7 +75,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-companions-for-ever",
-        "tracking/companion.py",
+        "tracking/track.py",
         "** misses",
         "** 0",
         "a body that went away is expected for ever where it was beside another",
@@ -83,7 +83,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-companions-in-world-axes",
-        "tracking/companion.py",
+        "tracking/track.py",
         "variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2",
         "variances.reshape(2, 3)",
         "what is known of a body beside another does not turn with it",

@@ -8,12 +8,8 @@ each feature at most one detection and each detection at most one feature,
 
     L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
 
-c being the number of false detections to be expected and W the room they have.  The sum over all
-associations runs over subsets of features, detection by detection, so that it is exact.
-
-One frame alone says little about how such a body is turned.  Where frames before it gave a pose,
-that pose is a Gaussian prior, as wide as it was uncertain and as the body may have moved since (a
-Kalman filter whose model of motion is that the body stays).
+c being the number of false detections to be expected and W the room they have.  The pose of a frame
+before is a Gaussian prior, as wide as it was uncertain and as the body may have moved since.
 """
 
 from __future__ import annotations
@@ -144,8 +140,8 @@ def sum_associations(
 def _summed(odds: Floats) -> tuple[Floats, Floats]:
     """Sum over associations (H,) and how probable each pair is (H, n, M), of odds (H, n, M).
 
-    From the first detection to the last, the odds of each subset of features being taken by the
-    detections so far; and the same backwards.
+    Exact: from the first detection to the last, the odds of each subset of features being taken by
+    the detections so far; and the same backwards.
     """
     count, n, M = odds.shape
     subsets = np.arange(2**n)
@@ -215,8 +211,10 @@ class AssociationLikelihood:
         """Judge a pose by the sum over all associations, with the prior of the start."""
         data, T, free, model = self.data, fit.T_world_object, self.data.free, self.data.rules
         judged = judge(Case(data.finest, T), free, model.judgement)
-        found, before = self._sums(T[None], self.noise), data.track.residuals.total
-        count, memory = int(free.sum()), model.judgement.noise.memory
+        views, detection = data.views, model.judgement.detection
+        found = sum_associations(views, data.body, T[None], self.noise, detection)
+        before, memory = data.track.residuals.total, model.judgement.noise.memory
+        count = int(free.sum())
         degrees = max(float(found.met[0]) - count, 0.0)
         noise = Noise(float(found.squares[0]) if degrees else 0.0, degrees)
         inner = np.ix_(free, free)
@@ -246,10 +244,6 @@ class AssociationLikelihood:
             return None
         return NormalPrior(expected.T_world_object, expected.uncertainty, self.data.free)
 
-    def _sums(self, poses: Floats, noise: float) -> AssociationSum:
-        data = self.data
-        return sum_associations(data.views, data.body, poses, noise, data.rules.judgement.detection)
-
     def _posterior(
         self, prior: NormalPrior | None, noise: float, T_world_object: Floats
     ) -> Quadratic:
@@ -257,12 +251,13 @@ class AssociationLikelihood:
 
         Steps move ranges by a small part of their error.
         """
-        free, sigma = self.data.free, noise * min(self.data.sigmas)
-        arm = float(np.linalg.norm(self.data.body.means, axis=1).max())
+        data, free, sigma = self.data, self.data.free, noise * min(self.data.sigmas)
+        arm = float(np.linalg.norm(data.body.means, axis=1).max())
         scale = np.repeat([_STEP * sigma, _STEP * sigma / max(arm, sigma)], 3)[free]
         steps = scale[:, None] * np.eye(6)[free]
         poses = perturb(T_world_object, np.vstack([np.zeros(6), steps, -steps]))
-        found = self._sums(poses, noise)
+        detection = data.rules.judgement.detection
+        found = sum_associations(data.views, data.body, poses, noise, detection)
         here, ahead, behind = np.split(found.gradient, [1, 1 + len(steps)])
         H = np.zeros((6, 6))
         H[free] = (behind - ahead) / (2 * scale[:, None])

@@ -1,9 +1,7 @@
-"""A pose near a start, with the velocity at which the body is seen there.
+"""Sensors that see a moving body at moments of their own: late, or row after row.
 
-Sensors may see a moving body at moments of their own: late, or row after row.  A pose and a
-velocity are estimated together: the pose by the objective, in which every feature is predicted
-where the body is when its row is read, and the velocity from what the frame's residuals and the
-poses before say of it.  Both are the maximum of one likelihood, sought in turns: a Gauss-Newton
+A pose and a velocity are estimated together, by the objective and by what the frame's residuals and
+the poses before say of it.  Both are the maximum of one likelihood, sought in turns: a Gauss-Newton
 step of both gives the velocity, with which the objective is climbed again.
 
 With velocity v, a feature that is seen t seconds after the common time moves by J δ + t J δv when
@@ -14,7 +12,7 @@ J v τ more.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -22,9 +20,10 @@ from numpy.typing import NDArray
 
 from mixpose.density import errors_seen, sums_of
 from mixpose.fit import Fit
-from mixpose.judgement import Association, Judged, associate, joined_offsets, nearest_alike
+from mixpose.judgement import Association, Judged, Matches, associate, nearest_alike
 from mixpose.judgement.moments import inverses
 from mixpose.objective import View
+from mixpose.records import DelaySeen
 from mixpose.rigid import Floats, perturb
 from mixpose.sensors import Motion, moments
 from mixpose.tracking.motion import Expected
@@ -39,6 +38,16 @@ SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they ar
 TYPICAL = 0.2  # residuals in σ_ε, as two features would say: what a frame alone is weighed by
 _TYPICAL_DEGREES = 4.0
 LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
+
+LONGEST_S = 1.0  # a clock that differs by more is not the same
+UNKNOWN_S = 0.1  # standard deviation of a delay of which nothing is known
+SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
+_ROUNDING = 1e-9
+
+
+def is_timed(views: Sequence[View]) -> bool:
+    """Whether any view is seen at another moment than the common time."""
+    return any(view.delay or view.readout or view.unsure is not None for view in views)
 
 
 class Offsets(NamedTuple):
@@ -167,7 +176,8 @@ def offsets_of(
     views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(found))
     if expected is not None:
         errors, known = data.rules.judgement.noise.errors, sums_of([data.noise[k] for k in chosen])
-        noise = errors_seen(joined_offsets(found), int(data.free.sum()), known, errors).blurs
+        met = Matches.of([found]).residuals()
+        noise = errors_seen(met, int(data.free.sum()), known, errors).blurs
         pairs = zip(found, views, strict=True)
         unsure = [_unsure_by(one.J, one.places, view, expected) for one, view in pairs]
         # a pose that was climbed to at another velocity is off by as much in all sensors
@@ -223,3 +233,90 @@ def _change(seen: Offsets, velocity: Floats, expected: Expected, free: NDArray[n
 def _inverse(information: Floats) -> Floats:
     """Inverse of one information matrix; large where it is open."""
     return np.asarray(inverses(information[None])[0])
+
+
+@dataclass(frozen=True)
+class DelayEvidence:
+    """What the frames so far say of how late sensors are, beyond what was told of them.
+
+    Attributes
+    ----------
+    reference : str
+        The sensor against which delays are known; empty before the first frame.
+    names : tuple of str
+        The others.
+    information : (n, n) float64
+        Per squared second.
+    vector : (n,) float64
+        Per second.
+    """
+
+    reference: str = ""
+    names: tuple[str, ...] = ()
+    information: Floats = field(default_factory=lambda: np.zeros((0, 0)))
+    vector: Floats = field(default_factory=lambda: np.zeros(0))
+
+    def seconds(self) -> dict[str, DelaySeen]:
+        """How late each sensor is, as far as it is known, and how surely."""
+        if not self.names:
+            return {}
+        inverse = np.linalg.inv(self.information + np.eye(len(self.names)) / UNKNOWN_S**2)
+        late, deviation = inverse @ self.vector, np.sqrt(inverse.diagonal())
+        pairs = zip(self.names, late.tolist(), deviation.tolist(), strict=True)
+        return {name: DelaySeen(seconds, sigma) for name, seconds, sigma in pairs}
+
+    def applied(
+        self, views: Sequence[View], time_s: float | None, elapsed: float | None
+    ) -> list[View]:
+        """Views as late as they are known to be by now, at a time and so long after the last pose.
+
+        Without times none is late; where clocks are not the same, none is by what was told.
+        """
+        if time_s is None:
+            return [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        known = self.seconds() if any(view.unsure is not None for view in views) else {}
+        applied = list(views)
+        for k, view in enumerate(views):
+            if view.unsure is not None:
+                late = known.get(view.name, DelaySeen(0.0, UNKNOWN_S))
+                delay = view.delay + late.seconds
+                applied[k] = replace(
+                    view, delay=delay, unsure=late.deviation, estimated=late.seconds
+                )
+        longest = LONGEST_S if elapsed is None else min(max(elapsed, 0.0), LONGEST_S)
+        if all(abs(view.delay) <= longest for view in applied):
+            return applied
+        return [replace(view, delay=0.0) for view in applied]
+
+    def joined(self, data: FrameData, best: Judged) -> DelayEvidence:
+        """With one more frame, whose best pose is known as well as its features say."""
+        used = [one for one in best.associations if best.sensors[one.name].used]
+        is_asked = data.frame % SOME_FRAMES == 0 or is_timed(data.views)
+        if len(used) < 2 or not data.elapsed or not is_asked:
+            return self
+        expected = data.expected(best.T_world_object)
+        own = {one.name: k for k, one in enumerate(used)}
+        views = [view for view in data.views if view.name in own]
+        told = [view.name for view in views if view.unsure is None]
+        reference = self.reference or (told[0] if told else "")
+        if not expected.gain.any() or reference not in own:
+            return self
+        names = (*self.names, *(n for n in own if n != reference and n not in self.names))
+        seen = offsets_of(data, used)
+        late = seen.by_delay(expected.velocity, [own.get(name, -1) for name in names])
+        rest = float(seen.offsets @ seen.offsets) / max(len(seen.offsets) - 6, 1)
+        variance = max(rest, LEAST_VARIANCE)
+        # what a pose and an unknown change of the velocity explain as well says nothing of delays
+        shifts = seen.rows * seen.late[:, None] * expected.deviation / np.sqrt(variance)
+        free = np.block([[seen.rows, shifts], [np.zeros((6, 6)), np.eye(6)]])
+        free /= np.maximum(np.linalg.norm(free, axis=0), np.finfo(float).tiny)
+        columns = np.pad(late, ((0, 6), (0, 0)))
+        columns -= free @ np.linalg.lstsq(free, columns, rcond=_ROUNDING)[0]
+        information = columns.T @ columns / variance
+        estimated = {view.name: view.estimated for view in views}
+        vector = columns[: len(late)].T @ seen.offsets / variance
+        vector += information @ np.array([estimated.get(name, 0.0) for name in names])
+        n = len(self.names)
+        information[:n, :n] += self.information
+        vector[:n] += self.vector
+        return DelayEvidence(reference, names, information, vector)

@@ -34,12 +34,10 @@ from mixpose.rigid import Floats, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.association_likelihood import AssociationLikelihood, are_associated
-from mixpose.tracking.companion import either
-from mixpose.tracking.delays import is_timed
-from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
+from mixpose.tracking.in_motion import fit_in_motion, is_timed, with_motion_unknown
 from mixpose.tracking.motion import Expected, unknown
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Prediction, Track, nearest_branch, prior_of
+from mixpose.tracking.track import Prediction, Track, either, nearest_branch
 
 
 @dataclass(frozen=True)
@@ -144,12 +142,26 @@ class FrameData:
 
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
-        rules, misses, of = self.rules.motion, self.track.misses, (self.body, self.free)
-        own = prior_of(T_world_object, self.predictions, *of, misses, rules, self.anywhere)
+        misses, rules = self.track.misses, self.rules.motion
+        own = self._prior(T_world_object, self.predictions, misses)
         if self.beside is None:
             return own
-        beside = prior_of(T_world_object, [self.beside], *of, 0, rules, self.anywhere)
-        return either(own, beside, misses, rules)
+        return either(own, self._prior(T_world_object, [self.beside], 0), misses, rules)
+
+    def _prior(self, T_world_object: Floats, some: Sequence[Prediction], misses: int) -> Prior:
+        """Density of a pose by predictions, or now and then anywhere."""
+        anywhere, rules = self.anywhere, self.rules.motion
+        if not some:
+            return anywhere
+        surprise = min(rules.surprise * (1 + misses), 1.0)
+        terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
+        for one in some:
+            T = nearest_alike(T_world_object, self.body, one.T_world_object)
+            weight = max((1 - surprise) * one.weight, 1e-12)
+            terms.append(np.log(weight) + one.log_density(T, self.free, rules))
+            spreads.append(one.uncertainty)
+        # directions that the data leave open are as uncertain as where the pose likely comes from
+        return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
 
     def moves_alike(self, T_world_object: Floats) -> Floats | None:
         """The pose, where motion does not tell it from its rivals; see `Start.T_moved`."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 from mixpose.fit import fit_together
 from mixpose.judgement import Case, judge_together, nearest_alike
 from mixpose.objective import SharedDensities, can_be_together, matched_objective
-from mixpose.tracking.delays import is_timed
+from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Start
 
 

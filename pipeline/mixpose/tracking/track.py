@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.judgement import Prior, Residuals, nearest_alike
-from mixpose.rigid import Floats, perturb, twist_between
+from mixpose.rigid import Floats, inverse, perturb, twist_between
 from mixpose.search import SearchState
-from mixpose.tracking.companion import Companion
-from mixpose.tracking.delays import DelayEvidence
-from mixpose.tracking.motion import Course, CourseRules, MotionRules, RandomWalk
+from mixpose.tracking.in_motion import DelayEvidence
+from mixpose.tracking.motion import Course, MotionRules, RandomWalk
 from mixpose.tracking.static_clutter import StaticClutter
+
+if TYPE_CHECKING:
+    from mixpose.tracking.likelihood import FrameData
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,54 @@ class SensorTally(NamedTuple):
 
     met: int
     in_view: int
+
+
+@dataclass(frozen=True)
+class Companion:
+    """The poses of a body seen from another one, in frames that were sure of both.
+
+    Limbs of a person, a tool and its tray stay near each other.  Where the one is sure and the
+    other was lost, or moved as nobody expected, these tell where it may be.
+
+    Attributes
+    ----------
+    T_other_object : (4, 4) float64
+        Their mean.
+    squares : (6,) float64
+        Mean squared twists from it, in the axes of the other body.
+    count : int
+        Of frames.
+    """
+
+    T_other_object: Floats
+    squares: Floats
+    count: int
+
+    @classmethod
+    def joined(
+        cls, before: Companion | None, T_world_object: Floats, T_world_other: Floats, body: Body
+    ) -> Companion:
+        """What was known, and one more frame that is sure of both."""
+        T = inverse(T_world_other) @ T_world_object
+        if before is None:
+            return cls(T, np.zeros(6), 1)
+        away = twist_between(before.T_other_object, nearest_alike(T, body, before.T_other_object))
+        n = before.count + 1
+        squares = before.squares + (away**2 * (1 - 1 / n) - before.squares) / n
+        return cls(perturb(before.T_other_object, away / n), squares, n)
+
+    def expected(
+        self, T_world_other: Floats, body: Body, rules: MotionRules
+    ) -> tuple[Floats, Floats]:
+        """Where the body is expected beside the other one, and standard deviations (6,) of that.
+
+        What is guessed before anything is known counts as some frames.
+        """
+        n, few, guess = self.count, rules.known_from, rules.guess(body) ** 2
+        spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
+        variances = np.maximum(spread, rules.steady(body) ** 2)
+        wide = variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2
+        return T_world_other @ self.T_other_object, np.sqrt(wide.ravel())
 
 
 @dataclass(frozen=True)
@@ -113,6 +163,11 @@ class Track:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s
 
+    def elapsed(self, frame: int, time_s: float | None) -> float:
+        """Time since the last pose: seconds where both frames have times, else frames."""
+        seconds = self.seconds_until(time_s)
+        return float(frame - (self.frame or 0)) if seconds is None else seconds
+
     def missed(self, search: SearchState, clutter: StaticClutter) -> Track:
         """The track after a frame without a pose."""
         return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
@@ -127,6 +182,24 @@ class Prediction:
     weight: float
     is_prior: bool = False
 
+    def log_density(
+        self, T_world_object: Floats, free: NDArray[np.bool_], rules: MotionRules
+    ) -> float:
+        """Of a pose before its frame, in the directions that are free.
+
+        How far a prediction errs is known from a step or two: errors have the distribution of
+        Student.
+        """
+        u = self.uncertainty[free]
+        scaled = twist_between(self.T_world_object, T_world_object)[free] / u
+        count, volume = len(u), float(np.log(u).sum())
+        if self.is_prior:
+            return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
+        n = rules.known_from
+        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+        tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
+        return count * peak - tails - volume
+
 
 def predict(
     track: Track,
@@ -139,7 +212,7 @@ def predict(
 
     The longer nothing was seen, the wider; velocities are believed for a few frames only.
     """
-    elapsed = elapsed_since(track, frame, time_s)
+    elapsed = track.elapsed(frame, time_s)
     widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
     for branch in track.branches:
@@ -155,44 +228,16 @@ def predict(
     return predictions
 
 
-def prior_of(
-    T_world_object: Floats,
-    predictions: Sequence[Prediction],
-    body: Body,
-    free: NDArray[np.bool_],
-    misses: int,
-    rules: MotionRules,
-    anywhere: Prior,
-) -> Prior:
-    """Density of a pose before its frame: the predictions, or now and then anywhere."""
-    if not predictions:
-        return anywhere
-    surprise = min(rules.surprise * (1 + misses), 1.0)
-    terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
-    for prediction in predictions:
-        u = prediction.uncertainty[free]
-        twist = twist_between(
-            prediction.T_world_object,
-            nearest_alike(T_world_object, body, prediction.T_world_object),
-        )
-        log_density = _log_density(twist[free] / u, rules, prediction) - np.log(u).sum()
-        weight = max((1 - surprise) * prediction.weight, 1e-12)
-        terms.append(np.log(weight) + log_density)
-        spreads.append(prediction.uncertainty)
-    # directions that the data leave open are as uncertain as where the pose most likely comes from
-    return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
+def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
+    """What the body's own track lets expect, or another body, of a pose.
 
-
-def _log_density(scaled: Floats, rules: MotionRules, prediction: Prediction) -> float:
-    """Of a pose so many standard deviations (k,) from a prediction, but for their product.
-
-    How far a prediction errs is known from a step or two: errors have the distribution of Student.
+    Either may hold, the other body the less the longer this one was away.  As both are densities
+    of poses, no more of the poses made by chance are believed than without the other body.
     """
-    if prediction.is_prior:
-        return float(-0.5 * scaled @ scaled) - 0.5 * len(scaled) * math.log(2 * math.pi)
-    n = rules.known_from
-    peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-    return len(scaled) * peak - 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
+    share = rules.beside * (1 - rules.surprise) ** misses
+    mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
+    spread = own.spread if mine > theirs else beside.spread
+    return Prior(float(np.logaddexp(mine, theirs)), spread)
 
 
 class Found(NamedTuple):
@@ -207,32 +252,11 @@ class Found(NamedTuple):
     deviation: Floats | None = None
 
 
-def follow(
-    track: Track,
-    body: Body,
-    found: Sequence[Found],
-    frame: int,
-    time_s: float | None,
-    rules: MotionRules,
-    course_rules: CourseRules = CourseRules(),
-) -> Track:
-    """The track after a frame with poses, as far as these tell.
-
-    Parameters
-    ----------
-    track : Track
-        Before the frame.
-    body : Body
-    found : sequence of Found
-        Best first.
-    frame, time_s
-        Of the frame.
-    rules : MotionRules
-    course_rules : CourseRules
-    """
-    elapsed = elapsed_since(track, frame, time_s)
+def follow(data: FrameData, found: Sequence[Found]) -> Track:
+    """The track after a frame with poses, the best first, as far as these tell."""
+    track, body, rules, course_rules = data.track, data.body, data.rules.motion, data.rules.course
+    elapsed, walk = track.elapsed(data.frame, data.time_s), track.walk
     branches: list[Branch] = []
-    walk = track.walk
     for T, weight, spread, deviation in found:
         velocity, course, uncertainty = None, None, rules.unsteady * rules.steady(body)
         parent = nearest_branch(track, T, body)
@@ -257,18 +281,12 @@ def follow(
     return replace(
         track,
         branches=tuple(branches),
-        frame=frame,
-        time_s=time_s,
+        frame=data.frame,
+        time_s=data.time_s,
         misses=0,
         walk=walk,
         search=SearchState(),
     )
-
-
-def elapsed_since(track: Track, frame: int, time_s: float | None) -> float:
-    """Time since the last pose: seconds where both frames have times, else frames."""
-    seconds = track.seconds_until(time_s)
-    return float(frame - (track.frame or 0)) if seconds is None else seconds
 
 
 def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:

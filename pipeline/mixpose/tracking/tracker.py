@@ -22,7 +22,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.rigid import Floats, is_rigid
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.delays import is_timed
+from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
@@ -258,11 +258,11 @@ class Tracker:
             for one in best.associations
             if best.sensors[one.name].used
         }
-        rules, met = self.rules, [one.met >= _MOST * one.in_view > 0 for one in tallies.values()]
+        met = [one.met >= _MOST * one.in_view > 0 for one in tallies.values()]
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
         return replace(
-            follow(track, self.body, found, data.frame, data.time_s, rules.motion, rules.course),
+            follow(data, found),
             residuals=best.residuals if is_ok else track.residuals,
             tallies=tallies,
             delays=track.delays.joined(data, best) if is_ok or late else track.delays,
