@@ -44,16 +44,10 @@ class Factors(NamedTuple):
 
 
 def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None, total: float) -> Factors:
-    """Blur a pattern, normalised, at columns u (U,) and rows v (V,), None for ranges.
+    """Blur a pattern that is not empty at columns u (U,) and rows v (V,), None for ranges.
 
-    Parameters
-    ----------
-    pattern : PointPattern or GridPattern
-        Not empty.
-    sigma : float
-        Standard deviation of the blur in sensor units; positive for detections.
-    total : float
-        What the pattern is normalised by, its `mass`.
+    `sigma` is the standard deviation of the blur in sensor units, positive for detections, and
+    `total` what the pattern is normalised by, its `mass`.
     """
     if isinstance(pattern, PointPattern):
         weights = (pattern.weights / total).astype(np.float32)[:, None]
@@ -151,24 +145,11 @@ def odd_factor(ratio: float) -> int:
 
 
 def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern and normalise it to a probability density.
+    """Blur a pattern g0 and normalise it to a probability density, with its gradient if wanted.
 
-    Parameters
-    ----------
-    pattern : PointPattern or GridPattern
-        g0.
-    sigma : float
-        Standard deviation of the blur in sensor units; positive for detections.
-    window : Window
-        Where the density is wanted.  The normalisation is that of the whole pattern, so that a
-        window shows a part of the same density.
-    gradient : bool
-        Whether to add the gradient channels.
-
-    Returns
-    -------
-    Density
-        Zero everywhere when the pattern is empty.
+    `sigma` is the standard deviation of the blur in sensor units, positive for detections.  The
+    normalisation is that of the whole pattern, so that a window shows a part of the same density,
+    which is zero everywhere where the pattern is empty.
     """
     m = len(window.origin)
     if is_empty(pattern):

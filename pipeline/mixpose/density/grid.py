@@ -28,21 +28,11 @@ FAR = -1.0e6  # an index that is outside any array, finite in float32
 
 @dataclass(frozen=True)
 class Window:
-    """A grid in sensor coordinates.
+    """A grid in sensor coordinates."""
 
-    Attributes
-    ----------
-    origin : (m,) float64
-        Sensor coordinates of the first grid point.
-    shape : (int, int)
-        Rows and columns; one row for ranges.
-    step : float
-        Sensor units between grid points.
-    """
-
-    origin: Floats
-    shape: tuple[int, int]
-    step: float
+    origin: Floats  # (m,) sensor coordinates of the first grid point
+    shape: tuple[int, int]  # rows and columns; one row for ranges
+    step: float  # sensor units between grid points
 
     @classmethod
     def around(cls, lower: Floats, upper: Floats, step: float) -> Window:
@@ -61,19 +51,13 @@ class Window:
 class Density:
     """A probability density over sensor coordinates, sampled on a window.
 
-    Attributes
-    ----------
-    values : (H, W, 3) or (H, W) float32
-        Density in 1/unit^m, then its gradient in 1/unit^(m+1) where it was asked for; for
-        ranges the last channel is empty.
-    window : Window
-    sigma : float
-        Standard deviation, in sensor units, that one exact feature has in it.
+    Values are (H, W, 3) or (H, W): the density in 1/unit^m, then its gradient in 1/unit^(m+1) where
+    it was asked for; for ranges the last channel is empty.
     """
 
     values: NDArray[np.float32]
     window: Window
-    sigma: float
+    sigma: float  # standard deviation, in sensor units, that one exact feature has in it
 
     @property
     def dimension(self) -> int:
@@ -95,17 +79,9 @@ class Density:
         return map_u, map_v
 
     def sample(self, y: Floats) -> NDArray[np.float32]:
-        """Look the channels up, bilinearly.
+        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; `FLOOR` outside.
 
-        Parameters
-        ----------
-        y : (..., m) float64
-            Sensor coordinates.
-
-        Returns
-        -------
-        (..., 1 + m) or (...,) float32
-            The channels at y, `FLOOR` outside; without the last axis for a single channel.
+        Without the last axis for a single channel.
         """
         map_u, map_v = self.indices(y)
         looked_up = remap(self.values, map_u, map_v)

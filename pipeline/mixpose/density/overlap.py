@@ -39,12 +39,7 @@ def _all_pairs(count: int) -> Indices:
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     """Σ_ij w_i w_j N(y_i − y_j; 0, variance): the inner product of a mixture with itself.
 
-    Parameters
-    ----------
-    points : (n, m) array
-    weights : (n,) array
-    variance : float
-        Sum of the variances of the two factors: 2σ² for features of standard deviation σ.
+    Of points (n, m) with weights (n,); the variance is 2σ² for features of standard deviation σ.
     """
     pairs = close_pairs(points, variance)
     away = points[pairs[:, 0]] - points[pairs[:, 1]]

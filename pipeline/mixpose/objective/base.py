@@ -57,15 +57,9 @@ class Objective(Protocol):
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
-    """Box (lower, upper) around projected points (n, m), within the sensor.
+    """Box (lower, upper) around visible points (n, m), at least one, within the sensor.
 
-    Parameters
-    ----------
-    sensor : Sensor
-    y : (n, m) array
-        Visible points, at least one.
-    margin : float
-        Sensor units added on every side.
+    The margin, in sensor units, is added on every side.
     """
     lower = np.maximum(y.min(axis=0) - margin, sensor.lower)
     upper = np.minimum(y.max(axis=0) + margin, sensor.upper)

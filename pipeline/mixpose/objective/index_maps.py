@@ -23,17 +23,9 @@ _BLOCK = 16384  # cv2.remap takes maps of less than 32767 a side
 
 
 class ParallelMaps:
-    """Samples of a body in blocks of W, B of them, before parallel beams.
+    """Samples (S, 3) of a body in blocks of W, B of them, before parallel beams.
 
-    Parameters
-    ----------
-    sensors : sequence of ParallelBeam
-    windows : sequence of Window
-        Of their densities.
-    points : (S, 3) array
-        In the object's frame.
-    offsets : (S, 3) array or None
-        Displacements in the world.
+    Windows are those of their densities; offsets (S, 3) are displacements in the world.
     """
 
     def __init__(

@@ -67,14 +67,9 @@ class Match(NamedTuple):
 
 
 def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Overlaps:
-    """How far the predicted features overlap.
+    """How far predicted features y (L, H, n, 2) of weights (L, H, n) overlap.
 
-    Parameters
-    ----------
-    y : (L, H, n, 2) array
-    weights : (L, H, n) array
-    variances, tops : (L, 1) array
-        v, and the peak of a Gaussian of that variance.
+    `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
     pairs = _NO_PAIRS if _are_apart(y, variances) else _pairs(y, variances)
@@ -124,14 +119,8 @@ def slopes(
 ) -> Slopes:
     """Second-order models of the matched objective at H poses.
 
-    Parameters
-    ----------
-    at : Projected
-    sampled : (L, H, n, 3) array
-        C and its gradient at the predicted features.
-    over : Overlaps
-    variances, tops, scales : (L, 1) array
-        v, N(0; 0, v), and the factor s of each sensor.
+    `sampled` (L, H, n, 3) is C with its gradient at the predicted features; `variances`, `tops` and
+    `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
     L, H, n = at.weights.shape
     J = at.J.reshape(L, H, 2 * n, 6)

@@ -42,16 +42,10 @@ class SampledTerm:
 
 
 class _SampledObjective:
-    """What both objectives share: samples of q and their densities.
+    """What both objectives share: samples z_ir (N, R, 3) of every feature, and their densities.
 
-    Parameters
-    ----------
-    terms : sequence of SampledTerm
-    samples : (N, R, 3) array
-        Samples z_ir of every feature, in the object's frame.
-    world_offsets : (R, 3) array or None
-        Displacements in the world that belong to the samples, as by gravity: they do not turn
-        with the pose.
+    `world_offsets` (R, 3) are displacements in the world that belong to the samples, as by gravity:
+    they do not turn with the pose.
     """
 
     def __init__(
@@ -182,15 +176,9 @@ def sampled_terms(
     sigmas: Sequence[float],
     near: Floats | None = None,
 ) -> list[SampledTerm]:
-    """Densities g_l at given blurs, around the projection of a pose or wherever a sensor sees.
+    """Densities g_l around the samples (N, R, 3) at a pose (4, 4), or wherever a sensor sees.
 
-    Parameters
-    ----------
-    views : sequence of View
-    samples : (N, R, 3) array
-    sigmas : sequence of float
-        Standard deviation of a feature at this level, per view, in sensor units.
-    near : (4, 4) array or None
+    `sigmas` are the standard deviations of a feature at this level, per view, in sensor units.
     """
     terms = []
     for view, sigma in zip(views, sigmas, strict=True):

@@ -31,12 +31,7 @@ class Projected(NamedTuple):
 class BodyProjection:
     """Sensors that look at a body; made once for the same ones by `project_body`.
 
-    Attributes
-    ----------
-    sensors : tuple of Sensor
-    body : Body
-    dimensions : (L,) int
-        m, the coordinates of each sensor.
+    `dimensions` (L,) are m, the coordinates of each sensor.
     """
 
     def __init__(self, sensors: Sequence[Sensor], body: Body) -> None:
@@ -78,14 +73,9 @@ def project_body(sensors: tuple[Sensor, ...], body: Body) -> BodyProjection:
 
 
 def in_image(spreads: Floats, J: Floats) -> Floats:
-    """How far features (..., n) are off in a sensor's coordinates, mean variance along one.
+    """How far features are off in a sensor's coordinates, mean variance along one (..., n).
 
-    Parameters
-    ----------
-    spreads : (n, 3, 3) array
-        Covariances of the features in the world.
-    J : (..., n, m, 6) array
-        As `Projected` has it, for the sensor's own m coordinates.
+    For covariances (n, 3, 3) in the world, and J (..., n, m, 6) in the sensor's own m coordinates.
     """
     by_world = J[..., :3]
     total = np.einsum("...nmi,nij,...nmj->...n", by_world, spreads, by_world)
@@ -95,13 +85,8 @@ def in_image(spreads: Floats, J: Floats) -> Floats:
 def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
     """Chain Jacobians (..., n, m, 3) by world points into (..., n, m, 6) by the pose's twist.
 
-    A turn ω about the object's origin moves an arm x = R z by ω × x, and a · (ω × x) = ω · (x × a).
-
-    Parameters
-    ----------
-    by_world : (..., n, m, 3) array
-    arms : (..., n, 3) array
-        Points relative to the object's origin, in world axes.
+    A turn ω about the object's origin moves an arm x = R z, one of (..., n, 3), by ω × x, and
+    a · (ω × x) = ω · (x × a).
     """
     J = np.empty((*by_world.shape[:-1], 6))
     x, y, z = arms[..., 0, None], arms[..., 1, None], arms[..., 2, None]
