@@ -15,21 +15,14 @@ from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Sta
 def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
     """The frames of several bodies with what is climbed from their first predictions, and judged.
 
-    Parameters
-    ----------
-    frames : sequence of FrameData
-        Of the same sensors; what is not a body's own is out of its reach.
-    shared : SharedDensities
-        Of all that these sensors see.
+    Their sensors are the same, of which `shared` has all that they see; what is not a body's own is
+    out of its reach.
     """
-    begun = [
-        one
-        if is_timed(one.views)
-        else replace(
-            one, begun=Begun(matched_objective(one.views, one.body, one.sigmas, shared=shared))
-        )
-        for one in frames
-    ]
+    begun = list(frames)
+    for k, one in enumerate(frames):
+        if not is_timed(one.views):
+            objective = matched_objective(one.views, one.body, one.sigmas, shared=shared)
+            begun[k] = replace(one, begun=Begun(objective))
     some = [k for k, one in enumerate(begun) if _is_climbed(one)]
     if len(some) < 2:
         return begun
