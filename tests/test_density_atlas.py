@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.density import Atlas
 from mixpose.density.atlas import MOST_OWN, REACH, TILE
-from mixpose.density.pages import MAX_PAGES
+from mixpose.density.pages import MAX_PAGES, Pages, Plane
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -356,3 +356,9 @@ def test_where_nothing_is_drawn_the_density_is_zero() -> None:
     value, gradient = looked_up(atlas, outside)
     assert not value.any()
     assert not gradient.any()
+
+
+def test_pages_of_many_sensors_lie_in_an_array_that_can_be_looked_up() -> None:
+    # fifteen cameras whose detections are far apart; cv2.remap takes less than 32767 a side
+    plane = Plane(np.zeros(2), (500, 500), 24)
+    assert max(Pages(plane, 15).values.shape) < 32767

@@ -15,14 +15,8 @@ NOTHING = np.zeros((2, 1))
 
 
 def offsets_of(away: Floats, finest: float = 0.01) -> Offsets:
-    count = len(away)
-    return Offsets(
-        (away * away).sum(axis=1),
-        np.ones(count),
-        np.zeros(count, np.intp),
-        np.array([away.shape[1]]),
-        np.array([finest]),
-    )
+    squared = (away * away).sum(axis=1)[None]
+    return Offsets(squared, np.ones_like(squared), np.array([away.shape[1]]), np.array([finest]))
 
 
 @pytest.mark.parametrize("coordinates", [1, 2])
@@ -80,13 +74,8 @@ def test_half_of_offsets_far_off_are_no_noise_where_the_rest_is_as_small_as_befo
 def test_sensors_are_weighed_half_by_what_all_of_them_err_by() -> None:
     rng = np.random.default_rng(4)
     away = rng.normal(0, np.repeat([[0.05], [0.2]], 2000, axis=0), (4000, 2))
-    both = Offsets(
-        (away**2).sum(axis=1),
-        np.ones(4000),
-        np.repeat([0, 1], 2000),
-        np.array([2, 2]),
-        np.full(2, 0.01),
-    )
+    squared = (away**2).sum(axis=1).reshape(2, 2000)
+    both = Offsets(squared, np.ones_like(squared), np.array([2, 2]), np.full(2, 0.01))
     seen = errors_seen(both, 0, np.zeros((2, 2)), RULES)
     mean = (0.05**2 + 0.2**2) / 2
     for blur, s in zip(seen.blurs, (0.05, 0.2), strict=True):

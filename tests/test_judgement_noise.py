@@ -28,7 +28,7 @@ def noise_of(
     model: NoiseModel,
 ) -> FrameNoise:
     """The noise of one frame."""
-    return noises_of([associations], Matches.of([associations]), free, [before], model)[0]
+    return noises_of(Matches.of([associations]), free, [before], model)[0]
 
 
 def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Association:

@@ -9,7 +9,7 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.budget import PeakOptions
+from mixpose.search.budget import SearchBudget
 from mixpose.search.detections import peaks, sensor_detections
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
@@ -31,7 +31,7 @@ def test_features_that_share_a_detection_count_once(
     paper_body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:
     views = seen_by(pinhole_cameras, paper_body)
-    detections = sensor_detections(views, paper_body, PeakOptions())
+    detections = sensor_detections(views, paper_body, SearchBudget())
     images = label_images(SearchProblem(detections, paper_body, ALL_FREE, np.eye(4)))
     collapsed = TRUTH.copy()
     # far behind its place the whole body falls within one disk
@@ -46,7 +46,7 @@ def test_peaks_of_an_image_are_found_between_pixels() -> None:
     v, u = np.mgrid[:64, :80]
     image = sum(np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 2.0**2) for x, y in places)
     pattern = GridPattern(np.asarray(image, dtype=np.float32), np.array([100.0, 50.0]), 1.0)
-    found = peaks(pattern, 1.5, PeakOptions())
+    found = peaks(pattern, 1.5, SearchBudget())
     order = np.argsort(found[:, 0])
     # the vertex of a parabola through a Gaussian of 2.5 px is off by less than 0.02 px
     np.testing.assert_allclose(found[order], places + pattern.origin, atol=0.02)

@@ -11,7 +11,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.judgement import Case, Prior, judge
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
-from mixpose.search.budget import PeakOptions
+from mixpose.search.budget import SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.evidence import evidence
 from mixpose.search.problem import SearchProblem
@@ -34,7 +34,7 @@ def evidence_in(views: list[View], body: Body = EIGHT) -> float:
 
 
 def problem(views: list[View], body: Body = EIGHT) -> SearchProblem:
-    detections = sensor_detections(views, body, PeakOptions())
+    detections = sensor_detections(views, body, SearchBudget())
     return SearchProblem(detections, body, ALL_FREE, np.eye(4))
 
 

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
-from mixpose.search.alignment import align_triples
-from mixpose.search.budget import THOROUGH, PeakOptions, SearchBudget
+from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.guesses import from_slips, kinds_of_guesses
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
+from mixpose.search.three_points import align_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -45,7 +45,7 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
 ) -> None:
     camera = pinhole_cameras[0]
     y = camera.project(transform(TRUTH, EIGHT.means))[0]
-    detections = sensor_detections([view_of("0", camera, y)], EIGHT, PeakOptions())
+    detections = sensor_detections([view_of("0", camera, y)], EIGHT, SearchBudget())
     images = label_images(SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4)))
     towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
@@ -86,7 +86,7 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
 ) -> None:
     def kinds(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
-        seen = sensor_detections(views, EIGHT, PeakOptions())
+        seen = sensor_detections(views, EIGHT, SearchBudget())
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
         return [one.name for one in kinds_of_guesses(problem)]
 

@@ -6,11 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
-from mixpose.search.alignment import align_triples
 from mixpose.search.budget import SearchBudget
 from mixpose.search.from_three_rays import from_three_rays
-from mixpose.search.p3p import SIDES, depths
 from mixpose.search.problem import SearchProblem
+from mixpose.search.three_points import SIDES, align_triples, depths
 from mixpose.sensors import PinholeCamera
 
 

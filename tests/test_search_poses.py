@@ -16,7 +16,7 @@ from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.search import LIVE, THOROUGH, Candidate, SearchBudget, SearchState, search_frame
-from mixpose.search.alignment import align_triples
+from mixpose.search.three_points import align_triples
 from mixpose.sensors import ParallelBeam
 from mixpose.tracking import estimate_pose
 

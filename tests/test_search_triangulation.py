@@ -11,7 +11,6 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
 from mixpose.search import SearchBudget
-from mixpose.search.budget import PeakOptions
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_point_triples import (
     by_promise,
@@ -92,7 +91,7 @@ def test_points_that_more_cameras_confirm_come_first() -> None:
         y = np.concatenate([false, camera.project(points)[0]])
         views.append(View(str(k), camera, Observation(PointPattern(y, np.ones(45)), 1.0)))
     body = Body("five", tuple(PointFeature(point) for point in points))
-    detections = sensor_detections(views, body, PeakOptions())
+    detections = sensor_detections(views, body, SearchBudget())
     rays = [each.rays for each in detections if each.rays is not None]
     budget = SearchBudget(max_points=10)
     problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget)

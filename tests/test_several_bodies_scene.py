@@ -230,7 +230,7 @@ def test_three_markers_of_a_body_that_gives_way_may_be_three_of_its_others() -> 
 def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    asked: list[int | None] = []
+    asked: list[float] = []
     frames: list[int] = []
 
     def search(views: Sequence[View], body: Body, **options: Any) -> SearchResult:

@@ -88,7 +88,7 @@ _ERRORS = (
     Mutant(
         "density-errors-of-all-detections-alike",
         "density/extraction_error.py",
-        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])",
+        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])",
         "weights = shares",
         "a cut spot is noise of all others",
     ),
@@ -185,8 +185,8 @@ _MET = (
     Mutant(
         "density-detection-met-twice",
         "density/features_met.py",
-        "if i not in met and j not in taken:",
-        "if i not in met:",
+        "if found.detections[i] < 0 and j not in taken:",
+        "if found.detections[i] < 0:",
         "one detection is taken for several features, hidden ones count as seen",
     ),
     Mutant(

@@ -55,8 +55,8 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "shares[squared > (errors.outlying**2 * variances)[sensor]]",
-        "shares[squared > np.inf]",
+        "limits = errors.outlying**2 * variances[:, None]",
+        "limits = np.inf",
         "a cut spot bends the pose",
         ("test_fit_noise.py",),
     ),
@@ -71,8 +71,8 @@ _NARROW = (
     Mutant(
         "fit-move-without-the-noise",
         "fit/near.py",
-        "weights = shares / variances[sensor]",
-        "weights = shares",
+        "self.offsets.shares / variances[:, None]",
+        "self.offsets.shares",
         "how far narrower blurs move the pose is told in σ_ε, not in standard deviations",
         ("test_fit_noise.py",),
     ),

@@ -29,8 +29,8 @@ _NOISE = (
     Mutant(
         "judgement-noise-with-the-coordinates-used-up",
         "judgement/noise.py",
-        "_level(*one, int(free.sum()), model)",
-        "_level(*one, 0, model)",
+        "found.residuals(k), int(free.sum()), model",
+        "found.residuals(k), 0, model",
         "noise seems smaller than it is",
     ),
     Mutant(

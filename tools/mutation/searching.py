@@ -116,8 +116,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers/narrowed.py",
-        "> len(offsets) / 2:",
-        "> len(offsets):",
+        "> len(each) / 2 for",
+        "> len(each) for",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),
     ),
@@ -188,8 +188,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-starts-of-one-seed",
         "tracking/proposers/multistart.py",
-        "_twists(uncertainty, rules.drawn, data.options.seed)",
-        "_twists(uncertainty, rules.drawn, 0)",
+        "default_rng(data.options.seed)",
+        "default_rng(0)",
         "the seed of a session does nothing",
         (_STARTS,),
     ),
@@ -316,7 +316,7 @@ _SEARCH = (
     Mutant(
         "search-bright-detections-count-more",
         "search/detections.py",
-        "alike = Observation(PointPattern(points, np.ones(len(points))),",
+        "alike = Observation(PointPattern(points, ones),",
         "alike = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
         "a bright blob is worth more features than a faint one",
     ),
@@ -357,9 +357,9 @@ _SEARCH = (
     ),
     Mutant(
         "search-triangles-turned-back",
-        "search/alignment.py",
-        "(flat_body.conj() * flat_world)",
-        "(flat_body * flat_world.conj())",
+        "search/three_points.py",
+        "c, s = turn.real, turn.imag",
+        "c, s = turn.real, -turn.imag",
         "guesses from three points are turned the wrong way",
     ),
     Mutant(

@@ -52,6 +52,7 @@ MOST_OWN = 128
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
 _AT_ONCE = 300_000  # cells or pairs that are worked on together: they stay in the cache
+_MANY = 100  # detections of a sensor: of so many, those beside all tiles are left out first
 _BESIDE = 2.0  # cells beside a place that are looked up, at most
 _SIDES = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
 _QUARTERS = np.full(4, 0.25, dtype=np.float32)
@@ -160,11 +161,16 @@ class Atlas:
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
-        away = self._q[sensors] - middles[:, None]
+        reach, q, chosen = 0.5 * self.tile + self._scale.reach, self._q, None
+        if self._most > _MANY:
+            inside = (q > middles.min(axis=0) - reach) & (q < middles.max(axis=0) + reach)
+            chosen = np.flatnonzero(inside.all(axis=2).any(axis=0))
+            q = q[:, chosen]
+        away = q[sensors] - middles[:, None]
         np.abs(away, out=away)
-        near = away < 0.5 * self.tile + self._scale.reach
+        near = away < reach
         of, which = np.nonzero(near[..., 0] & near[..., 1])
-        return of, which
+        return of, which if chosen is None else chosen[which]
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
         """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections `_near` them.

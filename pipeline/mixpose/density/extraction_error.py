@@ -88,11 +88,10 @@ def sums_of(noises: Sequence[Noise]) -> Floats:
 
 
 class Offsets(NamedTuple):
-    """Offsets of K features in L sensors."""
+    """Offsets of N features in L sensors."""
 
-    squared: Floats  # (K,) in σ_ε²
-    shares: Floats  # (K,) how far each feature was met
-    sensor: Indices  # (K,)
+    squared: Floats  # (L, N) in σ_ε²
+    shares: Floats  # (L, N) how far each feature was met
     dimensions: Indices  # (L,) coordinates of each sensor
     finest: Floats  # (L,) narrowest blur of each sensor, in σ_ε
 
@@ -144,10 +143,9 @@ def _seen_at(
     blurs: Floats, before: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules
 ) -> Seen:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, shares, sensor, dimensions, finest = offsets
-    weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[sensor])
-    totals = np.bincount(sensor, weights, len(dimensions)).tolist()
-    sums = np.bincount(sensor, weights * squared, len(dimensions)).tolist()
+    squared, shares, dimensions, finest = offsets
+    weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])
+    totals, sums = weights.sum(axis=1).tolist(), (weights * squared).sum(axis=1).tolist()
     squares, degrees = [], []
     for total, weighted, m, blur in zip(totals, sums, dimensions.tolist(), blurs.tolist()):
         q = weighted / max(m * total, _NOTHING)
@@ -173,22 +171,16 @@ def log_likelihood(
 ) -> float:
     """Of offsets, normal ones and some that are anywhere, less that of none being noise.
 
-    What a pose is free to fit is paid for.
-
-    Parameters
-    ----------
-    blurs : (L,) array
-        That go by the noise; the others as of `errors_seen`.
+    What a pose is free to fit is paid for.  Blurs (L,) go by the noise.
     """
-    m = offsets.dimensions[offsets.sensor]
-    variances = (blurs[offsets.sensor] / rules.blur) ** 2
+    m, variances = offsets.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2
     peaks = (2 * np.pi * variances) ** (-0.5 * m)
     anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
     odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * offsets.squared / variances)
     believed = m * offsets.shares * odds / (1 + odds)
-    logs = np.log(2 * np.pi * variances)
-    price = 0.5 * free * float(believed @ logs) / max(float(believed.sum()), _NOTHING)
-    return float(offsets.shares @ np.log1p(odds)) + price
+    logs = believed * np.log(2 * np.pi * variances)
+    price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), _NOTHING)
+    return float((offsets.shares * np.log1p(odds)).sum()) + price
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:

@@ -116,11 +116,9 @@ def _nearest(pattern: PointPattern, y: Floats, weights: Floats, reach: Floats) -
     squared = (away * away).sum(axis=-1)
     near_i, near_j = np.nonzero(squared <= reach[:, None])
     order = np.argsort(squared[near_i, near_j], kind="stable")
-    met: set[int] = set()
     taken: set[int] = set()
     for i, j in zip(near_i[order].tolist(), near_j[order].tolist(), strict=True):
-        if i not in met and j not in taken:
-            met.add(i)
+        if found.detections[i] < 0 and j not in taken:
             taken.add(j)
             found.shares[i] = weights[i]
             found.offsets[i] = away[i, j]

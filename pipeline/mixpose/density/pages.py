@@ -81,7 +81,7 @@ class Pages:
         self.table = np.full(sensors * plane.squares, _PENDING, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
         side = plane.page + 3
-        columns = len(self.table) * side // _LARGEST + 1
+        columns = min(len(self.table) * side // _LARGEST + 1, _LARGEST // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1
         # from a place in the plane to one in the array, by page; from nothing out of the array
@@ -110,9 +110,10 @@ class Pages:
             Pages that it is to draw at once, at most.
         """
         plane = self.plane
-        end = plane.origin + np.array(plane.shape) * plane.page - 1e-3
-        np.clip(index, plane.origin, end, out=index)
-        columns_rows = ((index - plane.origin) * (1.0 / plane.page)).astype(np.intp)
+        index -= plane.origin
+        np.maximum(index, 0.0, out=index)
+        np.minimum(index, np.array(plane.shape) * plane.page - 1e-3, out=index)
+        columns_rows = (index * (1.0 / plane.page)).astype(np.intp)
         squares = columns_rows @ np.array([1, plane.shape[0]]) + self._first
         number = self.table[squares]
         if number.min(initial=0) < 0:
@@ -120,15 +121,18 @@ class Pages:
             for some in np.array_split(pending, -(-len(pending) // at_once)):
                 sensors, place = np.divmod(some, plane.squares)
                 rows, columns = np.divmod(place, plane.shape[0])
-                middles = plane.origin + plane.page * (np.stack([columns, rows], axis=1) + 0.5)
-                filled, pages = draw(sensors, middles)
+                middles = plane.page * (np.stack([columns, rows], axis=1) + 0.5)
+                filled, pages = draw(sensors, plane.origin + middles)
                 self.table[some] = 0
                 self.table[some[filled]] = self._kept(pages, middles[filled])
             number = self.table[squares]
         index += self._shifts[number]
 
     def _kept(self, pages: Singles, middles: Floats) -> Indices:
-        """Numbers of pages (F, side, 3 side) that are put into the array."""
+        """Numbers of pages (F, side, 3 side) that are put into the array.
+
+        Middles (F, 2) are in cells from the origin of the plane.
+        """
         rows, side, columns, _ = self._room.shape
         numbers = np.arange(self._drawn, self._drawn + len(pages))
         self._drawn += len(pages)

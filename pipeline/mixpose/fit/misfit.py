@@ -194,14 +194,8 @@ def fit_freed(
 ) -> Floats | None:
     """Fit the pose to freed features by least squares; None where no place is surely whose.
 
-    Parameters
-    ----------
-    densities : sequence of SensorDensity
-    points : (n, 3) array
-        The body's features, all of one weight and seen by all sensors.
-    starts : sequence of (4, 4) array
-        Poses from which correspondences are sought.
-    free : (6,) bool
+    The features (n, 3), all of one weight, are seen by all sensors; correspondences are sought from
+    poses (4, 4), which may change in free directions (6,).
     """
     coordinates = sum(sensor.geometry.dimension for sensor in densities)
     redundant = coordinates * len(points) - int(free.sum())

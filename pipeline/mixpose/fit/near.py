@@ -307,17 +307,16 @@ class _Met(NamedTuple):
 
     def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
         """Whether no offset is larger than noise of variances (L,) lets it be."""
-        squared, shares, sensor, _, _ = self.offsets
-        return not shares[squared > (errors.outlying**2 * variances)[sensor]].any()
+        limits = errors.outlying**2 * variances[:, None]
+        return not self.offsets.shares[self.offsets.squared > limits].any()
 
     def moved(
         self, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
     ) -> float:
         """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
-        squared, shares, sensor, _, _ = self.offsets
-        now, then = (np.exp(-0.25 * squared / one[sensor] ** 2) for one in (blurs, narrower))
-        weights = shares / variances[sensor]
-        J = self.J[..., free].reshape(2 * len(shares), -1)
+        squared, weights = self.offsets.squared, self.offsets.shares / variances[:, None]
+        now, then = (np.exp(-0.25 * squared / one[:, None] ** 2) for one in (blurs, narrower))
+        J = self.J[..., free].reshape(self.away.size, -1)
         gradient = (weights * (then - now)).repeat(2) * self.away.ravel() @ J
         rows = (weights * then).repeat(2)[:, None] * J
         return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])
@@ -354,6 +353,4 @@ def _met(
         for view, one in zip(objective.views, places, strict=True)
     ]
     least = np.minimum(np.maximum(errors.blur * beside, finest), 1.0)
-    sensor = np.arange(len(C)).repeat(C.shape[1])
-    offsets = Offsets(squared.ravel(), shares.ravel(), sensor, dimensions, least)
-    return _Met(offsets, away, J, places)
+    return _Met(Offsets(squared, shares, dimensions, least), away, J, places)

@@ -39,21 +39,11 @@ _VALUE_ERROR = value_error(FINE_STEPS)
 
 @dataclass(frozen=True)
 class NormalPrior:
-    """A normal distribution of the pose.
+    """A normal distribution of the pose."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-        Its mean.
-    uncertainty : (6,) float64
-        Standard deviations, lengths and radians; positive where free.
-    free : (6,) bool
-        Directions in which the pose may change.
-    """
-
-    T_world_object: Floats
-    uncertainty: Floats
-    free: NDArray[np.bool_]
+    T_world_object: Floats  # (4, 4) its mean
+    uncertainty: Floats  # (6,) standard deviations, lengths and radians; positive where free
+    free: NDArray[np.bool_]  # (6,) directions in which the pose may change
 
     def joined(self, likelihood: Quadratic, T_world_object: Floats) -> Quadratic:
         """A log-likelihood at a pose (4, 4), with the logarithm of the prior."""
@@ -143,22 +133,9 @@ def believed(
     prior: NormalPrior,
     rules: MisfitRules = MisfitRules(),
 ) -> tuple[Floats, bool]:
-    """The most probable pose, or the fit to freed features of a body that does not fit.
+    """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
 
-    Parameters
-    ----------
-    objective : MatchedObjective
-        At σ_ε of sensors with noise in their cells.
-    T_world_object : (4, 4) array
-        A maximum of the objective.
-    prior : NormalPrior
-    rules : MisfitRules
-
-    Returns
-    -------
-    (4, 4) array
-    bool
-        Whether features were freed.
+    Or the fit to freed features of a body that does not fit, and whether it is that.
     """
     body = objective.projection.body
     points = body.nodes.points

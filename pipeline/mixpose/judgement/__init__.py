@@ -32,7 +32,7 @@ from mixpose.judgement.judge import (
     judge_together,
     nearest_alike,
 )
-from mixpose.judgement.noise import NoiseModel, Residuals, joined_offsets
+from mixpose.judgement.noise import NoiseModel, Residuals
 
 __all__ = [
     "APART",
@@ -59,7 +59,6 @@ __all__ = [
     "is_far_off",
     "is_possible",
     "is_sure",
-    "joined_offsets",
     "judge",
     "judge_together",
     "nearest_alike",

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import fdtri
 
 from mixpose.body import Body
@@ -232,18 +233,9 @@ def contradict(
 ) -> bool:
     """Whether the two sensors of a frame contradict each other: no pose is right for both.
 
-    Of three sensors the one that disagrees is left out.  Of two, nobody can tell which is wrong.
-
-    Parameters
-    ----------
-    judged : Judged
-        The frame's best pose.
-    before : Noise
-        Residuals of the frames before.
-    agreed : bool
-        Whether two sensors met the body in some frame before: then one may miss it now.
-    rules : AcceptanceRules
-    model : NoiseModel
+    Of three sensors the one that disagrees is left out; of two, nobody can tell which is wrong.
+    `before` are the residuals of the frames before, and where two sensors `agreed` in one of them,
+    one may miss the body now.
     """
     used = [one for one in judged.associations if judged.sensors[one.name].used]
     if len(used) != 2 or any(one.J.shape[1] != 2 for one in used):
@@ -270,14 +262,14 @@ def _is_between(
     """Offsets far beyond the noise so far, which a pose of its own takes away in each sensor."""
     if not is_far_off(used, before, rules, model):
         return False
-    apart = [_left_alone(one) for one in used]
-    own = sum(one.measurements - rank for one, (_, rank) in zip(used, apart, strict=True))
-    if own < 1:
-        return False
-    degrees = sum(one.measurements for one in used) - 6
-    alone = sum(left for left, _ in apart)
-    gained = (sum(one.squares for one in used) - alone) / max(degrees - own, 1.0)
-    return bool(gained > fdtri(max(degrees - own, 1.0), own, model.by_chance) * alone / own)
+    J = block_diag(*(one.rows[:, :6] for one in used))
+    J, offsets = J / np.maximum(np.linalg.norm(J, axis=0), 1e-12), [one.rows[:, 6] for one in used]
+    taken, _, rank, _ = np.linalg.lstsq(J, np.concatenate(offsets), rcond=1e-6)
+    alone = float(((np.concatenate(offsets) - J @ taken) ** 2).sum())
+    # two poses take up more than the one that both have in common
+    own, more = sum(one.measurements for one in used) - rank, max(rank - 6, 1.0)
+    gained = (sum(one.squares for one in used) - alone) / more
+    return bool(own >= 1 and gained > fdtri(more, own, model.by_chance) * alone / own)
 
 
 def is_far_off(
@@ -292,11 +284,3 @@ def is_far_off(
     times = rules.disagreeing if is_known else rules.strange
     squares = sum(one.squares for one in used)
     return bool(squares / degrees >= times * max(known, model.smallest**2))
-
-
-def _left_alone(one: Association) -> tuple[float, int]:
-    """Squared offsets in σ² that a sensor's best own pose leaves, and what that pose takes up."""
-    J, offsets = one.rows[:, :6], one.rows[:, 6]
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
-    taken, _, rank, _ = np.linalg.lstsq(J / scale, offsets, rcond=1e-6)
-    return float(((offsets - J / scale @ taken) ** 2).sum()), int(rank)

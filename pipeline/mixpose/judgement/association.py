@@ -15,6 +15,7 @@ from mixpose.density import (
     ErrorRules,
     FeaturesMet,
     Observation,
+    Offsets,
     crowding,
     features_met,
     surplus,
@@ -27,64 +28,28 @@ from mixpose.sensors import by_calibration
 
 @dataclass(frozen=True)
 class Association:
-    """A pose against one sensor, at the finest blur; n features are in view.
-
-    Attributes
-    ----------
-    name : str
-        Of the sensor.
-    explained : float
-        Share of the sensor's density that the pose accounts for.
-    features : (n,) int
-        Nodes of the body that are in view.
-    shares : (n,) float64
-        How far each was met, 0 to its weight.
-    places : (n, m) float64
-        Where they are predicted.
-    offsets : (n, m) float64
-        Observed minus predicted place of each, sensor units; 0 where it was not met.  Two that
-        were detected as one have those of their middle.
-    J : (n, m, 6) float64
-        Jacobian of the predicted places by the pose, likewise.
-    expected : float
-        Sum of the weights of the features in view.
-    unseen : float
-        Sum of the weights of the features that face the sensor outside its view.
-    sigma : float
-        σ_ε.
-    finest : float
-        Narrowest blur of the sensor, in σ_ε.
-    crowd : float
-        Observed features per unit of the sensor's coordinates, around the prediction.
-    count : float
-        Number of observed features.
-    detections : (n,) int
-        The observed features by which they were met; -1 for none.
-    by_calibration : (n, m, K) float64
-        By how much each is elsewhere where the sensor's calibration is off by a standard deviation
-        in one of K things.
-    merged : int
-        Features that were detected as one with another.
-    surplus : float
-        Where features are missed in an image: detections around the body that belong to none.
-    """
+    """A pose against one sensor, at the finest blur; n features are in view."""
 
     name: str
-    explained: float
-    features: NDArray[np.intp]
-    shares: Floats
-    places: Floats
-    offsets: Floats
-    J: Floats
-    expected: float
-    unseen: float
-    sigma: float
-    finest: float
-    crowd: float
-    count: float
-    merged: int = 0
-    surplus: float = 0.0
+    explained: float  # share of the sensor's density that the pose accounts for
+    features: NDArray[np.intp]  # (n,) nodes of the body that are in view
+    shares: Floats  # (n,) how far each was met, 0 to its weight
+    places: Floats  # (n, m) where they are predicted, sensor units
+    offsets: (
+        Floats  # (n, m) observed minus predicted; 0 where not met; of two in one, their middle's
+    )
+    J: Floats  # (n, m, 6) Jacobian of the predicted places by the pose, likewise
+    expected: float  # sum of the weights of the features in view
+    unseen: float  # sum of the weights of the features that face the sensor outside its view
+    sigma: float  # σ_ε
+    finest: float  # narrowest blur of the sensor, in σ_ε
+    crowd: float  # observed features per unit of the sensor's coordinates, around the prediction
+    count: float  # number of observed features
+    merged: int = 0  # features that were detected as one with another
+    surplus: float = 0.0  # detections around the body that belong to none, where some are missed
+    # (n,) the observed features by which they were met; -1 for none
     detections: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    # (n, m, K) by how much each is elsewhere for calibrations off by a deviation in one of K things
     by_calibration: Floats | None = None
 
     @cached_property
@@ -149,6 +114,12 @@ class Matches:
     crowd: Floats  # (K, L) observed features per m-th power of σ_ε
     count: Floats  # (K, L) number of observed features
     unseen: Floats  # (K, L) weight of the features that face a sensor outside its view
+    each: Sequence[Sequence[Association]] = ()  # what they were put together of, if of these
+
+    def residuals(self, k: int = 0) -> Offsets:
+        """Offsets of the features of all sensors at one of the poses."""
+        squared, finest = (self.offsets[k] ** 2).sum(axis=2), [one.finest for one in self.each[k]]
+        return Offsets(squared, self.shares[k], self.dimensions, np.array(finest))
 
     @classmethod
     def of(cls, each: Sequence[Sequence[Association]]) -> Matches:
@@ -173,7 +144,7 @@ class Matches:
             (one.crowd * one.sigma ** one.J.shape[1], one.count, one.unseen) for one in all_of_them
         ]
         crowd, count, unseen = np.array(whole).reshape(*shape[:2], 3).transpose(2, 0, 1)
-        return cls(dimensions, weights, shares, places, offsets, J, crowd, count, unseen)
+        return cls(dimensions, weights, shares, places, offsets, J, crowd, count, unseen, each)
 
 
 def associate(

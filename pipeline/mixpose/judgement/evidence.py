@@ -102,15 +102,8 @@ def log_evidence(
 ) -> Floats:
     """Logarithm of the odds (K,) for bodies at K poses against mere clutter.
 
-    Parameters
-    ----------
-    found : Matches
-        Of all sensors that saw something.
-    variances, sizes, detection, spreads
-        As `odds_of` has them.
-    free : (6,) bool
-    priors : sequence of Prior
-    information : (K, 6, 6) array
+    Of poses with an information (K, 6, 6) that are free in directions (6,), each with a prior; all
+    else as `odds_of` has it.
     """
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before

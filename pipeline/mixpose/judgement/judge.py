@@ -30,55 +30,24 @@ class JudgementRules:
 
 @dataclass(frozen=True)
 class Judged:
-    """A pose, and how well it explains the frame.
+    """A pose, and how well it explains the frame."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    sensors : dict of str to SensorReport
-    score : float
-        Mean cosine between predicted and observed densities, 0 to 1.
-    coverage : float
-        Mean share of the body's features in view that are met.
-    measurements : float
-        Number of met sensor coordinates.
-    covariance : (6, 6) float64
-        Zero in directions that are not estimated.
-    log_evidence : float
-        Logarithm of the odds for this pose against mere clutter.
-    residuals : Residuals
-        Of this frame and, fading, of those before it, for the next frame.
-    associations : tuple of Association
-        The pose against each sensor that saw something.
-    spread : (6,) float64 or None
-        Standard deviations of the pose where they are as large as its motion.
-    proposer : str
-        Where the pose came from.
-    value : float
-        Of what was climbed, at the pose.
-    lasting : (6, 6) float64
-        Of the covariance, what lasts from frame to frame.
-    surplus : float
-        How many times larger its residuals are than those before let chance make them.
-    bent : (6, 6) float64
-        Covariance of the pose where features are off by all that the body's spreads let them be;
-        zero of a body that is exact.
-    """
-
-    T_world_object: Floats
+    T_world_object: Floats  # (4, 4)
     sensors: dict[str, SensorReport]
-    score: float
-    coverage: float
-    measurements: float
-    covariance: Floats
-    log_evidence: float
-    residuals: Residuals
-    associations: tuple[Association, ...] = ()
-    spread: Floats | None = None
-    proposer: str = ""
-    value: float = 0.0
+    score: float  # mean cosine between predicted and observed densities, 0 to 1
+    coverage: float  # mean share of the body's features in view that are met
+    measurements: float  # number of met sensor coordinates
+    covariance: Floats  # (6, 6) zero in directions that are not estimated
+    log_evidence: float  # logarithm of the odds for this pose against mere clutter
+    residuals: Residuals  # of this frame and, fading, of those before it, for the next frame
+    associations: tuple[Association, ...] = ()  # the pose against each sensor that saw something
+    spread: Floats | None = None  # (6,) standard deviations where they are as large as its motion
+    proposer: str = ""  # where the pose came from
+    value: float = 0.0  # of what was climbed, at the pose
+    # (6, 6) of the covariance, what lasts from frame to frame
     lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    surplus: float = 0.0
+    surplus: float = 0.0  # how many times larger its residuals are than chance makes them
+    # (6, 6) where features are off by all that the spreads of a body that gives way let them be
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
@@ -111,11 +80,10 @@ def judge_together(
     pairs = [
         associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
     ]
-    each = [associations for associations, _ in pairs]
-    found = Matches.of(each)
-    noises = noises_of(each, found, free, [one.before for one in cases], rules.noise)
+    found = Matches.of([associations for associations, _ in pairs])
+    noises = noises_of(found, free, [one.before for one in cases], rules.noise)
     variances = np.array([noise.variances for noise in noises])
-    evidence, bent = _evidence(cases, each, found, variances, free, rules.detection)
+    evidence, bent = _evidence(cases, found, variances, free, rules.detection)
     parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
     return [
         Judged(
@@ -139,7 +107,6 @@ def judge_together(
 
 def _evidence(
     cases: Sequence[Case],
-    each: Sequence[Sequence[Association]],
     found: Matches,
     variances: Floats,
     free: NDArray[np.bool_],
@@ -150,7 +117,7 @@ def _evidence(
     whole, widened = found, variances
     blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
     if any(blind):
-        whole = Matches.of([[*own, *others] for own, others in zip(each, blind, strict=True)])
+        whole = Matches.of([[*own, *others] for own, others in zip(found.each, blind, strict=True)])
         widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
     priors = [
         one.prior or flat_prior(body, free, detection)

@@ -52,13 +52,9 @@ class Frame(NamedTuple):
 
 
 def frames_of(
-    each: Sequence[Sequence[Association]],
-    found: Matches,
-    variances: Floats,
-    free: NDArray[np.bool_],
-    outlying: float,
+    found: Matches, variances: Floats, free: NDArray[np.bool_], outlying: float
 ) -> list[Frame]:
-    """What K frames show, associated by frame and sensor, for noise (K, L) in σ_ε².
+    """What K frames show, for noise (K, L) in σ_ε².
 
     Detections are left out that are farther off than `outlying` standard deviations of the noise.
     """
@@ -69,7 +65,7 @@ def frames_of(
     scale = (np.sqrt(shares) / noise[..., None])[..., None]
     rows = scale[..., None] * found.J
     r, J = (scale * found.offsets).reshape(frames, -1, 1), rows[..., free]
-    doubts = [_doubts(*one) for one in zip(each, scale, J, strict=True)]
+    doubts = [_doubts(*one) for one in zip(found.each, scale, J, strict=True)]
     J = J.reshape(frames, -1, J.shape[4])
     fields, kinds = _fields(found.places, shares, found.dimensions)
     inverse = inverses(J.swapaxes(1, 2) @ J)
@@ -86,22 +82,21 @@ def frames_of(
     of_fields = (drawn[:, None] * kinds.T[:, None]) @ drawn.swapaxes(1, 2)[:, None]
     parts = np.concatenate([inverse[:, None], of_fields, part[:, None]], axis=1)
     # the noise of the sensor that each field is of
-    sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)
-    information /= sizes[:, :, None] * sizes[:, None]
-    names = tuple(one.name for one in each[0])
-    return [
-        Frame(
-            Moments(seen[k], expected[k]) if expected[k, 0, 0] > 0 else Moments(),
-            parts[k],
-            Lasting(names, information[k], vector[k] / sizes[k]),
-            drawn[k] / sizes[k],
-            inverse[k] @ doubts[k],
-            np.hstack([r[k], left[k] / sizes[k]]),
-            fields[k],
-            kinds,
-        )
-        for k in range(frames)
-    ]
+    sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)[:, None]
+    information /= sizes.swapaxes(1, 2) * sizes
+    names = tuple(one.name for one in found.each[0])
+    each = zip(
+        [Moments(*one) if one[1][0, 0] > 0 else Moments() for one in zip(seen, expected)],
+        parts,
+        [Lasting(names, *one) for one in zip(information, vector / sizes[:, 0])],
+        drawn / sizes,
+        [moves @ doubt for moves, doubt in zip(inverse, doubts)],
+        np.concatenate([r, left / sizes], axis=2),
+        fields,
+        [kinds] * frames,
+        strict=True,
+    )
+    return [Frame(*one) for one in each]
 
 
 def _fields(places: Floats, shares: Floats, dimensions: NDArray[np.intp]) -> tuple[Floats, Floats]:

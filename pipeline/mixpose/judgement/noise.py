@@ -61,12 +61,7 @@ class NoiseModel:
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
         """Factors that make the Gaussian ellipsoid as large as that of the F distribution.
 
-        Parameters
-        ----------
-        directions : int
-            Of the pose that are free.
-        degrees : (n,) array or float
-            Of freedom, from which the variances were estimated.
+        Of a pose that is free in so many directions; variances have degrees (n,) of freedom.
         """
         if directions == 0 or self.confidence == 0:
             return np.ones(np.shape(degrees))
@@ -102,7 +97,6 @@ class FrameNoise(NamedTuple):
 
 
 def noises_of(
-    each: Sequence[Sequence[Association]],
     found: Matches,
     free: NDArray[np.bool_],
     before: Sequence[Residuals],
@@ -113,10 +107,11 @@ def noises_of(
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
     own, and is remembered as one that has the largest that chance makes.
     """
-    pairs = list(zip(each, before, strict=True))
-    levels = [_level(*one, int(free.sum()), model) for one in pairs]
-    scales = np.array([one.scale for one in levels])
-    frames = frames_of(each, found, scales, free, model.errors.outlying)
+    pairs = list(zip(found.each, before, strict=True))
+    levels = [
+        _level(*one, found.residuals(k), int(free.sum()), model) for k, one in enumerate(pairs)
+    ]
+    frames = frames_of(found, np.array([one.scale for one in levels]), free, model.errors.outlying)
     parts = zip(pairs, levels, frames, strict=True)
     return [_frame_noise(*pair, level, frame, free, model) for pair, level, frame in parts]
 
@@ -132,9 +127,13 @@ class _Level(NamedTuple):
 
 
 def _level(
-    associations: Sequence[Association], before: Residuals, count: int, model: NoiseModel
+    associations: Sequence[Association],
+    before: Residuals,
+    offsets: Offsets,
+    count: int,
+    model: NoiseModel,
 ) -> _Level:
-    offsets, rules = joined_offsets(associations), model.errors
+    rules = model.errors
     past = sums_of([before.noise.get(one.name, Noise()) for one in associations])
     sums = model.memory * past
     seen = errors_seen(offsets, count, sums, rules)
@@ -175,17 +174,6 @@ def _frame_noise(
     noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
     remembered = Residuals({**before.noise, **noise}, moments, lasting)
     return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
-
-
-def joined_offsets(associations: Sequence[Association]) -> Offsets:
-    """Offsets of the features of all sensors."""
-    return Offsets(
-        np.concatenate([one.squared for one in associations]),
-        np.concatenate([one.shares for one in associations]),
-        np.repeat(np.arange(len(associations)), [len(one.shares) for one in associations]),
-        np.array([one.J.shape[1] for one in associations]),
-        np.array([one.finest for one in associations]),
-    )
 
 
 def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:

@@ -14,42 +14,15 @@ from mixpose.constants import constant
 
 
 @dataclass(frozen=True)
-class PeakOptions:
-    """Which maxima of grey values count as detections."""
-
-    max_peaks: int = constant(64, "peaks kept, highest first: more are noise on every recording")
-    height: float = constant(0.15, "of the highest peak: lower maxima of a blurred spot are noise")
-    grey_floor: float = constant(0.1, "of the largest value: below it a profile is background")
-
-
-@dataclass(frozen=True)
-class LabelOptions:
-    """How finely detections are drawn to be counted."""
-
-    cells: float = constant(4.0, "per radius of a disk: its rim is off by an eighth of the gate")
-    max_cells: int = constant(16_000_000, "per camera; larger planes get coarser")
-    min_cosine: float = constant(0.1, "to the middle of the rays: at 84° a ray misses the plane")
-
-
-@dataclass(frozen=True)
-class DescentOptions:
-    """How guesses are refined."""
-
-    damping: float = constant(1e-3, "share of the curvature added: directions without any stay")
-    max_turn: float = constant(0.35, "rad in one step: farther the linear model holds no longer")
-    same: float = constant(0.01, "of the body's radius: poses nearer to each other are one")
-    alike: float = constant(
-        0.03, "of the radius, root mean square over features: candidates nearer than this are one"
-    )
-
-
-@dataclass(frozen=True)
 class SearchBudget:
     """Limits and thresholds of one search."""
 
     max_guesses: float = constant(
         np.inf, "guesses of one search, counted and not timed, so that results repeat"
     )
+    max_peaks: int = constant(64, "peaks kept, highest first: more are noise on every recording")
+    height: float = constant(0.15, "of the highest peak: lower maxima of a blurred spot are noise")
+    grey_floor: float = constant(0.1, "of the largest value: below it a profile is background")
     gate: float = constant(3.0, "largest error of a detection in σ_ε: 99 % of errors in a plane")
     max_points: int = constant(1000, "triangulated points kept, the most promising first")
     max_prosac_points: int = constant(50, "of them all triples are tried: 19,600, which take 0.1 s")
@@ -86,6 +59,11 @@ class SearchBudget:
     chunk: int = constant(4096, "problems solved together: numbers stay in the cache")
     min_pixels: float = constant(3.0, "apart in the image, for two features to be told apart")
     min_sine: float = constant(0.02, "of the angle between rays: below it no depth is fixed")
+    cells: float = constant(
+        4.0, "per radius of a disk that is drawn for a detection: its rim is off by an eighth of it"
+    )
+    max_cells: int = constant(16_000_000, "per camera; larger planes get coarser")
+    min_cosine: float = constant(0.1, "to the middle of the rays: at 84° a ray misses the plane")
     max_together: int = constant(100_000, "features times poses tested together: cache size")
     test_features: int = constant(16, "features by which many guesses are compared at first")
     shortlist: int = constant(150, "guesses refined; fewer for bodies of more than 8 features")
@@ -97,6 +75,12 @@ class SearchBudget:
     )
     sufficient: float = constant(
         0.45, "the same beyond doubt, and for no spread orientations to be tried"
+    )
+    damping: float = constant(1e-3, "share of the curvature added: directions without any stay")
+    max_turn: float = constant(0.35, "rad in one step: farther the linear model holds no longer")
+    same: float = constant(0.01, "of the body's radius: refined poses nearer to each other are one")
+    alike: float = constant(
+        0.03, "of the radius, root mean square over features: candidates nearer than this are one"
     )
     descent_features: int = constant(
         32,
@@ -147,9 +131,6 @@ class SearchBudget:
     finalists: int = constant(16, "guesses refined as rivals of a pose beyond doubt")
     improvement: float = constant(1.1, "factor in detections explained for another such look")
     checked: int = constant(3, "guesses refined at once to see whether others are needed")
-    descent: DescentOptions = DescentOptions()
-    labels: LabelOptions = LabelOptions()
-    peaks: PeakOptions = PeakOptions()
 
 
 THOROUGH = SearchBudget()

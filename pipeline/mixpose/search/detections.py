@@ -13,7 +13,7 @@ from mixpose.body import Body
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import Floats, GridPattern, PointPattern
-from mixpose.search.budget import PeakOptions
+from mixpose.search.budget import SearchBudget
 from mixpose.sensors import Rays
 
 
@@ -55,7 +55,7 @@ def is_pointlike(body: Body) -> bool:
 
 
 def sensor_detections(
-    views: Sequence[View], body: Body, options: PeakOptions
+    views: Sequence[View], body: Body, budget: SearchBudget
 ) -> list[SensorDetections]:
     """Detections of all views that saw something."""
     found = []
@@ -68,18 +68,17 @@ def sensor_detections(
         if isinstance(pattern, PointPattern):
             points = pattern.points[pattern.weights > 0]
         elif observation.dimension == 2 and is_pointlike(body):
-            points = peaks(pattern, observation.sigma, options)
+            points = peaks(pattern, observation.sigma, budget)
         else:
             nothing = np.zeros((0, observation.dimension))
-            mean, spread = _moments(*_weighted_places(pattern, options))
-            found.append(SensorDetections(view, nothing, None, mean, spread))
+            moments = _moments(*_weighted_places(pattern, budget))
+            found.append(SensorDetections(view, nothing, None, *moments))
             continue
         if len(points):
-            alike = Observation(PointPattern(points, np.ones(len(points))), observation.sigma)
-            mean, spread = _moments(points, np.ones(len(points)))
-            rays = view.sensor.rays(points)
+            ones, rays = np.ones(len(points)), view.sensor.rays(points)
+            alike = Observation(PointPattern(points, ones), observation.sigma)
             seen = View(view.name, view.sensor, alike, view.delay)
-            found.append(SensorDetections(seen, points, rays, mean, spread))
+            found.append(SensorDetections(seen, points, rays, *_moments(points, ones)))
     return found
 
 
@@ -90,23 +89,18 @@ def _moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
     return mean, float(np.sqrt(variance))
 
 
-def _weighted_places(pattern: GridPattern, options: PeakOptions) -> tuple[Floats, Floats]:
+def _weighted_places(pattern: GridPattern, budget: SearchBudget) -> tuple[Floats, Floats]:
     """Grid points (K, m) that stand out, and their values (K,)."""
     values = pattern.values.astype(np.float64)
-    rows, columns = np.nonzero(values > options.grey_floor * values.max())
+    rows, columns = np.nonzero(values > budget.grey_floor * values.max())
     places = np.stack([columns, rows], axis=1)[:, : len(pattern.origin)]
     return pattern.origin + pattern.step * places, values[rows, columns]
 
 
-def peaks(pattern: GridPattern, sigma: float, options: PeakOptions) -> Floats:
-    """Local maxima (M, 2) of a blurred image, highest first, in sensor coordinates.
+def peaks(pattern: GridPattern, sigma: float, budget: SearchBudget) -> Floats:
+    """Local maxima (M, 2) of an image, highest first, in sensor coordinates.
 
-    Parameters
-    ----------
-    pattern : GridPattern
-    sigma : float
-        Standard deviation of the blur in sensor units.
-    options : PeakOptions
+    It is blurred by `sigma`, a standard deviation in sensor units.
     """
     values = np.asarray(pattern.values, dtype=np.float32)
     spread = max(sigma / pattern.step, 0.5)
@@ -115,21 +109,21 @@ def peaks(pattern: GridPattern, sigma: float, options: PeakOptions) -> Floats:
     )
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((blurred >= highest) & (blurred > options.height * blurred.max()))
-    order = np.argsort(-blurred[rows, columns], kind="stable")[: options.max_peaks]
+    rows, columns = np.nonzero((blurred >= highest) & (blurred > budget.height * blurred.max()))
+    order = np.argsort(-blurred[rows, columns], kind="stable")[: budget.max_peaks]
     rows, columns = rows[order], columns[order]
     inner_rows = np.clip(rows, 1, values.shape[0] - 2)
     inner_columns = np.clip(columns, 1, values.shape[1] - 2)
-    shift_u = _vertex(*(blurred[rows, inner_columns + k] for k in (-1, 0, 1)))
-    shift_v = _vertex(*(blurred[inner_rows + k, columns] for k in (-1, 0, 1)))
+    beside = np.array([[-1], [0], [1]])
+    shift_u = _vertex(blurred[rows, inner_columns + beside])
+    shift_v = _vertex(blurred[inner_rows + beside, columns])
     places = np.stack([inner_columns + shift_u, inner_rows + shift_v], axis=1)
     return np.asarray(pattern.origin + pattern.step * places)
 
 
-def _vertex(
-    before: NDArray[np.float32], here: NDArray[np.float32], after: NDArray[np.float32]
-) -> Floats:
-    """Offset of the top of the parabola through three neighbours, within half a step."""
+def _vertex(neighbours: NDArray[np.float32]) -> Floats:
+    """Offset of the top of parabolas through three neighbours (3, M), within half a step."""
+    before, here, after = neighbours
     bend = (2.0 * here - before - after).astype(np.float64)
     slope = 0.5 * (after - before).astype(np.float64)
     return np.asarray(np.clip(slope / np.maximum(bend, 1e-12), -0.5, 0.5))

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.search.alignment import align_triples
 from mixpose.search.problem import Kind, SearchProblem
 from mixpose.search.spread import far_apart
+from mixpose.search.three_points import align_triples
 from mixpose.search.triangulation import Indices, TriangulatedPoints
 
 

@@ -18,11 +18,11 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.records import Floats
-from mixpose.search.alignment import align_triples
 from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.three_points import SIDES, align_triples
 from mixpose.search.triangulation import Indices, TriangulatedPoints
 
-_SIDES = ((0, 1), (0, 2), (1, 2))
+_FIRST, _SECOND = np.transpose(SIDES)
 
 
 class FeatureTriangles(NamedTuple):
@@ -67,9 +67,8 @@ def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kin
         slack = 2 * found.tolerance[drawn].max(axis=1) + bent
         possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
         triples, sides = drawn[possible], sides[possible]
-        tolerance = found.tolerance[triples]
-        squares = np.stack([tolerance[:, i] ** 2 + tolerance[:, j] ** 2 for i, j in _SIDES], axis=1)
-        allowed = np.sqrt(squares + bent**2)
+        squares = found.tolerance[triples] ** 2
+        allowed = np.sqrt(squares[:, _FIRST] + squares[:, _SECOND] + bent**2)
         away, index = triangles.tree.query(
             sides,
             k=np.arange(1, min(budget.triangles_alike, len(triangles.corners)) + 1),
@@ -154,9 +153,8 @@ def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indic
 
 
 def _sides(points: Floats, triples: Indices) -> Floats:
-    corners = points[triples]
-    sides = [np.linalg.norm(corners[:, i] - corners[:, j], axis=1) for i, j in _SIDES]
-    return np.stack(sides, axis=1)
+    sides = points[triples[:, _FIRST]] - points[triples[:, _SECOND]]
+    return np.asarray(np.linalg.norm(sides, axis=2))
 
 
 def _is_wide(sides: Floats, min_height: float) -> NDArray[np.bool_]:

@@ -9,12 +9,13 @@ from math import comb, perm
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.search.alignment import align_triples
-from mixpose.search.p3p import SIDES, depths
 from mixpose.search.problem import Kind, SearchProblem
 from mixpose.search.spread import far_apart
+from mixpose.search.three_points import SIDES, align_triples, depths
 from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
+
+_FIRST, _SECOND = np.transpose(SIDES)
 
 
 def from_three_rays(problem: SearchProblem, rays: Rays) -> Kind:
@@ -80,15 +81,15 @@ def _perspective(
 ) -> Floats:
     distance2 = ((features[:, None] - features) ** 2).sum(axis=-1)
     between = rays.directions @ rays.directions.T
-    cosines = np.array([between[detections[i], detections[j]] for i, j in SIDES])
-    squared = np.array([distance2[corners[i], corners[j]] for i, j in SIDES])
+    cosines = between[detections[_FIRST], detections[_SECOND]]
+    squared = distance2[corners[_FIRST], corners[_SECOND]]
     distances, which = depths(cosines, squared)
     # smaller than this in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
     near = largest > min_pixels * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
-    body = features.T[:, corners[:, which]].swapaxes(0, 1)
-    directions = rays.directions.T[:, detections[:, which]].swapaxes(0, 1)
+    body = np.take(features.T, corners[:, which], axis=1).swapaxes(0, 1)
+    directions = np.take(rays.directions.T, detections[:, which], axis=1).swapaxes(0, 1)
     return align_triples(body, rays.origins[0][:, None] + directions * distances[:, None])
 
 
@@ -99,15 +100,12 @@ def _orthographic(
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    body = features.T[:, corners].swapaxes(0, 1)
-    seen = rays.origins.T[:, detections].swapaxes(0, 1)
+    body = np.take(features.T, corners, axis=1).swapaxes(0, 1)
+    seen = np.take(rays.origins.T, detections, axis=1).swapaxes(0, 1)
     tolerance = 3 * min_pixels * rays.offset
-    rise = []
-    for i, j in SIDES:
-        side, flat = body[j] - body[i], seen[j] - seen[i]
-        length2, flat2 = (side * side).sum(axis=0), (flat * flat).sum(axis=0)
-        possible = np.sqrt(flat2) <= np.sqrt(length2) + tolerance
-        rise.append(np.where(possible, np.sqrt(np.maximum(length2 - flat2, 0.0)), np.nan))
+    length, flat = (np.linalg.norm(each[_SECOND] - each[_FIRST], axis=1) for each in (body, seen))
+    rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
+    rise[flat > length + tolerance] = np.nan
     direction = rays.directions[0][:, None]
     poses = []
     for sign in (1.0, -1.0):

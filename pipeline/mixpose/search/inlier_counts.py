@@ -17,16 +17,14 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.records import Floats
-from mixpose.search.alignment import cross
-from mixpose.search.budget import LabelOptions
 from mixpose.search.detections import SensorDetections
 from mixpose.search.problem import SearchProblem
+from mixpose.search.three_points import cross
 from mixpose.sensors import Rays
 
 Integers: TypeAlias = NDArray[np.int32]
 
 _NEARNESS = 256  # a cell holds label * 256 + nearness
-_WORD = 63  # labels in one word of bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +33,10 @@ class LabelImage:
 
     Attributes
     ----------
-    axes : (3, 3) float64
-        Rows: the plane's two axes, scaled to cells, and the middle of the rays.
-    centre : (3,) float64
-        Centre of projection, or a point of the plane for parallel rays.
-    central : bool
-    origin : (2,) float64
-        Cells from the corner of the plane to the middle of the rays.
+    projection : (3, 4) float64
+        From the world to columns and rows of cells, homogeneous.
+    eye : (4,) float64
+        Centre of projection, or the way to it from everywhere, homogeneous.
     cells : (rows, columns) int32
         Detection 1 to M times 256, plus nearness: 255 at a detection, 0 at the rim.  Most are
         empty, and take no memory; the outermost are.
@@ -49,49 +44,47 @@ class LabelImage:
         M.
     """
 
-    axes: Floats
-    centre: Floats
-    central: bool
-    origin: Floats
+    projection: Floats
+    eye: Floats
     cells: Integers
     count: int
 
     def look_up(self, world: Floats) -> Integers:
         """Cells (K,) that points in the world (3, K) fall into."""
-        u, v, depth = self.axes @ world - (self.axes @ self.centre)[:, None]
-        if self.central:
-            scale = 1.0 / np.maximum(depth, 1e-300)
-            u *= scale
-            v *= scale
+        u, v, depth = self.projection[:, :3] @ world + self.projection[:, 3:]
+        scale = 1.0 / np.maximum(depth, 1e-300)
         rows, columns = self.cells.shape
-        column = np.clip(u + self.origin[0], 0.0, columns - 1.0).astype(np.int32)
-        row = np.clip(v + self.origin[1], 0.0, rows - 1.0).astype(np.int32)
-        return np.asarray(self.cells[row, column])
+        column = np.clip(u * scale, 0.0, columns - 1.0).astype(np.int32)
+        row = np.clip(v * scale, 0.0, rows - 1.0).astype(np.int32)
+        return np.asarray(np.take(self.cells, row * columns + column))
 
     def faced(self, world: Floats, outward: Floats) -> NDArray[np.bool_]:
         """Which points (3, K) with normals (3, K) turn their face to the camera."""
-        towards = self.centre[:, None] - world if self.central else -self.axes[2][:, None]
+        towards = self.eye[:3, None] - self.eye[3] * world
         return np.asarray((outward * towards).sum(axis=0) > 0)
 
 
 def label_images(problem: SearchProblem) -> list[LabelImage]:
     """Label images of all cameras, with disks as large as errors of detections may be."""
-    options = problem.budget.labels
-    return [_drawn(seen, rays, problem.reach(seen), options) for seen, rays in problem.cameras]
+    return [_drawn(problem, seen, rays) for seen, rays in problem.cameras]
 
 
-def _drawn(seen: SensorDetections, rays: Rays, radius: float, options: LabelOptions) -> LabelImage:
+def _drawn(problem: SearchProblem, seen: SensorDetections, rays: Rays) -> LabelImage:
+    options, radius = problem.budget, problem.reach(seen)
     middle = rays.directions.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
     side = cross(middle, np.eye(3)[np.abs(middle).argmin()])
     side /= np.linalg.norm(side)
     axes, centre = np.array([side, cross(middle, side), middle]), rays.origins[0]
-    points = rays.origins + rays.directions
-    plane = (points - centre) @ axes.T
+    to_plane, eye = np.column_stack([axes, -axes @ centre]), np.append(centre, 1.0)
+    if not rays.central:
+        to_plane[2], eye = [0.0, 0.0, 0.0, 1.0], np.append(-middle, 0.0)
     unit = rays.slope if rays.central else rays.offset
+    points = rays.origins + rays.directions
+    plane = points @ to_plane[:, :3].T + to_plane[:, 3]
+    depth = plane[:, 2:]
     # how many px a unit of the plane is at each detection, whatever the lens
     _, J, _ = seen.view.sensor.linearise(points)
-    depth = plane[:, 2:] if rays.central else np.ones((len(plane), 1))
     per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * depth[:, 0] * unit
     radii = radius / np.where(per_unit > 0, per_unit, 1.0)
     inside = depth[:, 0] > options.min_cosine
@@ -103,11 +96,11 @@ def _drawn(seen: SensorDetections, rays: Rays, radius: float, options: LabelOpti
     step = max(step, float(np.sqrt(np.prod(extent) / options.max_cells)))
     margin = radii.max() + 2 * step
     columns, rows = (np.ceil((extent + 2 * margin) / step) + 1).astype(int)
-    origin = -(lower - margin) / step
+    u, v = (margin - lower) / step
     cells = np.zeros((rows, columns), dtype=np.int32)
-    _draw(cells, places / step + origin, radii / step)
-    axes = axes / np.array([[unit * step], [unit * step], [1.0]])
-    return LabelImage(axes, centre, rays.central, origin, cells, len(rays))
+    _draw(cells, places / step + np.array([u, v]), radii / step)
+    to_cells = np.array([[1 / (unit * step), 0.0, u], [0.0, 1 / (unit * step), v], [0.0, 0.0, 1.0]])
+    return LabelImage(to_cells @ to_plane, eye, cells, len(rays))
 
 
 def _draw(cells: Integers, places: Floats, radii: Floats) -> None:
@@ -126,22 +119,10 @@ def _draw(cells: Integers, places: Floats, radii: Floats) -> None:
 def count_inliers(
     images: Sequence[LabelImage], body: Body, poses: Floats, max_together: int
 ) -> tuple[Floats, Floats]:
-    """Distinct detections explained by poses (H, 4, 4).
+    """Distinct detections (L, H) of each camera that poses (H, 4, 4) explain, and how nearly (H,).
 
-    Parameters
-    ----------
-    images : sequence of LabelImage
-    body : Body
-    poses : (H, 4, 4) array
-    max_together : int
-        Features times poses that are tested together.
-
-    Returns
-    -------
-    (L, H) array
-        Number per camera.
-    (H,) array
-        How near they are met: nearness, 0 to 1, summed over features, for ranking equals.
+    That is nearness, 0 to 1, summed over features, for ranking equals.  Not more than
+    `max_together` features times poses are tested together.
     """
     counts, near = np.zeros((len(images), len(poses))), np.zeros(len(poses))
     rows = max(max_together // len(body), 1)
@@ -157,17 +138,8 @@ def count_inliers(
                 outward = (axes[..., :3] @ body.normals.T).reshape(3, -1)
                 met = np.where(image.faced(world, outward), met, 0)
             met = met.reshape(shape)
-            counts[k, part] = _distinct(met >> 8, image.count)
+            labels = np.sort(met >> 8, axis=1)
+            labels[:, 1:] *= labels[:, 1:] != labels[:, :-1]
+            counts[k, part] = np.count_nonzero(labels, axis=1)
             near[part] += (met & 255).sum(axis=1) * (1.0 / _NEARNESS)
     return counts, near
-
-
-def _distinct(labels: Integers, count: int) -> Floats:
-    """Number of different labels above 0 in each row (H, n)."""
-    total = np.zeros(len(labels))
-    for first in range(1, count + 1, _WORD):
-        table = np.zeros(count + 1, dtype=np.uint64)
-        own = np.arange(first, min(first + _WORD, count + 1))
-        table[own] = np.uint64(1) << (own - first).astype(np.uint64)
-        total += np.bitwise_count(np.bitwise_or.reduce(table[labels], axis=1))
-    return total

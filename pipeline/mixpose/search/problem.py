@@ -84,38 +84,27 @@ class Kind(NamedTuple):
     poses: Callable[[Any], Floats]
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A pose that may explain the views.
+class Candidate(NamedTuple):
+    """A pose (4, 4) that may explain the views.
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    evidence : float
-        What candidates are ranked by: logarithm of the odds that this is not chance; with ranges
-        among the sensors, the matched objective at the finest blur, summed over views, every
-        detection counting alike.
+    Candidates are ranked by `evidence`: logarithm of the odds that this is not chance; with ranges
+    among the sensors, the matched objective at the finest blur, summed over views, every detection
+    counting alike.
     """
 
     T_world_object: Floats
     evidence: float
 
 
-@dataclass(frozen=True)
-class SearchReport:
+class SearchReport(NamedTuple):
     """What a search cost: guesses made, tested on all features and sensors, and refined."""
 
     made: int = 0
     tested: int = 0
     refined: int = 0
 
-    def __add__(self, other: SearchReport) -> SearchReport:
-        made, tested, refined = self.made, self.tested, self.refined
-        return SearchReport(made + other.made, tested + other.tested, refined + other.refined)
 
-
-@dataclass(frozen=True)
-class SearchState:
+class SearchState(NamedTuple):
     """Where a search with a limited budget goes on in the next frame.
 
     `kind` of guess, after the first, which is tried in every frame, and batches of it tried.
@@ -125,8 +114,7 @@ class SearchState:
     batch: int = 0
 
 
-@dataclass(frozen=True)
-class SearchResult:
+class SearchResult(NamedTuple):
     """Candidates, best first, what they cost, and where to go on while none convinces."""
 
     candidates: list[Candidate]

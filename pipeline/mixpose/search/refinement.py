@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from mixpose.body import Body
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-from mixpose.search.budget import DescentOptions
+from mixpose.search.budget import SearchBudget
 
 
 class Stage(NamedTuple):
@@ -23,34 +24,25 @@ class Stage(NamedTuple):
     survivors: int
 
 
+@dataclass(frozen=True, eq=False)
 class Descent:
     """Refines poses on the blurred observations of all sensors, which are drawn once per blur.
 
-    Parameters
-    ----------
-    views : sequence of View
-    body : Body
-    free : (6,) bool
-        Directions that may change.
-    options : DescentOptions
+    Directions (6,) that are `free` may change.
     """
 
-    def __init__(
-        self,
-        views: Sequence[View],
-        body: Body,
-        free: NDArray[np.bool_],
-        options: DescentOptions,
-    ) -> None:
-        self._views, self._body, self._free, self._options = views, body, free, options
-        self._objectives: dict[tuple[float, ...], MatchedObjective] = {}
+    views: Sequence[View]
+    body: Body
+    free: NDArray[np.bool_]
+    budget: SearchBudget
+    _objectives: dict[tuple[float, ...], MatchedObjective] = field(default_factory=dict)
 
     def objective(self, factors: tuple[float, ...] = ()) -> MatchedObjective:
         """The matched objective with features wider than σ_ε by factors per sensor; none: 1."""
-        key = factors or (1.0,) * len(self._views)
+        key = factors or (1.0,) * len(self.views)
         if key not in self._objectives:
-            sigmas = [f * one.observation.sigma for f, one in zip(key, self._views, strict=True)]
-            self._objectives[key] = matched_objective(self._views, self._body, sigmas)
+            sigmas = [f * one.observation.sigma for f, one in zip(key, self.views, strict=True)]
+            self._objectives[key] = matched_objective(self.views, self.body, sigmas)
         return self._objectives[key]
 
     def refine(self, poses: Floats, stages: Sequence[Stage]) -> Floats:
@@ -70,23 +62,23 @@ class Descent:
                 # of shares k/n, not of their squares: what counts is how many features are met
                 values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
                 poses = poses[np.argsort(-values, kind="stable")]
-            poses = poses[unlike(self._body, poses, self._options.same)[: stage.survivors]]
+            poses = poses[unlike(self.body, poses, self.budget.same)[: stage.survivors]]
         return poses
 
     def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:
         """One damped Newton step of every pose."""
-        model, free, most = objective.slopes(poses), self._free, self._options.max_turn
+        model, free, most = objective.slopes(poses), self.free, self.budget.max_turn
         A = model.curvature[:, free][:, :, free]
         diagonal = np.einsum("hkk->hk", A)
         largest = diagonal.max(axis=1, keepdims=True)
         scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + np.finfo(np.float64).tiny))
-        A = A * scale[:, :, None] * scale[:, None, :] + self._options.damping * np.eye(A.shape[1])
+        A = A * scale[:, :, None] * scale[:, None, :] + self.budget.damping * np.eye(A.shape[1])
         b = scale * model.gradient[:, free]
         twists = np.zeros((len(poses), 6))
         twists[:, free] = scale * np.linalg.solve(A, b[..., None])[..., 0]
         twists[largest[:, 0] <= 0] = 0.0
         shift, turn = (np.linalg.norm(each, axis=1) for each in (twists[:, :3], twists[:, 3:]))
-        longest = np.maximum(turn, most / 2 * (shift / max(self._body.radius, 1e-12)))
+        longest = np.maximum(turn, most / 2 * (shift / max(self.body.radius, 1e-12)))
         twists *= np.minimum(1.0, most / np.maximum(longest, 1e-12))[:, None]
         return perturb(poses, twists)
 

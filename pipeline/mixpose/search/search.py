@@ -16,7 +16,8 @@ from mixpose.records import Floats
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
-from mixpose.search.guesses import from_slips, from_spread_orientations, kinds_of_guesses
+from mixpose.search.from_orientations import from_spread_orientations
+from mixpose.search.guesses import from_slips, kinds_of_guesses
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import (
     Candidate,
@@ -71,7 +72,7 @@ def search_frame(
             "search: start: found none, but some directions are not free: a start must say where "
             "they stay"
         )
-    detections = sensor_detections(views, body, budget.peaks)
+    detections = sensor_detections(views, body, budget)
     if not detections:
         return SearchResult([])
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
@@ -93,10 +94,10 @@ class _Run:
         )
         seen, budget = [one.view for one in problem.detections], self._budget
         few = sparse(self._body, budget.descent_features)
-        self._descent = Descent(seen, self._body, problem.free, budget.descent)
+        self._descent = Descent(seen, self._body, problem.free, budget)
         self._quick_descent = self._descent
         if few is not self._body:
-            self._quick_descent = Descent(seen, few, problem.free, budget.descent)
+            self._quick_descent = Descent(seen, few, problem.free, budget)
         plan = budget.descent_plan if self._by_evidence else budget.wide_plan
         self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
         self._poses = np.zeros((0, 4, 4))
@@ -155,7 +156,7 @@ class _Run:
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
     def _first(self, count: int) -> list[int]:
-        alike = self._budget.descent.alike
+        alike = self._budget.alike
         return first_of_each(self._body, self._poses, self._ranks, count, alike)
 
     def _keep(self, poses: Floats) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mixpose.density import errors_seen, sums_of
 from mixpose.fit import Fit
-from mixpose.judgement import Association, Judged, associate, joined_offsets, nearest_alike
+from mixpose.judgement import Association, Judged, Matches, associate, nearest_alike
 from mixpose.judgement.moments import inverses
 from mixpose.objective import View
 from mixpose.records import DelaySeen
@@ -156,7 +156,8 @@ def offsets_of(
     views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(found))
     if expected is not None:
         errors, known = data.rules.judgement.noise.errors, sums_of([data.noise[k] for k in chosen])
-        noise = errors_seen(joined_offsets(found), int(data.free.sum()), known, errors).blurs
+        met = Matches.of([found]).residuals()
+        noise = errors_seen(met, int(data.free.sum()), known, errors).blurs
         pairs = zip(found, views, strict=True)
         unsure = [_unsure_by(one.J, one.places, view, expected) for one, view in pairs]
         # a pose that was climbed to at another velocity is off by as much in all sensors

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,7 +136,7 @@ class Tracker:
         followed = self.followed(data, verdict)
         estimate = self.estimate(data, views, verdict, ranked)
         if data.log.report:
-            estimate = replace(estimate, guesses=astuple(data.log.report))
+            estimate = replace(estimate, guesses=data.log.report)
         return followed, replace(estimate, delays=followed.delays.seconds())
 
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:

@@ -28,7 +28,6 @@ class Proposer(Protocol):
 
     def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
         """Where fits may begin; nothing where the proposer does not apply."""
-        ...
 
 
 class Refinement(Protocol):
@@ -38,7 +37,6 @@ class Refinement(Protocol):
 
     def __call__(self, data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
         """Where fits may begin; nothing where the pose leaves nothing to mend."""
-        ...
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, stepped_aside, mirrored)

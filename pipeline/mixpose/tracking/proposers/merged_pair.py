@@ -1,13 +1,11 @@
 """Two features that run into each other: one detection, in their middle.
 
-It pulls at both and bends the pose, or is taken for one of them while the other seems hidden.  The
-pose that puts their middle where the one detection is seen is a rival; its evidence tells whether
-it is the better one.
+It pulls at both and bends the pose, or is taken for one of them while the other seems hidden.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -24,8 +22,7 @@ def merged_pair(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iter
     if not likelihood.knows_detections:
         return []
     reach = data.rules.judgement.association.reach_squared
-    associations: Sequence[Association] = [_paired(one, reach) for one in judged.associations]
-    at = judged
+    at, associations = judged, tuple(_paired(one, reach) for one in judged.associations)
     for _ in range(_STEPS):
         if not any(one.merged for one in associations):
             break
@@ -39,13 +36,9 @@ def merged_pair(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iter
 
 
 def _paired(one: Association, reach: float) -> Association:
-    """Features that were not met in one with those whose detection is within their reach, too.
+    """Two features in one: the one not met that is nearest to the detection of another.
 
-    Parameters
-    ----------
-    one : Association
-    reach : float
-        Squared, in variances of C.
+    `reach` is how far that may be, squared, in variances of C.
     """
     met = np.flatnonzero(one.detections >= 0)
     lost = np.flatnonzero((one.shares == 0) & (one.detections < 0))
@@ -56,9 +49,9 @@ def _paired(one: Association, reach: float) -> Association:
     i, k = np.unravel_index(int(squared.argmin()), squared.shape)
     if squared[i, k] > reach:
         return one
-    pair = [int(lost[i]), int(met[k])]
+    pair = [lost[i], met[k]]
     shares, offsets, J = one.shares.copy(), one.offsets.copy(), one.J.copy()
-    shares[pair] = one.shares[pair[1]] / 2
-    offsets[pair] = (away[i, k] + one.offsets[pair[1]]) / 2
+    shares[pair] = one.shares[met[k]] / 2
+    offsets[pair] = (away[i, k] + one.offsets[met[k]]) / 2
     J[pair] = one.J[pair].mean(axis=0)
     return replace(one, shares=shares, offsets=offsets, J=J, merged=1)

@@ -1,26 +1,19 @@
-"""Several starts around a prediction, for frames where one descent does not convince.
-
-With clutter or hidden features the coarsest blurs can lead astray.  Poses drawn from the
-uncertainty of the guess are scored at a medium blur, and the best of them descend, all at once.
-"""
+"""Several starts around a prediction, where the coarsest blurs of one descent may lead astray."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.fit import blur_schedule
 from mixpose.judgement import Judged
 from mixpose.objective import matched_objective
+from mixpose.records import Floats
 from mixpose.rigid import perturb
 from mixpose.search import Descent, Stage
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 def multistart(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
@@ -41,7 +34,7 @@ def _descended(data: FrameData, starts: Sequence[Floats], uncertainty: Floats) -
     rules, sigmas = data.rules.proposals, np.array(data.sigmas)
     levels = blur_schedule(data.views, data.body, starts[0], uncertainty)
     stages = [Stage(tuple(level / sigmas), rules.steps, len(starts)) for level in levels]
-    descent = Descent(data.views, data.body, data.free, data.rules.search.descent)
+    descent = Descent(data.views, data.body, data.free, data.rules.search)
     poses = descent.refine(np.array(starts), stages)
     values = descent.objective().value(poses)
     order = np.argsort(-values, kind="stable")
@@ -60,12 +53,12 @@ def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list
     """
     rules = data.rules.proposals
     sigmas = blur_schedule(data.views, data.body, T_guess, uncertainty / rules.narrowing)[0]
-    objective = matched_objective(data.views, data.body, sigmas)
-    twists = np.concatenate(
-        [np.zeros((1, 6)), _twists(uncertainty, rules.drawn, data.options.seed)]
-    )
+    cube = np.random.default_rng(data.options.seed).random((rules.drawn, 6))
+    # uniform within √3 standard deviations each way
+    drawn = (2 * cube - 1) * np.sqrt(3) * uncertainty
+    twists = np.concatenate([np.zeros((1, 6)), drawn])
     poses = perturb(T_guess, twists)
-    scores = objective.value(poses)
+    scores = matched_objective(data.views, data.body, sigmas).value(poses)
     kept: list[int] = []
     scale = np.where(uncertainty > 0, uncertainty / rules.narrowing, np.inf)
     for k in np.argsort(scores)[::-1]:
@@ -74,9 +67,3 @@ def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list
         if len(kept) == rules.kept:
             break
     return [poses[k] for k in kept]
-
-
-def _twists(uncertainty: Floats, count: int, seed: int) -> Floats:
-    """Random twists (n, 6), uniform within √3 standard deviations each way."""
-    cube = np.random.default_rng(seed).random((count, 6))
-    return np.asarray((2 * cube - 1) * np.sqrt(3) * uncertainty)

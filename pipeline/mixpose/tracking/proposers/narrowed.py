@@ -1,15 +1,12 @@
 """From a prediction at once to narrow blurs, where detections bend the pose.
 
 Spots that are cut, or run into another's, are off by a share of σ_ε: too little for the blur that a
-fit begins with to leave them out, and enough to make the frame's noise seem larger than it is.
-Where frames before tell how small it is, and where the body is to within that share, narrow blurs
-hold on to the detections that agree.  They are most of every sensor's: where all of one sensor
-are off, it is out of step or bumped, and what the others agree on is no better for it.
+fit begins with to leave them out.  Narrow blurs hold on to the detections that agree.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -32,17 +29,7 @@ def narrowed(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterabl
         for blur in [blur for blur in data.rules.proposals.blurs if blur > narrowest]:
             start = Start(one.T_world_object, one.uncertainty, blur=blur)
             found = likelihood.judge(likelihood.fit(start), start)
-            if _agree(found, largest):
+            # where all of a sensor are off it is out of step, and the others no better for it
+            off = ((one.squared[one.shares > 0], largest[one.name]) for one in found.associations)
+            if not any(np.count_nonzero(each > most) > len(each) / 2 for each, most in off):
                 yield Start(found.T_world_object)
-
-
-def _agree(found: Judged, largest: Mapping[str, float]) -> bool:
-    """Whether most features that a sensor meets are met as closely as noise lets them.
-
-    `largest` has the squared offsets in σ_ε² that noise makes, by sensor.
-    """
-    for one in found.associations:
-        offsets = one.squared[one.shares > 0]
-        if np.count_nonzero(offsets > largest[one.name]) > len(offsets) / 2:
-            return False
-    return True

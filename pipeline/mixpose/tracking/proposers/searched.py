@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import add
 
 from mixpose.judgement import Judged
 from mixpose.search import Candidate, SearchReport, SearchState, search_frame
@@ -43,7 +44,7 @@ def candidates_of(data: FrameData) -> list[Candidate]:
             data.log.report = spent
             return found
     result = search(data.views, budget=budget, state=data.track.search if live else SearchState())
-    data.log.state, data.log.report = result.state, spent + result.report
+    data.log.state, data.log.report = result.state, SearchReport(*map(add, spent, result.report))
     return found + result.candidates
 
 

@@ -1,7 +1,7 @@
 """A grid of features, a step aside.
 
-A chessboard of which a rim is hidden explains what is seen a step off, too: after a step that the
-body slipped, or because its session says a row more than there is.
+A chessboard of which a rim is hidden, or that has a row less than its session says, explains what
+is seen a step off, too.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """A sensor that disagrees with the others: out of step, or bumped.
 
-A frame that is late, or a camera that was moved, pulls the pose aside and makes a frame that the
-other sensors explain look doubtful.  Where two sensors or more agree on most of the body, the pose
-is fitted to them alone; what is left out counts as missed in the evidence.
+Where two sensors or more agree on most of the body, the pose is fitted to them alone; what is left
+out counts as missed in the evidence.
 """
 
 from __future__ import annotations
@@ -20,15 +19,13 @@ OUT_OF_STEP = "out of step or bumped"
 def without_sensor(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
     """The pose fitted without the sensors that disagree with two others or more."""
     if not likelihood.knows_detections or len(data.views) < 3:
-        return []
+        return
     if any(not report.used for report in judged.sensors.values()):
-        return []  # some are left out already
+        return  # some are left out already
     rules = data.rules
-    apart = disagreeing(judged.associations, rules.acceptance, rules.judgement.noise)
-    if not apart:
-        return []
     close = data.start_uncertainty / rules.proposals.narrowing**2
-    return [Start(judged.T_world_object, close, left_out=dict.fromkeys(apart, OUT_OF_STEP))]
+    if apart := disagreeing(judged.associations, rules.acceptance, rules.judgement.noise):
+        yield Start(judged.T_world_object, close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
 
 
 def disagreeing(

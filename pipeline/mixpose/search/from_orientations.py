@@ -1,7 +1,4 @@
-"""Where the body is, once its orientation is assumed.
-
-Its centre is where every sensor sees the middle of its detections.
-"""
+"""Guesses of all orientations, the body's middle where sensors see the middle of what they see."""
 
 from __future__ import annotations
 
@@ -10,10 +7,28 @@ import numpy as np
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, transform
 from mixpose.search.problem import SearchProblem
+from mixpose.search.refinement import Stage
+from mixpose.search.spread import spread_turns
 from mixpose.sensors import Sensor
 
 
-def centres(problem: SearchProblem) -> Floats:
+def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage]]:
+    """Poses (H, 4, 4) of all orientations, and how to descend from them."""
+    budget = problem.budget
+    turns = spread_turns(problem.free[3:], budget.orientation_step)
+    rotations = turns @ problem.T_reference[:3, :3]
+    poses = [_placed(problem, rotations, centre) for centre in _centres(problem)]
+    wide = [
+        max(budget.orientation_blur * each.spread / each.sigma, 1.0) for each in problem.detections
+    ]
+    stages = [
+        Stage(tuple(w**share for w in wide), steps, survivors)
+        for share, steps, survivors in budget.orientation_stages
+    ]
+    return np.concatenate(poses) if poses else np.zeros((0, 4, 4)), stages
+
+
+def _centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
     budget, radius = problem.budget, problem.body.radius
     places = _starts(problem)
@@ -29,7 +44,7 @@ def centres(problem: SearchProblem) -> Floats:
     return places[kept[: budget.max_places]]
 
 
-def place(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats:
+def _placed(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats:
     """Poses (H, 4, 4) of assumed rotations (H, 3, 3) with the body's centre about `centre` (3,)."""
     body, shifts = problem.body, problem.free[:3]
     translations = centre - rotations @ body.means.mean(axis=0)
