@@ -42,8 +42,8 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
             T = nearest_alike(fits[k].T_world_object, data.body, data.T_reference)
             cases.append(Case(data.finest, T, data.track.residuals, data.prior(T)))
     judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
-    for (k, fit), one in zip(fits.items(), judged, strict=True):
-        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, one))
+    for (k, fit), found in zip(fits.items(), judged, strict=True):
+        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, found))
     return begun
 
 
