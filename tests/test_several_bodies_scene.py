@@ -6,86 +6,31 @@ Scenes are drawn here from the cameras' geometry alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bodies_in_view import CAMERAS, OTHER, TOOL, at, body, off, scene_of, views_of
 
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import EstimatorOptions
-from mixpose.judgement import Prior
 from mixpose.objective import SharedDensities, Together, View, matched_objective
 from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, PointPattern
-from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
-from mixpose.scene import Member, Scene
+from mixpose.rigid import Floats
+from mixpose.scene import Scene
 from mixpose.scene.joint import Joint
 from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, overlap
 from mixpose.search import SearchResult, search_frame
-from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Companion, Rules, Track, Tracker
-from mixpose.tracking.track import either
+from mixpose.tracking import Track
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
-TOOL = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [10, -30, 45], [35, 30, -40.0]])
-OTHER = np.array([[0, 0, 0], [45, 0, 20], [-30, 35, 0], [5, -55, 10], [20, 20, 50.0]])
-
-
-def camera(angle: float) -> PinholeCamera:
-    K = np.array([[1000, 0, 640], [0, 1000, 512], [0, 0, 1.0]])
-    T = from_rotation_vector([0, angle, 0], [0, 0, 1200])
-    return PinholeCamera(K, np.zeros(5), (1280, 1024), T)
-
-
-CAMERAS = {"left": camera(0.5), "right": camera(-0.5)}
-
-
-def body(name: str, points: Floats) -> Body:
-    return Body(name, tuple(PointFeature(point) for point in points))
-
-
-def scene_of(*bodies: Body) -> Scene:
-    """A scene in which the same body several times is as many identical ones."""
-    members = []
-    for k, one in enumerate(bodies):
-        alike = [other for other in bodies if other is one]
-        instance = [j for j, other in enumerate(bodies) if other is one].index(k)
-        tracker = Tracker.create(one, EstimatorOptions())
-        members.append(Member(tracker, instance if len(alike) > 1 else None))
-    return Scene(tuple(members))
-
-
-def views_of(bodies: Sequence[Body], poses: Sequence[Floats], seed: int) -> list[View]:
-    """What the cameras see, with 0.2 px of noise, and a false spot."""
-    rng = np.random.default_rng(seed)
-    views = []
-    for name, one in CAMERAS.items():
-        spots = [np.array([[30.0, 40.0]])]
-        for each, T in zip(bodies, poses, strict=True):
-            spots.append(one.project(transform(T, each.means))[0])
-        points = rng.permutation(np.concatenate(spots))
-        points = points + 0.2 * rng.standard_normal(points.shape)
-        pattern = PointPattern(points, np.ones(len(points)))
-        views.append(View(name, one, Observation(pattern, 1.5)))
-    return views
-
-
-def at(x: float, y: float = 0.0, z: float = 0.0, turn: float = 0.0) -> Floats:
-    return from_rotation_vector([0.3, turn, -0.2], [x, y, z])
-
-
-def off(estimate: Estimate, T: Floats) -> tuple[float, float]:
-    assert estimate.T_world_object is not None
-    away = float(np.linalg.norm(estimate.T_world_object[:3, 3] - T[:3, 3]))
-    return away, float(rotation_angle_deg(estimate.T_world_object, T))
 
 
 def test_a_recording_of_two_different_and_two_identical_bodies() -> None:
@@ -301,118 +246,6 @@ def spots(*points: list[float]) -> list[View]:
     return [View("left", CAMERAS["left"], Observation(pattern, 1.0))]
 
 
-def beside_each_other(frame: int) -> tuple[Floats, Floats]:
-    """Two bodies that jump about together, the one within 5 mm and 0.1 rad where it was beside."""
-    rng = np.random.default_rng(frame)
-    first = from_rotation_vector(rng.uniform(-0.6, 0.6, 3), rng.uniform(-150, 150, 3))
-    swung = from_rotation_vector(rng.normal([0.5, 0, 0], 0.1), rng.normal(0, 5, 3))
-    swung[0, 3] += 150
-    return first, first @ swung
-
-
-@pytest.fixture(scope="module")
-def acquainted() -> tuple[Scene, tuple[Track, ...]]:
-    """A scene whose two bodies were beside each other for eleven frames."""
-    tool, other = body("tool", TOOL), body("other", OTHER)
-    scene = scene_of(tool, other)
-    tracks = scene.begin()
-    for k in range(11):
-        outcomes = scene.advance(
-            tracks, k, k / 10, views_of([tool, other], beside_each_other(k), k)
-        )
-        tracks = tuple(one.track for one in outcomes)
-    return scene, tracks
-
-
-def strangers(tracks: Sequence[Track]) -> list[Track]:
-    return [replace(track, companions={}) for track in tracks]
-
-
-@pytest.mark.parametrize("seed", [11, 311])
-def test_three_markers_where_the_body_was_beside_another_one_are_the_body(
-    acquainted: tuple[Scene, tuple[Track, ...]], seed: int
-) -> None:
-    scene, tracks = acquainted
-    poses = beside_each_other(seed)
-    views = views_of([body("tool", TOOL), body("other", OTHER[:3])], poses, 11)
-    outcomes = scene.advance(tracks, 11, 1.1, views)
-    assert [one.estimate.status for one in outcomes] == ["ok", "ok"]
-    assert off(outcomes[1].estimate, poses[1])[0] < 1.0
-    # it jumped by half of the view, where its own track did not expect it
-    alone = scene.advance(strangers(tracks), 11, 1.1, views)
-    assert alone[1].estimate.status == "ambiguous"
-
-
-def test_a_body_that_parts_from_another_one_is_found_where_it_is(
-    acquainted: tuple[Scene, tuple[Track, ...]],
-) -> None:
-    scene, tracks = acquainted
-    first = beside_each_other(11)[0]
-    parted = from_rotation_vector([1.0, -2.0, 0.5], -first[:3, 3] / 2 + [0, 120, 40])
-    views = views_of([body("tool", TOOL), body("other", OTHER)], [first, parted], 11)
-    outcomes = scene.advance(tracks, 11, 1.1, views)
-    assert [one.estimate.status for one in outcomes] == ["ok", "ok"]
-    assert off(outcomes[1].estimate, parted)[0] < 1.0
-    # and where only three of its markers are seen, that it was elsewhere before makes nothing sure
-    views = views_of([body("tool", TOOL), body("other", OTHER[:3])], [first, parted], 11)
-    outcomes = scene.advance(tracks, 11, 1.1, views)
-    assert outcomes[1].estimate.status != "ok"
-
-
-def test_what_was_beside_is_a_mean_and_a_spread_that_narrows_with_the_frames() -> None:
-    other = body("other", OTHER)
-    known = None
-    rng = np.random.default_rng(0)
-    for _ in range(400):
-        first, _ = beside_each_other(int(rng.integers(1 << 30)))
-        away = from_rotation_vector(rng.normal(0, 0.2, 3), rng.normal(0, [5, 20, 40]))
-        known = Companion.joined(known, first @ away, first, other)
-    assert known is not None
-    rules = Rules().motion
-    assert np.abs(known.T_other_object[:3, 3]).max() < 6  # 40 mm of 400 frames, three times
-    # what is guessed counts as three frames: a radius, and 30 degrees
-    _, wide = known.expected(np.eye(4), other, rules)
-    guess = 3 / 403 * np.array([other.radius] * 3 + [np.pi / 6] * 3) ** 2
-    true = np.sqrt(np.array([5, 20, 40, 0.2, 0.2, 0.2]) ** 2 + guess)
-    assert np.allclose(wide, true, rtol=0.12)  # three standard deviations of a spread of 400
-    # a quarter turn of the other body turns what is known with it
-    quarter = from_rotation_vector([0, 0, np.pi / 2], [0, 0, 0])
-    _, turned = known.expected(quarter, other, rules)
-    assert turned[[1, 0, 2]] == pytest.approx(wide[:3])
-
-
-def test_what_lets_expect_a_pose_is_shared_between_its_own_track_and_another_body() -> None:
-    own, near = Prior(-20.0, np.ones(6)), Prior(-8.0, np.full(6, 0.1))
-    fresh = either(own, near, 0, Rules().motion)
-    assert fresh.log_density == pytest.approx(-8.0 + np.log(0.5), abs=1e-4)
-    assert (fresh.spread == 0.1).all()
-    # after a hundred frames without the body half of what was left is left of 0.98^100
-    faded = either(own, near, 100, Rules().motion)
-    assert faded.log_density == pytest.approx(-8.0 + np.log(0.5 * 0.98**100), abs=1e-4)
-    gone = either(own, near, 2000, Rules().motion)
-    assert gone.log_density == pytest.approx(-20.0, abs=1e-6)
-
-
-def test_a_pose_that_is_sure_for_doubtful_ones_before_it_alone_is_in_doubt() -> None:
-    other = body("other", OTHER[:4])
-    scene = scene_of(body("tool", TOOL), other)
-    poses = at(-200), at(150, turn=1.0)
-    tracks = scene.begin()
-    statuses = []
-    # two of its four markers, and a spot of one camera where a third may be, all standing still
-    for k in range(12):
-        views = views_of([body("tool", TOOL), body("some", OTHER[[0, 1]])], poses, k)
-        third = CAMERAS["left"].project(transform(poses[1], OTHER[2:3]))[0] + [0.5, 0.3]
-        seen = views[0].observation.pattern
-        assert isinstance(seen, PointPattern)
-        spots = PointPattern(np.concatenate([seen.points, third]), np.append(seen.weights, 1.0))
-        views[0] = replace(views[0], observation=Observation(spots, 1.5))
-        outcomes = scene.advance(tracks, k, k / 10, views)
-        tracks = tuple(one.track for one in outcomes)
-        statuses.append(outcomes[1].estimate.status)
-    assert "ok" not in statuses, statuses
-
-
 def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
     views = spots([0.0, 0.0], [50.0, 0.0])
     first = {"left": claim([0, 1], [[0.4, 0.0], [50.0, 0.0]], [0.16, 0.0])}
@@ -445,9 +278,10 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
     together = Together.of(each)
     for found, one, T in zip(together.models(near), each, near, strict=True):
         alone = one.linearise(T)
-        assert found.value == pytest.approx(alone.value, rel=1e-9)
-        np.testing.assert_allclose(found.gradient, alone.gradient, rtol=1e-6, atol=1e-9)
-        np.testing.assert_allclose(found.curvature, alone.curvature, rtol=1e-6, atol=1e-9)
+        # looked up on other tiles of an array in which places are rounded to 2e-5 cells
+        assert found.value == pytest.approx(alone.value, rel=1e-5)
+        for a, b in ((found.gradient, alone.gradient), (found.curvature, alone.curvature)):
+            np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5 * np.abs(b).max())
     # what they see at other poses is at hand afterwards, as each would see it
     fresh = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
     together.match(poses)
@@ -457,7 +291,8 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
         seen, looked_up, apart = other.match(T[None])
         np.testing.assert_allclose(at_hand.y, seen.y)
         np.testing.assert_array_equal(at_hand.weights, seen.weights)
-        np.testing.assert_allclose(sampled, looked_up, rtol=1e-6, atol=1e-12)
+        largest = looked_up[..., 0].max() / np.array([1.0, 1.5, 1.5])  # gradients of 1.5 px
+        assert (np.abs(sampled - looked_up) < 1e-5 * largest).all()
         np.testing.assert_allclose(over.norm, apart.norm)
         np.testing.assert_array_equal(over.pairs, apart.pairs)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mutation.mutant import Mutant
 
 _PROPOSERS = "test_tracking_proposers.py"
-_SCENES = "test_several_bodies_scene.py"
+_BESIDE = "test_several_bodies_companions.py"
 _STARTS = "test_tracking_starts.py"
 
 _PROPOSALS = (
@@ -71,7 +71,7 @@ _PROPOSALS = (
         "share = rules.beside *",
         "share = 1e-9 *",
         "a limb that is lost is not found again by where it was beside the next one",
-        (_SCENES,),
+        (_BESIDE,),
     ),
     Mutant(
         "tracking-companions-for-ever",
@@ -79,7 +79,7 @@ _PROPOSALS = (
         "** misses",
         "** 0",
         "a body that went away is expected for ever where it was beside another",
-        (_SCENES,),
+        (_BESIDE,),
     ),
     Mutant(
         "tracking-companions-in-world-axes",
@@ -87,7 +87,7 @@ _PROPOSALS = (
         "variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2",
         "variances.reshape(2, 3)",
         "what is known of a body beside another does not turn with it",
-        (_SCENES,),
+        (_BESIDE,),
     ),
     Mutant(
         "tracking-left-out-for-free",
