@@ -309,8 +309,8 @@ _SEARCH = (
     Mutant(
         "search-slips-not-tried",
         "search/guesses.py",
-        "shifts[:, :3, 3] = body.means[i] - body.means[j]",
-        "shifts[:, :3, 3] = 0.0",
+        "from_parts(np.eye(3), body.means[i] - body.means[j])",
+        "from_parts(np.eye(3), 0 * body.means[i])",
         "a chessboard is found a square off",
     ),
     Mutant(
@@ -344,8 +344,8 @@ _SEARCH = (
     Mutant(
         "search-symmetric-poses-are-candidates",
         "search/refinement.py",
-        "images.append(transform(poses[k] @ body.symmetries, body.means))",
-        "images.append(transform(poses[k][None], body.means))",
+        "images.append(transform(pose @ body.symmetries, body.means))",
+        "images.append(transform(pose[None], body.means))",
         "candidates are the same pose several times",
     ),
     Mutant(

@@ -136,7 +136,7 @@ def _combinations(count: int) -> Indices:
 
 def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indices:
     """Triples (K, 3) drawn among points (P, 3) that are within reach of the first of them."""
-    rng = problem.rng()
+    rng = np.random.default_rng(problem.seed)
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]

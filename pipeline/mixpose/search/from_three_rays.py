@@ -37,7 +37,8 @@ def _problems(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Ind
     fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
     near detections as features that are near each other, at random.
     """
-    budget, features, rng = problem.budget, problem.body.means, problem.rng()
+    budget, features = problem.budget, problem.body.means
+    rng = np.random.default_rng(problem.seed)
     n, M, eyes = len(features), len(rays), len(problem.cameras)
     most = budget.max_shared_problems // eyes if eyes > 1 else budget.max_problems
     all_tried = comb(M, 3) * perm(n, 3) <= most

@@ -6,6 +6,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.search.from_point_and_rays import from_point_and_rays
 from mixpose.search.from_point_triples import by_promise, from_point_triples
 from mixpose.search.from_three_rays import from_three_rays
@@ -36,6 +37,4 @@ def from_slips(body: Body, pose: Floats) -> Floats:
     On a grid of features a pose that is a step off explains most of them.
     """
     i, j = np.nonzero(~np.eye(len(body), dtype=np.bool_))
-    shifts = np.tile(np.eye(4), (len(i), 1, 1))
-    shifts[:, :3, 3] = body.means[i] - body.means[j]
-    return pose @ shifts
+    return pose @ from_parts(np.eye(3), body.means[i] - body.means[j])

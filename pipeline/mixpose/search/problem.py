@@ -50,10 +50,6 @@ class SearchProblem:
             (one, one.rays) for one in self.detections if one.rays is not None and len(one.rays)
         ]
 
-    def rng(self) -> np.random.Generator:
-        """Random numbers, always the same."""
-        return np.random.default_rng(self.seed)
-
     def reach(self, seen: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""
         return self.budget.gate * seen.sigma

@@ -37,7 +37,6 @@ def search_frame(
     *,
     free: NDArray[np.bool_],
     T_reference: Floats | None,
-    count: int = 8,
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
     state: SearchState = SearchState(),
@@ -53,8 +52,6 @@ def search_frame(
         World directions to search, order of `mixpose.rigid`.
     T_reference : (4, 4) array or None
         Where the directions that are not free stay; may be None when all are free.
-    count : int
-        Most candidates returned.
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
@@ -78,7 +75,7 @@ def search_frame(
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
     run = _Run(SearchProblem(detections, body, free, reference, budget, seed))
     after = run.find(state)
-    return SearchResult(run.candidates(count), SearchReport(**run.cost), after)
+    return SearchResult(run.candidates(), SearchReport(**run.cost), after)
 
 
 class _Run:
@@ -88,16 +85,14 @@ class _Run:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         self._images = label_images(problem) if is_pointlike(self._body) else []
         self._explainable = sum(min(image.count, len(self._body)) for image in self._images)
-        # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = bool(self._images) and all(
-            one.rays is not None for one in problem.detections
-        )
+        cameras = [one for one in problem.detections if one.rays is not None]
         seen, budget = [one.view for one in problem.detections], self._budget
+        # ranges are met by chance too often, and err too coarsely, to be counted one by one
+        self._by_evidence = bool(self._images) and len(cameras) == len(seen)
+        self._may_be_sure = self._by_evidence and len(seen) > 1
         few = sparse(self._body, budget.descent_features)
-        self._descent = Descent(seen, self._body, problem.free, budget)
-        self._quick_descent = self._descent
-        if few is not self._body:
-            self._quick_descent = Descent(seen, few, problem.free, budget)
+        descents = {one: Descent(seen, one, problem.free, budget) for one in (self._body, few)}
+        self._descent, self._quick_descent = descents[self._body], descents[few]
         plan = budget.descent_plan if self._by_evidence else budget.wide_plan
         self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
         self._poses = np.zeros((0, 4, 4))
@@ -114,7 +109,7 @@ class _Run:
             self._keep(self._descent.refine(poses, stages))
         slippery = budget.min_slip_features <= len(self._body) <= budget.max_slip_features
         if len(self._body.grid_steps) and slippery and len(self._poses) and self._images:
-            slips = from_slips(self._body, self._poses[self._ranks.argmax()])
+            slips = from_slips(self._body, self._poses[0])
             self._keep(self._descended(self._shortlist([slips])))
         return after
 
@@ -147,23 +142,24 @@ class _Run:
         self._keep(self._descended(self._shortlist(guesses())))
         return done
 
-    def candidates(self, count: int) -> list[Candidate]:
+    def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._first(count), self._ranks
+        kept, ranks = self._first(self._budget.candidates), self._ranks
         if self._by_evidence and kept:
             least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
     def _first(self, count: int) -> list[int]:
-        alike = self._budget.alike
-        return first_of_each(self._body, self._poses, self._ranks, count, alike)
+        return first_of_each(self._body, self._poses, count, self._budget.alike)
 
     def _keep(self, poses: Floats) -> None:
         if len(poses):
             ranks, met = self._judged(poses)
-            self._poses = np.concatenate([self._poses, poses])
-            self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
+            ranks, met = np.append(self._ranks, ranks), np.append(self._met, met)
+            best = np.argsort(-ranks, kind="stable")
+            self._poses = np.concatenate([self._poses, poses])[best]
+            self._ranks, self._met = ranks[best], met[best]
 
     def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""
@@ -181,16 +177,16 @@ class _Run:
         budget, coverage = self._budget, self._coverage()
         if coverage >= budget.convincing:
             return True
-        if len(self._problem.detections) < 2 or not self._is_beyond_doubt():
+        if not self._is_beyond_doubt():
             return False
-        best = self._poses[self._ranks.argmax()][None]
         most = budget.sufficient * self._explainable
-        return coverage >= budget.sufficient or int(self._count(self._body, best)[0]) >= most
+        explained = self._count(self._body, self._poses[:1])[0]
+        return coverage >= budget.sufficient or int(explained) >= most
 
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
         budget, best = self._budget, self._ranks.max(initial=0.0)
-        if not self._by_evidence or best < budget.promising:
+        if not self._may_be_sure or best < budget.promising:
             return False
         two = self._first(2)
         lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
@@ -198,7 +194,7 @@ class _Run:
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
-        return float(self._met[self._ranks.argmax()]) if len(self._ranks) else 0.0
+        return float(self._met[:1].sum())
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
@@ -245,10 +241,10 @@ class _Run:
 
     def _is_found(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras leave no need for others."""
-        if not self._by_evidence or len(self._problem.detections) < 2:
-            return False
         doubtful = explained < self._budget.sufficient * self._explainable
-        if doubtful and self._judged(guesses)[0].max() < self._budget.hopeless:
+        if not self._may_be_sure or (
+            doubtful and self._judged(guesses)[0].max() < self._budget.hopeless
+        ):
             return False
         self._keep(self._descended(guesses))
         return self._is_beyond_doubt() and self._is_settled()

@@ -53,14 +53,7 @@ def triangulate(
 ) -> TriangulatedPoints:
     """All pairs of rays of two sensors or more that meet within the error of the detections.
 
-    Parameters
-    ----------
-    rays : sequence of Rays
-        One per sensor.
-    gates : sequence of float
-        Largest error of a detection per sensor, in px.
-    min_sine : float
-        Of the angle between two rays that still fix a depth.
+    That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
     """
     found = []
     for first, second in combinations(range(len(rays)), 2):
