@@ -308,7 +308,7 @@ _SEARCH_EVIDENCE = (
 _SEARCH = (
     Mutant(
         "search-slips-not-tried",
-        "search/guesses.py",
+        "search/search.py",
         "from_parts(np.eye(3), body.means[i] - body.means[j])",
         "from_parts(np.eye(3), 0 * body.means[i])",
         "a chessboard is found a square off",
@@ -395,7 +395,7 @@ _SEARCH = (
     ),
     Mutant(
         "search-points-of-a-crowd-first",
-        "search/guesses.py",
+        "search/search.py",
         "kinds.insert(len(kinds) if crowded else 0,",
         "kinds.insert(0,",
         "the first frame of web cams takes a third longer",
