@@ -48,9 +48,9 @@ def odds_at(
 ) -> float:
     """Of one pose."""
     variances, sizes = np.full((1, len(found)), S2), np.array([size])
-    stacked = Matches.of([found])
+    matches = Matches.of([found])
     at_S2 = information[None] / S2
-    odds = log_evidence(stacked, variances, FREE, [prior], sizes, model, at_S2, spreads)
+    odds = log_evidence(matches, variances, FREE, [prior], sizes, model, at_S2, spreads)
     return float(odds[0])
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mixpose.density import Density, Window
 from mixpose.objective import IndependentObjective, PaperObjective
-from mixpose.objective.index_maps import SampledTerm
+from mixpose.objective.paper import SampledTerm
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 

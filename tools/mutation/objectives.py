@@ -131,8 +131,8 @@ _SAMPLED = (
     Mutant(
         "objective-left-of-the-image-is-seen",
         "objective/index_maps.py",
-        "maps[~((maps >= low) & (maps <= high))] = FAR",
-        "maps[~(maps <= high)] = FAR",
+        "maps[~((maps >= lower) & (maps <= upper))] = FAR",
+        "maps[~(maps <= upper)] = FAR",
         "what a sensor cannot measure counts as measured",
     ),
     Mutant(

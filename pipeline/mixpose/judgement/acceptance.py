@@ -141,17 +141,14 @@ def is_recognised(judged: Judged, rules: AcceptanceRules) -> bool:
     return len(met) >= min(rules.majority * len(in_view), rules.enough)
 
 
-def is_turned_surely(judged: Judged, rules: AcceptanceRules) -> bool:
-    """Whether no wide sector of turns is left open, as ranges may."""
-    if judged.spread is None:
-        return True
-    return bool(1.96 * judged.spread[3:].max() < np.radians(rules.widest_turn_deg))
-
-
 def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose is believed, if no rival casts doubt on it."""
-    possible = is_possible(judged, free, rules) and judged.log_evidence > rules.sure
-    return possible and is_turned_surely(judged, rules) and is_recognised(judged, rules)
+    if not is_possible(judged, free, rules) or judged.log_evidence <= rules.sure:
+        return False
+    # no wide sector of turns is left open, as ranges may
+    turn = 0.0 if judged.spread is None else 1.96 * float(judged.spread[3:].max())
+    is_turned = bool(turn < np.radians(rules.widest_turn_deg))
+    return is_turned and is_recognised(judged, rules)
 
 
 def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
@@ -172,19 +169,15 @@ def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceR
     # what is not possible by itself still casts doubt on the others
     rivals = [weight for one, weight in zip(ranked, weights, strict=True) if one is not best]
     clear = max(rivals, default=0.0) < rules.rival
-    clear = clear and is_sure(best, free, rules) and _is_determined(best)
+    # nor is a turn left open, as about the line that all features met lie on
+    turns = np.linalg.eigvalsh(best.covariance[3:, 3:])
+    clear = clear and is_sure(best, free, rules) and bool(turns.max() < _OPEN_TURN**2)
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
         if one is best or (weight >= rules.listed and _is_fixed(one, free))
     ]
     return Verdict("ok" if clear else "ambiguous", best, kept)
-
-
-def _is_determined(judged: Judged) -> bool:
-    """Whether no turn is left open, as about the line that all features met lie on."""
-    turns = np.linalg.eigvalsh(judged.covariance[3:, 3:])
-    return bool(turns.max() < _OPEN_TURN**2)
 
 
 def insert(

@@ -172,29 +172,22 @@ def associate(
         The objective at the pose.
     """
     match = objective.match(T_world_object[None])
-    body = objective.projection.body
-    world = transform(T_world_object, body.nodes.points)
-    spreads = body.node_spreads(T_world_object) if body.spread else None
-    value = float(objective.shares_of(match).sum())
-    found = [
-        _associated(objective, match, k, world, spreads, rules, narrowest)
-        for k in range(len(objective.views))
-    ]
-    return found, value
+    views = range(len(objective.views))
+    found = [_associated(objective, match, k, T_world_object, rules, narrowest) for k in views]
+    return found, float(objective.shares_of(match).sum())
 
 
 def _associated(
     objective: MatchedObjective,
     match: Match,
     k: int,
-    world: Floats,
-    spreads: Floats | None,
+    T_world_object: Floats,
     rules: AssociationRules,
     narrowest: float,
 ) -> Association:
-    """The same of sensor k; the body's features are at `world` (N, 3), off by `spreads`."""
+    """The same of sensor k."""
     at, sampled, over = match
-    view, node_weights = objective.views[k], objective.projection.body.nodes.weights
+    view, body = objective.views[k], objective.projection.body
     m, observation = int(objective.projection.dimensions[k]), view.observation
     variance, energy = float(objective.variances[k, 0]), float(objective.energies[k, 0])
     features = np.flatnonzero(at.seen[k, 0])
@@ -202,19 +195,17 @@ def _associated(
     J, C = at.J[k, 0, features, :m], sampled[k, 0, features, : 1 + m]
     product, norm = float(weights @ C[:, 0]), float(over.norm[k, 0])
     if product > 0:
-        wide = in_image(spreads[features], J) if spreads is not None else np.zeros(len(y))
+        wide = in_image(body.node_spreads(T_world_object)[features], J) if body.spread else 0.0
         # beside detections the fit gives all features of a sensor one amplitude
         unlike = all(one.observation.cell is not None for one in objective.views)
-        amplitude = product / norm
-        met = features_met(
-            observation, y, weights, variance, C, amplitude, rules, wide, unlike=unlike
-        )
+        beside = product / norm, rules, wide
+        met = features_met(observation, y, weights, variance, C, *beside, unlike=unlike)
     else:
         met = FeaturesMet.none(y)
     paired = met.partner != np.arange(len(y))
     if paired.any():
         J = np.where(paired[:, None, None], (J + J[met.partner]) / 2, J)
-    sigma = math.sqrt(variance / 2)
+    sigma, world = math.sqrt(variance / 2), transform(T_world_object, body.nodes.points[features])
     # of grey values as many equal features as would give their energy
     count, crowd = _crowd(observation, y, sigma, float(objective.tops[k, 0]) / energy, rules)
     complete, total = np.count_nonzero(met.shares) == len(y), float(met.shares.sum())
@@ -227,7 +218,7 @@ def _associated(
         offsets=met.offsets,
         J=J,
         expected=float(weights.sum()),
-        unseen=float(node_weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
+        unseen=float(body.nodes.weights[at.faced[k, 0] & ~at.seen[k, 0]].sum()),
         sigma=sigma,
         finest=observation.narrowest(narrowest, y),
         crowd=crowd,
@@ -235,7 +226,7 @@ def _associated(
         detections=met.detections,
         merged=int(np.count_nonzero(paired)) // 2,
         surplus=0.0 if complete else surplus(observation, y, total, rules),
-        by_calibration=by_calibration(view.doubts, world[features]) if view.doubts else None,
+        by_calibration=by_calibration(view.doubts, world) if view.doubts else None,
     )
 
 

@@ -32,21 +32,11 @@ class LastingRules:
 
 @dataclass(frozen=True)
 class Lasting:
-    """What the frames so far say of fields that last.
+    """What the frames so far say of fields that last."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Sensors that took part in these frames.
-    information : (q, q) float64
-        About the fields of all of them, per σ_ε².
-    vector : (q,) float64
-        Per σ_ε.
-    """
-
-    names: tuple[str, ...]
-    information: Floats
-    vector: Floats
+    names: tuple[str, ...]  # sensors that took part in these frames
+    information: Floats  # (q, q) about the fields of all of them, per σ_ε²
+    vector: Floats  # (q,) per σ_ε
 
     def after(self, before: Sequence[Lasting], rules: LastingRules) -> tuple[Lasting, ...]:
         """What a frame says, with what the same sensors showed before it, then what others did."""

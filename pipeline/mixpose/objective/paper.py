@@ -12,6 +12,7 @@ its density, as if its feature were a Gaussian of the level's σ.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeAlias
 
@@ -19,26 +20,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.density import Density
 from mixpose.objective.base import Quadratic, View, region_of_interest
-from mixpose.objective.index_maps import (
-    Projection,
-    SampledTerm,
-    Samples,
-    Singles,
-    index_maps,
-    look_up_array,
-)
+from mixpose.objective.index_maps import ParallelMaps
 from mixpose.objective.projection import pose_jacobian
 from mixpose.rigid import transform
-
-__all__ = ["REACH", "IndependentObjective", "PaperObjective", "SampledTerm", "sampled_terms"]
+from mixpose.sensors import ParallelBeam, Sensor
 
 Floats: TypeAlias = NDArray[np.float64]
+Singles: TypeAlias = NDArray[np.float32]
 
 REACH = 4.0
 """Margin of a window around the predicted samples, in standard deviations of a feature."""
 
 _SAMPLES_AT_ONCE = 2**18  # of all poses of a batch: bounds its memory to a few MB per sensor
+
+
+@dataclass(frozen=True)
+class SampledTerm:
+    """A sensor with its density g_l (with gradient) at one level of blur."""
+
+    sensor: Sensor
+    density: Density
 
 
 class _SampledObjective:
@@ -85,19 +88,36 @@ class _SampledObjective:
         raise AssertionError("an objective says how sensors combine")
 
     @cached_property
-    def _looked_up_in(self) -> tuple[Projection, list[Singles]]:
-        """What only values need, so that objectives to be linearised are not slowed down."""
-        project = index_maps(self.terms, Samples(self.points, self.offsets))
-        return project, [look_up_array(term.density) for term in self.terms]
+    def _alone(self) -> list[Density]:
+        """The densities without gradients, which values do not need."""
+        first = [np.atleast_3d(term.density.values)[..., 0] for term in self.terms]
+        return [
+            replace(term.density, values=np.ascontiguousarray(values))
+            for term, values in zip(self.terms, first, strict=True)
+        ]
+
+    @cached_property
+    def _maps(self) -> ParallelMaps | None:
+        """Where all sensors are parallel beams."""
+        sensors = [one.sensor for one in self.terms if isinstance(one.sensor, ParallelBeam)]
+        if len(sensors) < len(self.terms):
+            return None
+        windows = [term.density.window for term in self.terms]
+        return ParallelMaps(sensors, windows, self.points, self.offsets)
 
     def _densities(self, poses: Floats) -> list[Singles]:
-        """g_l in blocks of samples, per sensor, for poses (k, 4, 4)."""
-        project, arrays = self._looked_up_in
-        looked_up = []
-        for g, (u, v) in zip(arrays, project(poses), strict=True):
-            values: Any = cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-            looked_up.append(values)
-        return looked_up
+        """g_l of samples, per sensor, in rows of as many for each of the poses (k, 4, 4)."""
+        if self._maps is not None:
+            return [
+                _looked_up(g.values, u, v)
+                for g, (u, v) in zip(self._alone, self._maps(poses), strict=True)
+            ]
+        with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
+            points = transform(poses, self.points)
+            if self.offsets is not None:
+                points += self.offsets
+            places = [term.sensor.project(points)[0] for term in self.terms]
+            return [g.sample(y) for g, y in zip(self._alone, places, strict=True)]
 
     def _means(self, blocks: Singles, count: int) -> Floats:
         """Means (k,) over the samples of k poses, summed in double precision."""
@@ -153,6 +173,10 @@ class IndependentObjective(_SampledObjective):
         means = densities.mean(axis=1)
         ones = np.ones(densities.shape[1])
         return [np.prod(np.delete(means, k)) * ones for k in range(len(means))]
+
+
+def _looked_up(g: Singles, u: Singles, v: Singles) -> Any:
+    return cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
 
 
 def sampled_terms(
