@@ -279,7 +279,7 @@ def _advance(
         met = all(
             one.estimate.status == "ok"
             and is_convincing(
-                one.track.tallies, expected.names, member.tracker.rules.acceptance.convincing
+                one.track.tallies, expected.cameras, member.tracker.rules.acceptance.convincing
             )
             for one, expected, member in zip(outcomes, expectations, scene.members, strict=True)
         )

@@ -38,8 +38,8 @@ _NEAR = (
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "if blur < 1 or here.value >= rules.near * len(views):",
-        "if here.value >= 0.0:",
+        "if blur == 1 and here.value < rules.near * len(objective.views):",
+        "if here.value < 0.0:",
         "a start some widths off is never corrected",
     ),
     Mutant(

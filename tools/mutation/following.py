@@ -14,8 +14,8 @@ _PREDICTION = (
     Mutant(
         "tracking-errors-over-a-gap-count-for-one-frame",
         "tracking/track.py",
-        "change = change / (1 + track.misses)",
-        "change = change / 1",
+        "np.abs(change / (1 + track.misses))",
+        "np.abs(change / 1)",
         "after a gap a body may be anywhere in the next frame",
     ),
     Mutant(
@@ -108,7 +108,7 @@ _PREDICTION = (
     Mutant(
         "tracking-sudden-motion-goes-unnoticed",
         "tracking/track.py",
-        "uncertainty = np.maximum(_per_kind(change), rules.steady(body))",
+        "uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), rules.steady(body))",
         "uncertainty = rules.steady(body)",
         "a body that changes its speed is expected as surely as a steady one",
         (_TRACK,),
@@ -116,8 +116,8 @@ _PREDICTION = (
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "return track.branches[int(np.argmin(away))]",
-        "return track.branches[int(np.argmax(away))]",
+        "return min(track.branches, key=away, default=None)",
+        "return max(track.branches, key=away, default=None)",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),
@@ -162,7 +162,7 @@ _GATING = (
     Mutant(
         "tracking-windows-of-an-exact-prediction",
         "tracking/gating.py",
-        "margins = self._rules.reach * np.sqrt(by_pose)",
+        "margins = self.rules.reach * np.sqrt(by_pose)",
         "margins = 0 * np.sqrt(by_pose)",
         "a body that moves otherwise than predicted is cut off",
         (_WINDOWS,),
@@ -178,8 +178,8 @@ _GATING = (
     Mutant(
         "tracking-windows-of-points",
         "tracking/gating.py",
-        "np.maximum(scales * self._feature_reach, self._rules.min_margin_px)",
-        "np.maximum(0 * scales, self._rules.min_margin_px)",
+        "np.maximum(scales * self._feature_reach, self.rules.min_margin_px)",
+        "np.maximum(0 * scales, self.rules.min_margin_px)",
         "features that are large in the image are cut off",
         (_WINDOWS,),
     ),

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,7 @@ from numpy.typing import NDArray
 from mixpose.density.blur import factors, mass, reduced
 from mixpose.density.grid import remap
 from mixpose.density.pages import Pages, Plane
-from mixpose.records import GridPattern, Pattern, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
-Singles: TypeAlias = NDArray[np.float32]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.records import Floats, GridPattern, Indices, Pattern, PointPattern, Singles
 
 REACH = 4.25
 """Standard deviations around a detection that are drawn: features farther apart draw each other by
@@ -246,28 +242,14 @@ class _Tiles(NamedTuple):
 
 
 class _Scale(NamedTuple):
-    """What cells are in units of L sensors, and densities in those of the array.
+    """What cells are in units of L sensors, and densities in those of the array."""
 
-    Attributes
-    ----------
-    per_unit : (L, 1, 1, 2) float64
-        As `Atlas` has it.
-    widths : list of float
-        Standard deviations that are drawn, in sensor units: look-ups blur by the rest.
-    sigma, reach : float
-        The same in cells, and how far around a detection it is drawn.
-    units : (L, 1, 1, 3) float64
-        Of the channels.
-    is_flat : (L,) bool or None
-        Sensors of one coordinate, where there are any.
-    """
-
-    per_unit: Floats
-    widths: list[float]
-    sigma: float
-    reach: float
-    units: Floats
-    is_flat: NDArray[np.bool_] | None
+    per_unit: Floats  # (L, 1, 1, 2) as `Atlas` has it
+    widths: list[float]  # deviations that are drawn, in sensor units: look-ups blur by the rest
+    sigma: float  # the same in cells
+    reach: float  # cells around a detection to which it is drawn
+    units: Floats  # (L, 1, 1, 3) of the channels
+    is_flat: NDArray[np.bool_] | None  # (L,) sensors of one coordinate, where there are any
 
     @classmethod
     @lru_cache(maxsize=64)

@@ -8,17 +8,13 @@ no filter is cut off but where a Gaussian has vanished.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density.grid import Density, Window, merge
-from mixpose.records import GridPattern, Pattern, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
-Singles: TypeAlias = NDArray[np.float32]
+from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
 
 CUT = 5.0
 """Standard deviations at which sums over a grid end: the tail holds 6e-7."""

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.records import Floats
-
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.records import Floats, Indices
 
 _NOTHING = 1e-12
 _ALIKE = 1.2  # blurs that differ by less are the same

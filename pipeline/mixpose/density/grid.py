@@ -12,13 +12,12 @@ Arrays have 1, 3 or 4 channels: for those `cv2.remap` of OpenCV 5 is exact to fl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 FLOOR = 0.0
 """Density outside the grid, behind the camera and wherever a sensor sees nothing."""

@@ -12,19 +12,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.overlap import self_overlap
-from mixpose.records import Pattern, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, Pattern, PointPattern
 
 STEPS_PER_SIGMA = 4.0
 """Grid points per standard deviation of dense windows."""

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density.grid import FAR
-
-Floats: TypeAlias = NDArray[np.float64]
-Singles: TypeAlias = NDArray[np.float32]
-Indices: TypeAlias = NDArray[np.intp]
+from mixpose.records import Floats, Indices, Singles
 
 MAX_PAGES = 250_000
 """Pages of a sensor's plane; detections that are too far from their middle for it are left out,

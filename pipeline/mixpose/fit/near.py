@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,7 +26,6 @@ from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import NormalPrior, believed, has_likelihood
 from mixpose.objective import (
     MatchedObjective,
-    Objective,
     Quadratic,
     Together,
     View,
@@ -72,28 +72,19 @@ class FitRules:
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an ascent ended.
+    """Where an ascent ended."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    value : float
-        Of the objective at that pose, at the finest blur.
-    converged : bool
-    iterations : int
-        Evaluations at the finest blur.
-    freed : bool
-        Whether the body did not fit, and the pose was fitted to freed features.
-    motion : Motion or None
-        Of the body, where sensors see it at moments of their own.
-    """
-
-    T_world_object: Floats
-    value: float
+    T_world_object: Floats  # (4, 4)
+    value: float  # of the objective at that pose, at the finest blur
     converged: bool
-    iterations: int
-    freed: bool = False
-    motion: Motion | None = None
+    iterations: int  # evaluations at the finest blur
+    freed: bool = False  # whether the body did not fit, and the pose was fitted to freed features
+    motion: Motion | None = None  # of the body, where sensors see it at moments of their own
+
+    @classmethod
+    def of(cls, ascent: Ascent[Floats]) -> Fit:
+        """Where an ascent ended."""
+        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations)
 
 
 @dataclass(frozen=True)
@@ -157,32 +148,25 @@ def fit_near(
     rules : FitRules
     """
     free = free_mask(options)
-    ascent = begun
+    descend = partial(_through_blurs, views, body, T_start, uncertainty, options, samples, rules)
     if options.objective != "matched":
-        finest = None
-    else:
+        return Fit.of(descend(None, FINE))
+    if finest is None or blur != 1:
         sigmas = [blur * view.observation.sigma for view in views]
-        finest = finest if finest and blur == 1 else matched_objective(views, body, sigmas)
-    if finest and ascent is None and not has_likelihood(views):
-        here = finest.linearise(T_start)
-        if blur < 1 or here.value >= rules.near * len(views):
-            ascent = ascend(finest.linearise, perturb, T_start, free, SHARP, here)
-    if ascent is None:
-        ascent = _through_blurs(views, body, T_start, uncertainty, options, samples, finest, rules)
-    at_sigma = ascent
-    if climbed is None or not finest or has_likelihood(views) or blur < 1:
-        climbed = []
+        finest = matched_objective(views, body, sigmas)
+    if has_likelihood(views):
+        ascent = descend(finest, FINE)
+        prior = NormalPrior(T_start, uncertainty, free)
+        T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
+        return replace(Fit.of(ascent), T_world_object=T, freed=is_freed)
+    ascent = begun or _at_once(finest, T_start, free, blur, rules) or descend(finest, SHARP)
+    climbed = climbed if climbed is not None and blur == 1 else []
     for one in climbed:
-        if one.begins_at(at_sigma, rules):
+        if one.begins_at(ascent, rules):
             return one.fit
-    if finest and any(view.observation.cell is None for view in views):
-        known = noise or [Noise()] * len(views)
-        ascent = _to_the_noise(ascent, finest, free, known, beside, errors, rules, blur)
-    T, is_freed = ascent.state, False
-    if finest and has_likelihood(views):
-        T, is_freed = believed(finest, T, NormalPrior(T_start, uncertainty, free), rules.misfit)
-    fit = Fit(T, ascent.value, ascent.converged, ascent.iterations, freed=is_freed)
-    climbed.append(Climbed(at_sigma, fit))
+    known = noise or [Noise()] * len(views)
+    fit = Fit.of(_to_the_noise(ascent, finest, free, known, beside, errors, rules, blur))
+    climbed.append(Climbed(ascent, fit))
     return fit
 
 
@@ -215,6 +199,20 @@ def fit_together(
     return [one if at.value >= least else None for one, at in zip(found, here, strict=True)]
 
 
+def _at_once(
+    objective: MatchedObjective,
+    T_start: Floats,
+    free: NDArray[np.bool_],
+    blur: float,
+    rules: FitRules,
+) -> Ascent[Floats] | None:
+    """The ascent from a start where most features are near a detection, or said to be."""
+    here = objective.linearise(T_start)
+    if blur == 1 and here.value < rules.near * len(objective.views):
+        return None
+    return ascend(objective.linearise, perturb, T_start, free, SHARP, here)
+
+
 def _through_blurs(
     views: Sequence[View],
     body: Body,
@@ -222,24 +220,20 @@ def _through_blurs(
     uncertainty: Floats,
     options: EstimatorOptions,
     samples: Floats,
-    finest: MatchedObjective | None,
     rules: FitRules,
+    finest: MatchedObjective | None,
+    last: NewtonOptions,
 ) -> Ascent[Floats]:
-    """The ascent at one blur after the other."""
+    """The ascent at one blur after the other, with options of the last one."""
     free = free_mask(options)
     spread = np.where(free, uncertainty, 0.0)
-    fine = has_likelihood(views) or options.objective != "matched"
-    ascent = Ascent(T_start, 0.0, False, 0)
-    schedule = blur_schedule(views, body, T_start, spread, rules.schedule)
-    for k, sigmas in enumerate(schedule):
-        last = k == len(schedule) - 1
-        newton = (FINE if fine else SHARP) if last else COARSE
-        objective: Objective | None = finest if last else None
-        if objective is None:
-            name, near = options.objective, ascent.state
-            objective = build_objective(name, views, body, samples, sigmas, near)
-        ascent = ascend(objective.linearise, perturb, ascent.state, free, newton)
-    return ascent
+    *wider, narrowest = blur_schedule(views, body, T_start, spread, rules.schedule)
+    build = partial(build_objective, options.objective, views, body, samples)
+    T = T_start
+    for sigmas in wider:
+        T = ascend(build(sigmas, T).linearise, perturb, T, free, COARSE).state
+    objective = finest or build(narrowest, T)
+    return ascend(objective.linearise, perturb, T, free, last)
 
 
 def _to_the_noise(
@@ -287,23 +281,12 @@ def _to_the_noise(
 
 
 class _Met(NamedTuple):
-    """Where the features are met in each sensor; without share where they are not.
-
-    Attributes
-    ----------
-    offsets : Offsets
-    away : (L, n, 2) float64
-        The offsets themselves, in σ_ε.
-    J : (L, n, 2, 6) float64
-        Of the features by the pose, in σ_ε.
-    places : list of (k, m) float64
-        Of all features that a sensor sees, in its units.
-    """
+    """Where the features are met in each sensor; without share where they are not."""
 
     offsets: Offsets
-    away: Floats
-    J: Floats
-    places: list[Floats]
+    away: Floats  # (L, n, 2) the offsets themselves, in σ_ε
+    J: Floats  # (L, n, 2, 6) of the features by the pose, in σ_ε
+    places: list[Floats]  # (k, m) of all features that a sensor sees, in its units
 
     def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
         """Whether no offset is larger than noise of variances (L,) lets it be."""

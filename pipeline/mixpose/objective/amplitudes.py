@@ -15,60 +15,34 @@ residual g − Σ_i α_i h_i with α solved for (variable projection).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.objective.base import Quadratic
 from mixpose.objective.matched import MatchedObjective
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 
 class _Mixture(NamedTuple):
-    """The n features that a sensor of m coordinates sees, and their amplitudes.
+    """The n features that a sensor of m coordinates sees, and their amplitudes."""
 
-    Attributes
-    ----------
-    alpha : (n,) float64
-    b : (n,) float64
-    B : (n, n) float64
-    inner : (n, n) float64
-        B + λP.
-    pull : (n, m) float64
-        ∇b.
-    away : (n, n, m) float64
-        p_i − p_j.
-    J : (n, m, 6) float64
-    """
-
-    alpha: Floats
-    b: Floats
-    B: Floats
-    inner: Floats
-    pull: Floats
-    away: Floats
-    J: Floats
+    alpha: Floats  # (n,)
+    b: Floats  # (n,)
+    B: Floats  # (n, n)
+    inner: Floats  # (n, n) B + λP
+    pull: Floats  # (n, m) ∇b
+    away: Floats  # (n, n, m) p_i − p_j
+    J: Floats  # (n, m, 6)
 
 
 @dataclass(frozen=True, eq=False)
 class AmplitudesObjective:
-    """Σ_l Q_l / (2 N_l) over the pose, in nats.
+    """Σ_l Q_l / (2 N_l) over the pose, in nats."""
 
-    Attributes
-    ----------
-    matched : MatchedObjective
-        At σ_ε of sensors with noise in their cells.
-    noise : (L,) float64
-        Variance of a cell's noise times the size of a cell, per sensor.
-    spread : float
-        s, relative.
-    """
-
-    matched: MatchedObjective
-    noise: Floats
-    spread: float
+    matched: MatchedObjective  # at σ_ε of sensors with noise in their cells
+    noise: Floats  # (L,) variance of a cell's noise times the size of a cell
+    spread: float  # s, relative
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
         """Value, gradient and curvature at one pose (4, 4)."""

@@ -9,69 +9,39 @@ without the terms that can make it indefinite).  Order and axes of the six numbe
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density import Observation
 from mixpose.objective.kernel import Match
+from mixpose.records import Floats
 from mixpose.sensors import Sensor
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class View:
-    """One sensor with what it observed.
-
-    Attributes
-    ----------
-    name : str
-    sensor : Sensor
-    observation : Observation
-    delay : float
-        Seconds by which the sensor's frame was taken later than the common time.
-    readout : float
-        Seconds from the first row to the last; the frame's time is that of the middle row.
-    unsure : float or None
-        Standard deviation of a delay that is estimated; None where it is told.
-    estimated : float
-        Of the delay, what was estimated.
-    doubts : tuple of Sensor
-        Where its calibration is not exact: the sensor as it stands still, and as it might be.
-    """
+    """One sensor with what it observed; times in seconds."""
 
     name: str
     sensor: Sensor
     observation: Observation
-    delay: float = 0.0
-    readout: float = 0.0
-    unsure: float | None = None
-    estimated: float = 0.0
+    delay: float = 0.0  # by which the sensor's frame was taken later than the common time
+    readout: float = 0.0  # from the first row to the last; the time is that of the middle row
+    unsure: float | None = None  # deviation of a delay that is estimated; None where it is told
+    estimated: float = 0.0  # of the delay, what was estimated
+    # where its calibration is not exact: the sensor as it stands still, and as it might be
     doubts: tuple[Sensor, ...] = ()
 
 
 class Quadratic(NamedTuple):
-    """Second-order model of an objective at a pose: value + gᵀδ − ½ δᵀCδ.
-
-    Attributes
-    ----------
-    value : float
-    gradient : (6,) float64
-    curvature : (6, 6) float64
-        Symmetric, positive semidefinite.
-    hessian : (6, 6) float64 or None
-        Minus the second derivative itself, where it is known; may be indefinite.
-    match : Match or None
-        What a matched objective made it of.
-    """
+    """Second-order model of an objective at a pose: value + gᵀδ − ½ δᵀCδ."""
 
     value: float
-    gradient: Floats
-    curvature: Floats
-    hessian: Floats | None = None
-    match: Match | None = None
+    gradient: Floats  # (6,)
+    curvature: Floats  # (6, 6) symmetric, positive semidefinite
+    hessian: Floats | None = None  # minus the second derivative itself; may be indefinite
+    match: Match | None = None  # what a matched objective made it of
 
 
 class Objective(Protocol):

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, TypeAlias, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mixpose.body import Body
 from mixpose.objective.base import Objective, View
 from mixpose.objective.matched import matched_objective
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
+from mixpose.records import Floats
 
-Floats: TypeAlias = NDArray[np.float64]
 ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
 OBJECTIVES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
 

@@ -11,17 +11,13 @@ Samples that a sensor does not see, or that are not finite, come to lie at `FAR`
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density import FAR, Window
+from mixpose.records import Floats, Singles
 from mixpose.sensors import ParallelBeam
-
-Floats: TypeAlias = NDArray[np.float64]
-Singles: TypeAlias = NDArray[np.float32]
 
 _BLOCK = 16384  # cv2.remap takes maps of less than 32767 a side
 

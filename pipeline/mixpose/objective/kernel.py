@@ -16,7 +16,7 @@ is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 from mixpose.density import close_pairs
 from mixpose.density.overlap import ALL_PAIRS
 from mixpose.objective.projection import Projected
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 _NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
 _FEW = 24  # features up to which all pairs are looked at first
@@ -42,23 +41,12 @@ class Slopes(NamedTuple):
 
 
 class Overlaps(NamedTuple):
-    """⟨h, h⟩ (L, H), and what its derivatives are made of: close pairs of predicted features.
+    """⟨h, h⟩, and what its derivatives are made of: close pairs of predicted features."""
 
-    Attributes
-    ----------
-    norm : (L, H) float64
-    pairs : (P, 2) int
-        i < j.
-    bells : (L, H, P) float64
-        w_i w_j N(p_i − p_j; 0, v); 0 where the two do not overlap.
-    away : (L, H, P, 2) float64
-        p_i − p_j.
-    """
-
-    norm: Floats
-    pairs: NDArray[np.intp]
-    bells: Floats
-    away: Floats
+    norm: Floats  # (L, H)
+    pairs: NDArray[np.intp]  # (P, 2), i < j
+    bells: Floats  # (L, H, P) w_i w_j N(p_i − p_j; 0, v); 0 where the two do not overlap
+    away: Floats  # (L, H, P, 2) p_i − p_j
 
 
 class Match(NamedTuple):

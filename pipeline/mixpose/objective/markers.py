@@ -14,16 +14,12 @@ disk; what is left is of the fourth order of the marker's size over its distance
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.records import Floats, Mask
 from mixpose.sensors import OUTSIDE, Sensor, SensorBatch
-
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 CUBATURE = 0.5**0.5  # of the radius: where the four points are
 

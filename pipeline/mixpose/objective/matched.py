@@ -14,18 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Atlas, matched_atlas, peak
 from mixpose.objective.base import Quadratic, View
 from mixpose.objective.kernel import Match, Slopes, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, project_body
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 STEPS_PER_SIGMA = 4.0
 """Cells per standard deviation of C: places are 4e-4 standard deviations off at most, a part of
@@ -52,33 +49,18 @@ def value_error(steps_per_sigma: float) -> float:
 class MatchedObjective:
     """Σ_l ω_l ⟨g_l, h_l⟩² / (⟨g_l, g_l⟩ ⟨h_l, h_l⟩) over the pose.
 
-    Attributes
-    ----------
-    views : tuple of View
-    projection : BodyProjection
-        Spreads Σ_i of the body's features do not widen the prediction, as a template wider than
-        the data is biased (see `docs/method.md`).
-    atlas : Atlas
-        C of all sensors.
-    variances : (L, 1) float64
-        v = 2σ², that of the product of two features, in squared sensor units.
-    tops : (L, 1) float64
-        N(0; 0, v).
-    energies : (L, 1) float64
-        ⟨g, g⟩.
-    weights : (L, 1) float64
-        ω_l.
-    at_hand : list of (pose, Match)
-        Where several bodies were looked up at once: the body's pose, and what it has there.
+    Spreads Σ_i of the body's features do not widen the prediction, as a template wider than the
+    data is biased (see `docs/method.md`).
     """
 
     views: tuple[View, ...]
     projection: BodyProjection
-    atlas: Atlas
-    variances: Floats
-    tops: Floats
-    energies: Floats
-    weights: Floats
+    atlas: Atlas  # C of all sensors
+    variances: Floats  # (L, 1) v = 2σ², of the product of two features, in squared sensor units
+    tops: Floats  # (L, 1) N(0; 0, v)
+    energies: Floats  # (L, 1) ⟨g, g⟩
+    weights: Floats  # (L, 1) ω_l
+    # where several bodies were looked up at once: the body's pose, and what it has there
     at_hand: list[tuple[Floats, Match]] = field(default_factory=list, init=False)
 
     def value(self, T_world_object: Floats) -> Floats:
@@ -139,17 +121,10 @@ class MatchedObjective:
 
 @dataclass(frozen=True, eq=False)
 class SharedDensities:
-    """C of all sensors at σ_ε, drawn once for several bodies.
-
-    Attributes
-    ----------
-    atlas : Atlas
-    totals : tuple of float
-        Weight of all that was drawn, per sensor.
-    """
+    """C of all sensors at σ_ε, drawn once for several bodies."""
 
     atlas: Atlas
-    totals: tuple[float, ...]
+    totals: tuple[float, ...]  # weight of all that was drawn, per sensor
 
     @classmethod
     def drawn(cls, views: Sequence[View]) -> SharedDensities:

@@ -14,21 +14,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density import Density
 from mixpose.objective.base import Quadratic, View, region_of_interest
 from mixpose.objective.index_maps import ParallelMaps
 from mixpose.objective.projection import pose_jacobian
+from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam, Sensor
-
-Floats: TypeAlias = NDArray[np.float64]
-Singles: TypeAlias = NDArray[np.float32]
 
 REACH = 4.0
 """Margin of a window around the predicted samples, in standard deviations of a feature."""

@@ -8,40 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.markers import MarkerBatch
+from mixpose.records import Floats, Mask
 from mixpose.sensors import Sensor, facing, side_by_side
-
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 
 class Projected(NamedTuple):
-    """A body in L sensors at H poses.
+    """A body in L sensors at H poses."""
 
-    Attributes
-    ----------
-    y : (L, H, n, 2) float64
-    J : (L, H, n, 2, 6) float64
-        By the twist of the pose; zero where a feature is not visible.
-    seen : (L, H, n) bool
-        In view, and facing the sensor where normals are known.
-    faced : (L, H, n) bool
-        Facing the sensor, in view or not.
-    weights : (L, H, n) float64
-        Zero where a feature is not seen.
-    """
-
-    y: Floats
-    J: Floats
-    seen: Mask
-    faced: Mask
-    weights: Floats
+    y: Floats  # (L, H, n, 2)
+    J: Floats  # (L, H, n, 2, 6) by the twist of the pose; zero where a feature is not visible
+    seen: Mask  # (L, H, n) in view, and facing the sensor where normals are known
+    faced: Mask  # (L, H, n) facing the sensor, in view or not
+    weights: Floats  # (L, H, n) zero where a feature is not seen
 
 
 class BodyProjection:

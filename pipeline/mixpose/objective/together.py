@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective.base import Quadratic
 from mixpose.objective.kernel import Match
 from mixpose.objective.matched import MatchedObjective
 from mixpose.objective.projection import BodyProjection
+from mixpose.records import Floats
 from mixpose.sensors import Sensor
-
-Floats: TypeAlias = NDArray[np.float64]
 
 
 class BodiesProjection(BodyProjection):

@@ -65,27 +65,13 @@ def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeR
 
 @dataclass(frozen=True)
 class AssociationSum:
-    """The likelihood over all associations in all sensors, at H poses.
+    """The likelihood over all associations in all sensors, at H poses."""
 
-    Attributes
-    ----------
-    log_odds : (H,) float64
-        Logarithm of the likelihood, over that of mere clutter.
-    gradient : (H, 6) float64
-        Of it, by the twist of the pose.
-    information : (H, 6, 6) float64
-        What the ranges would say if their labels were known.
-    met : (H,) float64
-        Expected number of detections that belong to features.
-    squares : (H,) float64
-        Expected sum of their squared offsets, in σ_ε.
-    """
-
-    log_odds: Floats
-    gradient: Floats
-    information: Floats
-    met: Floats
-    squares: Floats
+    log_odds: Floats  # (H,), logarithm of the likelihood, over that of mere clutter
+    gradient: Floats  # (H, 6), of it, by the twist of the pose
+    information: Floats  # (H, 6, 6), what the ranges would say if their labels were known
+    met: Floats  # (H,), expected number of detections that belong to features
+    squares: Floats  # (H,), expected sum of their squared offsets, in σ_ε²
 
 
 def sum_associations(
@@ -95,17 +81,10 @@ def sum_associations(
     noise: float = 1.0,
     detection: DetectionModel = DetectionModel(),
 ) -> AssociationSum:
-    """Sum the likelihood over all associations.
+    """Sum the likelihood over all associations at poses (H, 4, 4).
 
-    Parameters
-    ----------
-    views : sequence of View
-        For which `are_associated` holds, none with an empty observation.
-    body : Body
-    poses : (H, 4, 4) array
-    noise : float
-        Standard deviation of offsets, in σ_ε.
-    detection : DetectionModel
+    For views `are_associated` holds, none has an empty observation; `noise` is the standard
+    deviation of offsets, in σ_ε.
     """
     patterns = [view.observation.pattern for view in views]
     ranges = [one.points[one.weights > 0, 0] for one in patterns if isinstance(one, PointPattern)]
@@ -172,13 +151,10 @@ def noise_ratio(noise: Noise, rules: RangeRules) -> float:
 
 @dataclass(frozen=True, eq=False)
 class AssociationLikelihood:
-    """All associations of single ranges with the features of a small body.
-
-    `matched` leads from a start of which nothing is known to where it begins.
-    """
+    """All associations of single ranges with the features of a small body."""
 
     data: FrameData
-    matched: Callable[[FrameData], Likelihood]
+    matched: Callable[[FrameData], Likelihood]  # leads from starts of which nothing is known
 
     @property
     def knows_detections(self) -> bool:

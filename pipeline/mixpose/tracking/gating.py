@@ -1,15 +1,15 @@
 """Where a track expects the body in its cameras, and whether it was met there.
 
-While a body is tracked, features are looked for around the prediction only.  That must never
-change what is found: a frame whose pose is not as convincing as the one before it is looked at
-again as a whole (`mixpose.runner`).
+A frame of which only that was looked at, and whose pose is not as convincing as the one before it,
+is looked at again as a whole (`mixpose.runner`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -37,36 +37,22 @@ class GatingRules:
     min_margin_px: float = constant(40.0, "around the predicted features: a spot and its ground")
 
 
+@dataclass(frozen=True)
 class Expectation:
     """A body in front of cameras."""
 
-    def __init__(
-        self,
-        body: Body,
-        cameras: Mapping[str, Sensor],
-        free: NDArray[np.bool_],
-        rules: GatingRules = GatingRules(),
-    ) -> None:
-        """Prepare for a body.
+    body: Body
+    cameras: Mapping[str, Sensor]  # by name; with two coordinates, in px
+    free: NDArray[np.bool_]  # (6,), directions that are estimated
+    rules: GatingRules = GatingRules()
 
-        Parameters
-        ----------
-        body : Body
-        cameras : mapping of str to Sensor
-            Sensors with two coordinates, in px.
-        free : (6,) bool
-            Directions that are estimated.
-        rules : GatingRules
-        """
-        self.names = tuple(cameras)
-        self._projection = project_body(tuple(cameras.values()), body) if cameras else None
-        self._rules = rules
-        self._free = free
-        points = body.nodes.points
-        # A feature's image reaches less than half way to that of its neighbour.
+    @cached_property
+    def _feature_reach(self) -> float:
+        """How far a feature's image reaches: less than half way to that of its neighbour."""
+        points = self.body.nodes.points
         apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
-        gravity = body.gravity.sigma if body.gravity is not None else 0.0
-        self._feature_reach = apart / 2 + rules.reach * float(np.hypot(body.spread, gravity))
+        gravity = self.body.gravity.sigma if self.body.gravity is not None else 0.0
+        return float(apart / 2 + self.rules.reach * np.hypot(self.body.spread, gravity))
 
     def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
         """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
@@ -75,28 +61,29 @@ class Expectation:
         and the features' images, but at least 40 px, around them.  Cameras that will not see the
         body have none; a body of one feature, whose size in the image nothing tells, neither.
         """
-        if self._projection is None or not predictions or not np.isfinite(self._feature_reach):
+        if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
             return {}
-        at = self._projection.project(np.array([one.T_world_object for one in predictions]))
+        projection = project_body(tuple(self.cameras.values()), self.body)
+        at = projection.project(np.array([one.T_world_object for one in predictions]))
         uncertainty = np.array([one.uncertainty for one in predictions])
-        by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self._free) ** 2)
+        by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self.free) ** 2)
         scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
-        rims = np.maximum(scales * self._feature_reach, self._rules.min_margin_px)
-        margins = self._rules.reach * np.sqrt(by_pose) + rims[..., None, None]
+        rims = np.maximum(scales * self._feature_reach, self.rules.min_margin_px)
+        margins = self.rules.reach * np.sqrt(by_pose) + rims[..., None, None]
         seen = at.seen[..., None]
         lower = np.where(seen, at.y - margins, np.inf).min(axis=(1, 2)).tolist()
         upper = np.where(seen, at.y + margins, -np.inf).max(axis=(1, 2)).tolist()
         return {
             name: (math.floor(u0), math.floor(v0), math.ceil(u1) + 1, math.ceil(v1) + 1)
-            for name, (u0, v0), (u1, v1) in zip(self.names, lower, upper, strict=True)
+            for name, (u0, v0), (u1, v1) in zip(self.cameras, lower, upper, strict=True)
             if u0 <= u1
         }
 
 
-def is_convincing(tallies: Tallies, cameras: Sequence[str], share: float) -> bool:
+def is_convincing(tallies: Tallies, cameras: Iterable[str], share: float) -> bool:
     """Whether cameras met so much of the body that the next frame need not be seen whole."""
     some = [tallies[name] for name in cameras if name in tallies]
-    agreeing = [one for one in some if one.met >= 0.5 * one.in_view > 0]
+    agreeing = [one for one in some if one.is_met]
     some = agreeing if len(agreeing) > 1 else some
     return sum(one.met for one in some) > share * sum(one.in_view for one in some)
 

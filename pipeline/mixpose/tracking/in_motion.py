@@ -51,26 +51,13 @@ def is_timed(views: Sequence[View]) -> bool:
 
 
 class Offsets(NamedTuple):
-    """Met features of all sensors, in σ_ε and as rows for least squares.
+    """Met features of all sensors, in σ_ε and as rows for least squares."""
 
-    Attributes
-    ----------
-    rows : (K, 6) float64
-        J, each weighted by the root of how far its feature is met.
-    late : (K,) float64
-        Seconds after the common time at which it is seen.
-    offsets : (K,) float64
-        Observed minus predicted.
-    sensor : (K,) int
-    unsure : tuple of (int, float)
-        Sensors whose delays are estimated, with the standard deviations.
-    """
-
-    rows: Floats
-    late: Floats
-    offsets: Floats
-    sensor: NDArray[np.intp]
-    unsure: tuple[tuple[int, float], ...]
+    rows: Floats  # (K, 6), J, each weighted by the root of how far its feature is met
+    late: Floats  # (K,), seconds after the common time at which it is seen
+    offsets: Floats  # (K,), observed minus predicted
+    sensor: NDArray[np.intp]  # (K,)
+    unsure: tuple[tuple[int, float], ...]  # sensors with estimated delays, standard deviations
 
     def of(self, sensors: Sequence[int]) -> NDArray[np.bool_]:
         """Which rows are of each of some sensors (K, q)."""
@@ -116,15 +103,8 @@ def fit_in_motion(
     """Climb to the most likely pose and velocity near a start.
 
     The pose is climbed to as if the velocity were known, then steps of both are taken in turns.
-
-    Parameters
-    ----------
-    data : FrameData
-        Of sensors that see features at moments of their own.
-    T_start : (4, 4) array
-    climb : callable
-        Takes a frame as of the common time, a pose, and how far features may be off, in σ_ε, to
-        the best pose near it.
+    `climb` takes a frame as of the common time, a pose (4, 4), and how far features may be off, in
+    σ_ε, to the best pose near it.
     """
     motion = data.expected(T_start, is_there=False).at(T_start)
     T, expected, moved = T_start, data.expected(T_start), np.inf
@@ -237,24 +217,12 @@ def _inverse(information: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class DelayEvidence:
-    """What the frames so far say of how late sensors are, beyond what was told of them.
+    """What the frames so far say of how late sensors are, beyond what was told of them."""
 
-    Attributes
-    ----------
-    reference : str
-        The sensor against which delays are known; empty before the first frame.
-    names : tuple of str
-        The others.
-    information : (n, n) float64
-        Per squared second.
-    vector : (n,) float64
-        Per second.
-    """
-
-    reference: str = ""
-    names: tuple[str, ...] = ()
-    information: Floats = field(default_factory=lambda: np.zeros((0, 0)))
-    vector: Floats = field(default_factory=lambda: np.zeros(0))
+    reference: str = ""  # the sensor against which delays are known; empty before the first frame
+    names: tuple[str, ...] = ()  # the others
+    information: Floats = field(default_factory=lambda: np.zeros((0, 0)))  # (n, n), s⁻²
+    vector: Floats = field(default_factory=lambda: np.zeros(0))  # (n,), s⁻¹
 
     def seconds(self) -> dict[str, DelaySeen]:
         """How late each sensor is, as far as it is known, and how surely."""

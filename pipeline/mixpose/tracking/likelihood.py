@@ -42,29 +42,14 @@ from mixpose.tracking.track import Prediction, Track, either, nearest_branch
 
 @dataclass(frozen=True)
 class Start:
-    """Where a fit begins.
+    """Where a fit begins."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    uncertainty : (6,) float64 or None
-        Standard deviations; None: the pose is there already.
-    prediction : Prediction or None
-        That it comes from.
-    left_out : mapping of str to str
-        Sensors that are not to take part, and why.
-    T_moved : (4, 4) float64 or None
-        A pose that has moved as this one must have, and was as likely before the frame.
-    blur : float
-        In σ_ε, that the fit begins at.
-    """
-
-    T_world_object: Floats
-    uncertainty: Floats | None = None
-    prediction: Prediction | None = None
-    left_out: Mapping[str, str] = field(default_factory=dict)
-    T_moved: Floats | None = None
-    blur: float = 1.0
+    T_world_object: Floats  # (4, 4)
+    uncertainty: Floats | None = None  # (6,), standard deviations; None: the pose is there already
+    prediction: Prediction | None = None  # that it comes from
+    left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
+    T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
+    blur: float = 1.0  # in σ_ε, that the fit begins at
 
 
 @dataclass
@@ -76,32 +61,16 @@ class SearchLog:
 
 
 class Begun(NamedTuple):
-    """What is known of the fit from the first prediction.
+    """What is known of the fit from the first prediction."""
 
-    Attributes
-    ----------
-    objective : MatchedObjective
-        At σ_ε.
-    fit : Fit or None
-        That this was climbed to with others'.
-    judged : Judged or None
-        The pose of that fit.
-    """
-
-    objective: MatchedObjective
-    fit: Fit | None = None
-    judged: Judged | None = None
+    objective: MatchedObjective  # at σ_ε
+    fit: Fit | None = None  # that this was climbed to with others'
+    judged: Judged | None = None  # the pose of that fit
 
 
 @dataclass(frozen=True, eq=False)
 class FrameData:
-    """A frame, and what is known before it.
-
-    `log` is written by the proposer that searches.  Where views see the body in motion as of the
-    common time, `still` is the frame with the sensors as they stand.  `begun` is the climb from the
-    first prediction, where several bodies were fitted together.  `beside` is where another body
-    lets it expect that was not seen where it was expected.
-    """
+    """A frame, and what is known before it."""
 
     views: Sequence[View]
     body: Body
@@ -114,10 +83,10 @@ class FrameData:
     rules: Rules
     frame: int
     time_s: float | None
-    begun: Begun | None = None
-    log: SearchLog = field(default_factory=SearchLog)
-    still: FrameData | None = None
-    beside: Prediction | None = None
+    begun: Begun | None = None  # where several bodies were fitted together
+    log: SearchLog = field(default_factory=SearchLog)  # written by the proposer that searches
+    still: FrameData | None = None  # where views are as of the common time: sensors as they stand
+    beside: Prediction | None = None  # where another body lets expect one that is not where it was
 
     @cached_property
     def free(self) -> NDArray[np.bool_]:
@@ -232,13 +201,10 @@ class FrameData:
 
 @dataclass(frozen=True, eq=False)
 class MatchedLikelihood:
-    """Matched densities of all sensors.
-
-    `climbed` has the fits so far, by the sensors that were left out.
-    """
+    """Matched densities of all sensors."""
 
     data: FrameData
-    climbed: dict[frozenset[str], list[Climbed]] = field(default_factory=dict)
+    climbed: dict[frozenset[str], list[Climbed]] = field(default_factory=dict)  # by those left out
 
     @property
     def knows_detections(self) -> bool:

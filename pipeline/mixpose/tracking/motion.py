@@ -1,11 +1,9 @@
 """How a body moves: how far from frame to frame, and how fast at a moment.
 
-The velocity at a moment is known from the poses of the frames before: each of the six coordinates
-of the pose is followed with its first three derivatives, of which the last takes a random walk (a
-Kalman filter).  How fast that is says how steady the motion is: filters from very steady to very
-sudden ones run side by side, and the one is believed that foretold the last poses best.  The
-filter says of the frame's velocity how it depends on the frame's pose, and nothing of the pose
-itself: that is estimated from its frame.
+Each of the six coordinates of the pose is followed with its first three derivatives, of which the
+last takes a random walk (a Kalman filter).  Filters from very steady to very sudden motion run side
+by side, and the one is believed that foretold the last poses best.  It says how the velocity
+depends on the frame's pose, and nothing of the pose itself: that is estimated from its frame.
 """
 
 from __future__ import annotations
@@ -80,19 +78,10 @@ class MotionRules:
 
 @dataclass(frozen=True)
 class RandomWalk:
-    """How far the body moves from frame to frame, learnt from uncertain poses.
+    """How far the body moves from frame to frame, learnt from uncertain poses."""
 
-    Attributes
-    ----------
-    rates : (6,) float64
-        Sum of squared displacements over the time that they took.
-    count : float
-        Of displacements; fades.
-    rules : MotionRules
-    """
-
-    rates: Floats
-    count: float
+    rates: Floats  # (6,), sum of squared displacements over the time that they took
+    count: float  # of displacements; fades
     rules: MotionRules
 
     @classmethod
@@ -108,7 +97,10 @@ class RandomWalk:
         the other way round: a turn is not unlikely for not having been seen so far.
         """
         lever = np.repeat([1.0, radius], 3)
-        shares = _per_kind_mean((moved * lever) ** 2)
+        squares = ((moved * lever) ** 2).reshape(2, 3)
+        # of the lengths and of the angles, the mean of those that are not zero
+        means = squares.sum(axis=1) / np.maximum(np.count_nonzero(squares, axis=1), 1)
+        shares = np.repeat(means, 3)
         other = np.roll(shares, 3)
         rate = np.maximum(shares, self.rules.other_kind * other) / lever**2 / elapsed
         recall = self.rules.recall
@@ -126,12 +118,6 @@ class RandomWalk:
 def per_kind(body: Body, radii: float, degrees: float) -> Floats:
     """Lengths, in radii of a body, and angles for all directions alike (6,)."""
     return np.repeat([radii * body.radius, np.radians(degrees)], 3)
-
-
-def _per_kind_mean(squares: Floats) -> Floats:
-    """The mean of the lengths and of the angles that are not zero, for all directions alike."""
-    parts = [part.sum() / max(np.count_nonzero(part), 1) for part in (squares[:3], squares[3:])]
-    return np.repeat(parts, 3)
 
 
 @dataclass(frozen=True)
@@ -158,24 +144,12 @@ class CourseRules:
 
 
 class Expected(NamedTuple):
-    """A velocity that is expected of a pose.
+    """A velocity that is expected of a pose."""
 
-    Attributes
-    ----------
-    velocity : (6,) float64
-        Twist per second.
-    gain : (6,) float64
-        By how much more per second for a pose farther on; zero where no pose was seen before.
-    deviation : (6,) float64
-        Standard deviations.
-    acceleration : (6,) float64
-        Per second more.
-    """
-
-    velocity: Floats
-    gain: Floats
-    deviation: Floats
-    acceleration: Floats
+    velocity: Floats  # (6,), twist per second
+    gain: Floats  # (6,), more per second for a pose farther on; 0 where none was seen before
+    deviation: Floats  # (6,), of the velocity
+    acceleration: Floats  # (6,), per second more
 
     def at(self, T_world_object: Floats) -> Motion:
         """How a body moves at that pose."""
@@ -190,21 +164,11 @@ def unknown(body: Body, rules: CourseRules) -> Expected:
 
 @dataclass(frozen=True)
 class Course:
-    """How fast a body goes at its last pose, to which states are relative, and how sure that is.
+    """How fast a body goes at its last pose, to which states are relative, and how sure that is."""
 
-    Attributes
-    ----------
-    means : (F, 6, 4) float64
-        Place, velocity, acceleration and jerk by F filters.
-    covariances : (F, 6, 4, 4) float64
-    log_likelihoods : (F, 2) float64
-        Of lengths and of angles.
-    body : Body
-    """
-
-    means: Floats
-    covariances: Floats
-    log_likelihoods: Floats
+    means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F filters
+    covariances: Floats  # (F, 6, 4, 4)
+    log_likelihoods: Floats  # (F, 2), of lengths and of angles
     body: Body
 
     @classmethod

@@ -1,16 +1,12 @@
 """Whether it is the body that was seen, or what has markers alike: another thing, a mirror image.
 
-Three markers in space are met by every thing that has three in the same places.  A body of more,
-alone in its session, is known once others of it are met, and stays so while it is followed.  To one
-camera another thing may look like the body by chance.  As it moves as one, it does so for several
+A body is known once more than three markers are met, which other things have in the same places,
+too, and stays so while it is followed.  What looks like the body by chance does so for several
 frames, and what the track expects then tells nothing.
 
-In a window or a polished floor, or where a body is given mirrored, there is its mirror image.  Any
-three markers of that lie as three of the body do, a fourth and a fifth may by chance, and markers
-that are nearly in a plane all do.  So where features are missed, and detections about the body
-belong to none, its mirror image is a rival: reflected in the plane nearest to the features met,
-which it leaves where they are.  Where few are met, it is looked for everywhere, in the first
-frames.
+Where features are missed, and detections about the body belong to none, its mirror image is a
+rival: reflected in the plane nearest to the features met, which it leaves where they are.  Where
+few are met, it is looked for everywhere, in the first frames.
 """
 
 from __future__ import annotations
@@ -87,8 +83,7 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
     own = _evidence(alone, Start(judged.T_world_object))
     mirror = replace(alone, body=_reflected(data.body, met >= 0))
     least = own - data.rules.search.outdone
-    found = [one for one in candidates_of(mirror) if one.evidence > least]
-    starts = starts_at(mirror, found)
+    starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
     return any(_evidence(mirror, start) > own + ahead for start in starts)
 
 
@@ -107,9 +102,8 @@ def _is_by_chance(data: FrameData, judged: Judged) -> bool:
     if data.track.believed >= rules.proposals.believed or any(one.J.shape[1] != 2 for one in seen):
         return False
     before, noise = data.track.residuals.total, rules.judgement.noise
-    return any(one.missed > 0.5 for one in seen) or is_far_off(
-        seen, before, rules.acceptance, noise
-    )
+    off = is_far_off(seen, before, rules.acceptance, noise)
+    return off or any(one.missed > 0.5 for one in seen)
 
 
 def _evidence(data: FrameData, start: Start) -> float:

@@ -32,13 +32,7 @@ class StaticRules:
 
 @dataclass(frozen=True)
 class StaticClutter:
-    """Places with the number of frames that had a detection there, less those without.
-
-    Attributes
-    ----------
-    places : mapping of str to ((K, m) float64, (K,) int)
-        By sensor, with their counts.
-    """
+    """Places (K, m) by sensor, and in how many frames more they were seen than not (K,)."""
 
     places: Mapping[str, tuple[Floats, NDArray[np.intp]]] = field(default_factory=dict)
 
@@ -50,7 +44,8 @@ class StaticClutter:
             if not isinstance(pattern, PointPattern):
                 continue
             old, count = places.get(view.name, (pattern.points[:0], np.zeros(0, dtype=np.intp)))
-            near = _nearest(old, pattern.points, rules.same * view.observation.sigma)
+            reach = rules.same * view.observation.sigma
+            near = cKDTree(old).query(pattern.points, distance_upper_bound=reach)[1]
             met = np.isin(np.arange(len(old)), near)
             count = np.minimum(count + np.where(met, 1, -1), 2 * rules.frames)
             fresh = pattern.points[near == len(old)]
@@ -70,16 +65,10 @@ class StaticClutter:
                 continue
             places, counts = self.places[view.name]
             static = places[counts >= rules.frames]
-            near = _nearest(static, pattern.points, rules.same * view.observation.sigma)
-            alone = near == len(static)
+            reach = rules.same * view.observation.sigma
+            away = cKDTree(static).query(pattern.points, distance_upper_bound=reach)[0]
+            alone = np.isinf(away)
             if not alone.all():
                 rest = PointPattern(pattern.points[alone], pattern.weights[alone])
                 moving[k] = replace(view, observation=replace(view.observation, pattern=rest))
         return moving
-
-
-def _nearest(places: Floats, points: Floats, reach: float) -> NDArray[np.intp]:
-    """The place (M,) within reach of each point; the number of places where there is none."""
-    if not len(places):
-        return np.zeros(len(points), dtype=np.intp)
-    return np.asarray(cKDTree(places).query(points, distance_upper_bound=reach)[1])

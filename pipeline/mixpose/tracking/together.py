@@ -15,21 +15,14 @@ from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Sta
 def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
     """The frames of several bodies with what is climbed from their first predictions, and judged.
 
-    Parameters
-    ----------
-    frames : sequence of FrameData
-        Of the same sensors; what is not a body's own is out of its reach.
-    shared : SharedDensities
-        Of all that these sensors see.
+    Their sensors are the same, of which `shared` has all that they see; what is not a body's own is
+    out of its reach.
     """
-    begun = [
-        one
-        if is_timed(one.views)
-        else replace(
-            one, begun=Begun(matched_objective(one.views, one.body, one.sigmas, shared=shared))
-        )
-        for one in frames
-    ]
+    begun = list(frames)
+    for k, one in enumerate(frames):
+        if not is_timed(one.views):
+            objective = matched_objective(one.views, one.body, one.sigmas, shared=shared)
+            begun[k] = replace(one, begun=Begun(objective))
     some = [k for k, one in enumerate(begun) if _is_climbed(one)]
     if len(some) < 2:
         return begun
@@ -49,8 +42,8 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
             T = nearest_alike(fits[k].T_world_object, data.body, data.T_reference)
             cases.append(Case(data.finest, T, data.track.residuals, data.prior(T)))
     judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
-    for (k, fit), one in zip(fits.items(), judged, strict=True):
-        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, one))
+    for (k, fit), found in zip(fits.items(), judged, strict=True):
+        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, found))
     return begun
 
 

@@ -26,28 +26,16 @@ if TYPE_CHECKING:
 class Branch:
     """One place where the body may be.
 
-    Attributes
-    ----------
-    T_world_object : (4, 4) float64
-    weight : float
-        Belief in this branch among its rivals.
-    velocity : (6,) float64 or None
-        Twist per second where frames have times, else per frame.
-    uncertainty : (6,) float64
-        Standard deviations of the next pose about the prediction.
-    spread : (6,) float64 or None
-        Standard deviations of the pose itself, where they are as large as its motion: then the
-        next frame takes it as a prior, and no velocity is believed.
-    course : Course or None
-        From which its velocity at a moment is known; None where nobody asks for that.
+    Where standard deviations of the pose are as large as its motion, the next frame takes it as a
+    prior, and no velocity is believed.
     """
 
-    T_world_object: Floats
-    weight: float
-    velocity: Floats | None
-    uncertainty: Floats
-    spread: Floats | None = None
-    course: Course | None = None
+    T_world_object: Floats  # (4, 4)
+    weight: float  # belief in this branch among its rivals
+    velocity: Floats | None  # (6,), twist per second where frames have times, else per frame
+    uncertainty: Floats  # (6,), standard deviations of the next pose about the prediction
+    spread: Floats | None = None  # (6,), of the pose itself, where it is to be a prior
+    course: Course | None = None  # for its velocity at a moment, where anybody asks for that
 
 
 class SensorTally(NamedTuple):
@@ -56,6 +44,11 @@ class SensorTally(NamedTuple):
     met: int
     in_view: int
 
+    @property
+    def is_met(self) -> bool:
+        """Whether it met the body: at least half of it."""
+        return self.met >= 0.5 * self.in_view > 0
+
 
 @dataclass(frozen=True)
 class Companion:
@@ -63,20 +56,11 @@ class Companion:
 
     Limbs of a person, a tool and its tray stay near each other.  Where the one is sure and the
     other was lost, or moved as nobody expected, these tell where it may be.
-
-    Attributes
-    ----------
-    T_other_object : (4, 4) float64
-        Their mean.
-    squares : (6,) float64
-        Mean squared twists from it, in the axes of the other body.
-    count : int
-        Of frames.
     """
 
-    T_other_object: Floats
-    squares: Floats
-    count: int
+    T_other_object: Floats  # (4, 4), their mean
+    squares: Floats  # (6,), mean squared twists from it, in the axes of the other body
+    count: int  # of frames
 
     @classmethod
     def joined(
@@ -107,57 +91,23 @@ class Companion:
 
 @dataclass(frozen=True)
 class Track:
-    """What is known between two frames.
+    """What is known between two frames."""
 
-    Attributes
-    ----------
-    branches : tuple of Branch
-        Best first; empty where nothing is known.
-    frame : int or None
-        The last frame with a pose; None before the first.
-    time_s : float or None
-        Its time.
-    misses : int
-        Frames since then.
-    residuals : Residuals
-        So far.
-    walk : RandomWalk or None
-        None before two uncertain poses.
-    tallies : mapping of str to SensorTally
-        By sensor, of the last frame with a pose.
-    search : SearchState
-        Where a search with a budget goes on while nothing convinces.
-    delays : DelayEvidence
-        How late sensors are, as far as it was seen.
-    doubted : bool
-        Whether another body of the scene may have what the last pose meets.
-    agreed : bool
-        Whether two sensors met most of the body in some frame.
-    believed : int
-        Frames whose pose was ok.
-    known : bool
-        Whether the body was told from things that have three markers alike.
-    clutter : StaticClutter
-        What stayed where it was while the body was lost.
-    companions : mapping of str to Companion
-        Where it was beside other bodies, by their labels.
-    """
-
-    branches: tuple[Branch, ...] = ()
-    frame: int | None = None
-    time_s: float | None = None
-    misses: int = 0
-    residuals: Residuals = Residuals()
-    walk: RandomWalk | None = None
-    tallies: Mapping[str, SensorTally] = field(default_factory=dict)
-    search: SearchState = SearchState()
-    delays: DelayEvidence = field(default_factory=DelayEvidence)
-    doubted: bool = False
-    agreed: bool = False
-    believed: int = 0
-    known: bool = False
-    clutter: StaticClutter = StaticClutter()
-    companions: Mapping[str, Companion] = field(default_factory=dict)
+    branches: tuple[Branch, ...] = ()  # best first; empty where nothing is known
+    frame: int | None = None  # the last with a pose; None before the first
+    time_s: float | None = None  # of that frame
+    misses: int = 0  # frames since then
+    residuals: Residuals = Residuals()  # so far
+    walk: RandomWalk | None = None  # None before two uncertain poses
+    tallies: Mapping[str, SensorTally] = field(default_factory=dict)  # of the last pose, by sensor
+    search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
+    delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
+    doubted: bool = False  # whether another body may have what the last pose meets
+    agreed: bool = False  # whether two sensors met most of the body in some frame
+    believed: int = 0  # frames whose pose was ok
+    known: bool = False  # whether it was told from things that have three markers alike
+    clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
+    companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
 
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
@@ -241,15 +191,12 @@ def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
 
 
 class Found(NamedTuple):
-    """A pose of a frame, its belief among its rivals, and its spread if that is to be a prior.
+    """A pose of a frame, and how sure it is."""
 
-    `deviation` are its standard deviations (6,), None where nobody asks for velocities at moments.
-    """
-
-    T_world_object: Floats
-    weight: float
-    spread: Floats | None = None
-    deviation: Floats | None = None
+    T_world_object: Floats  # (4, 4)
+    weight: float  # belief among its rivals
+    spread: Floats | None = None  # (6,), if that is to be a prior
+    deviation: Floats | None = None  # (6,), where anybody asks for velocities at moments
 
 
 def follow(data: FrameData, found: Sequence[Found]) -> Track:
@@ -271,8 +218,8 @@ def follow(data: FrameData, found: Sequence[Found]) -> Track:
                 last = parent.velocity
                 change = moved / 2 if last is None else moved - last * elapsed
                 # of one frame, where it was seen over several
-                change = change / (1 + track.misses)
-                uncertainty = np.maximum(_per_kind(change), rules.steady(body))
+                change = np.abs(change / (1 + track.misses)).reshape(2, 3)
+                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), rules.steady(body))
             if deviation is not None and before and elapsed <= course_rules.longest_s:
                 course = before.followed(moved, deviation, elapsed, course_rules)
         if deviation is not None:
@@ -291,15 +238,9 @@ def follow(data: FrameData, found: Sequence[Found]) -> Track:
 
 def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:
     """The branch that a pose goes on from: the nearest."""
-    if not track.branches:
-        return None
-    away = [
-        np.linalg.norm(twist_between(branch.T_world_object, T) / np.repeat([body.radius, 1.0], 3))
-        for branch in track.branches
-    ]
-    return track.branches[int(np.argmin(away))]
+    scale = np.repeat([body.radius, 1.0], 3)
 
+    def away(branch: Branch) -> float:
+        return float(np.linalg.norm(twist_between(branch.T_world_object, T) / scale))
 
-def _per_kind(twist: Floats) -> Floats:
-    """The largest of the lengths and the largest of the angles, for all directions alike."""
-    return np.repeat([np.abs(twist[:3]).max(), np.abs(twist[3:]).max()], 3)
+    return min(track.branches, key=away, default=None)

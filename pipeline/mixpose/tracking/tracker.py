@@ -38,8 +38,6 @@ from mixpose.tracking.recognition import (
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Found, Prediction, SensorTally, Track, follow, predict
 
-_MOST = 0.5  # of the features in view: a sensor that meets so many has met the body
-
 
 @dataclass(frozen=True)
 class Tracker:
@@ -143,32 +141,27 @@ class Tracker:
 
     def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
-        verdict = decide(ranked, self.free, self.rules.acceptance)
+        rules = self.rules.acceptance
+        verdict = decide(ranked, self.free, rules)
         best = verdict.best
         if best is None:
             return verdict
-        if verdict.status != "ok" and any(
-            is_a_step(self.body, best, one) for one, _ in verdict.kept
-        ):
+        steps = (is_a_step(self.body, best, one) for one, _ in verdict.kept)
+        if verdict.status != "ok" and any(steps):
             return replace(verdict, doubt=ASIDE)
         # a sure pose that has rivals may have them for a reason that can be told
-        if not is_sure(best, self.free, self.rules.acceptance):
+        if not is_sure(best, self.free, rules):
             return verdict
         if is_reflection(data, best):
             return verdict.doubted(MIRRORED)
-        track, noise = data.track, self.rules.judgement.noise
-        if contradict(best, track.residuals.total, track.agreed, self.rules.acceptance, noise):
-            return verdict.doubted(APART)
-        return verdict
+        before, noise = data.track.residuals.total, self.rules.judgement.noise
+        apart = contradict(best, before, data.track.agreed, rules, noise)
+        return verdict.doubted(APART if apart else "")
 
     def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
-        Parameters
-        ----------
-        data : FrameData
-        quickly : bool
-            Whether to look where the body is expected only.
+        `quickly`: where the body is expected only.
         """
         ranked: list[Judged] = []
         if not data.views:
@@ -218,12 +211,14 @@ class Tracker:
         told = best or next(iter(ranked), None)
         hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
         reports = {view.name: SensorReport(False) for view in views}
-        offsets = {}
-        if told is not None:
-            reports |= told.sensors
-            offsets = _offsets(told, self.body)
+        reports |= told.sensors if told else {}
+        offsets = _offsets(told, self.body) if told else {}
         for name, one in offsets.items():
-            reports[name] = replace(reports[name], residuals=_residuals(one, self.body))
+            lengths = np.linalg.norm(one.offsets, axis=1).tolist()
+            labels = [self.body.labels[i] for i in one.features]
+            each = zip(labels, lengths, one.met, strict=True)
+            residuals = {label: length if met else None for label, length, met in each}
+            reports[name] = replace(reports[name], residuals=residuals)
         return Estimate(
             frame=data.frame,
             time_s=data.time_s,
@@ -258,7 +253,6 @@ class Tracker:
             for one in best.associations
             if best.sensors[one.name].used
         }
-        met = [one.met >= _MOST * one.in_view > 0 for one in tallies.values()]
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
         return replace(
@@ -266,7 +260,7 @@ class Tracker:
             residuals=best.residuals if is_ok else track.residuals,
             tallies=tallies,
             delays=track.delays.joined(data, best) if is_ok or late else track.delays,
-            agreed=track.agreed or sum(met) > 1,
+            agreed=track.agreed or sum(one.is_met for one in tallies.values()) > 1,
             known=is_known(data, best),
             believed=track.believed + is_ok,
         )
@@ -312,15 +306,6 @@ def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
     }
 
 
-def _residuals(offsets: Offsets, body: Body) -> dict[str, float | None]:
-    """Lengths of offsets by the name of their feature."""
-    lengths = np.linalg.norm(offsets.offsets, axis=1).tolist()
-    return {
-        body.labels[i]: length if met else None
-        for i, met, length in zip(offsets.features, offsets.met, lengths, strict=True)
-    }
-
-
 def estimate_pose(
     views: Sequence[View],
     model: Body,
@@ -348,16 +333,6 @@ def estimate_pose(
     ValueError
         If the start is no rigid motion, or a view's features are not of its sensor's dimension.
     """
-    _check(views, start)
-    tracker = Tracker.create(model, options or EstimatorOptions(), start)
-    began = time.perf_counter()
-    with one_blas_thread():
-        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
-    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
-
-
-def _check(views: Sequence[View], start: Floats | None) -> None:
-    """Refuse arrays that cannot be meant, before they go astray in the search."""
     if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
         raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
     for view in views:
@@ -366,3 +341,8 @@ def _check(views: Sequence[View], start: Floats | None) -> None:
             raise ValueError(
                 f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
             )
+    tracker = Tracker.create(model, options or EstimatorOptions(), start)
+    began = time.perf_counter()
+    with one_blas_thread():
+        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
