@@ -12,7 +12,6 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import AssociationRules
 from mixpose.judgement import Case, associate, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
-from mixpose.rigid import transform
 from mixpose.sensors import PinholeCamera
 
 
@@ -93,7 +92,7 @@ def test_a_sensor_that_is_left_out_may_see_what_no_other_sees(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     # the last feature of a body that gives way, far to the left of the first camera's view
-    far = transform(np.linalg.inv(TRUTH), np.array([[-750.0, 40.0, 0.0]]))[0]
+    far = (np.array([-750.0, 40.0, 0.0]) - TRUTH[:3, 3]) @ TRUTH[:3, :3]
     features = (PointFeature(p, np.eye(3)) for p in [*EIGHT.means, far])
     body = Body("long", tuple(features))
     views = detect(pinhole_cameras, body, TRUTH, noise=0.2)
