@@ -9,7 +9,8 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import Case, expected_covariance, judge, judge_together
+from mixpose.density import AssociationRules
+from mixpose.judgement import Case, associate, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
 from mixpose.sensors import PinholeCamera
 
@@ -85,3 +86,19 @@ def test_a_body_that_gives_way_is_as_evident_bent_as_its_spread_lets_it_be(
     # what both cameras see alike is no noise of either
     bent = giving_way(0.0, off=1.0)
     assert evidence(giving_way(1.0), bent) > evidence(giving_way(0.0), bent) + 1
+
+
+def test_a_sensor_that_is_left_out_may_see_what_no_other_sees(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # the last feature of a body that gives way, far to the left of the first camera's view
+    far = (np.array([-750.0, 40.0, 0.0]) - TRUTH[:3, 3]) @ TRUTH[:3, :3]
+    features = (PointFeature(p, np.eye(3)) for p in [*EIGHT.means, far])
+    body = Body("long", tuple(features))
+    views = detect(pinhole_cameras, body, TRUTH, noise=0.2)
+    found, _ = associate(matched_objective(views, body, [1.5, 1.5]), TRUTH, AssociationRules())
+    assert [int(one.features.max()) for one in found] == [7, 8]
+    alone = Case(matched_objective(views[:1], body, [1.5]), TRUTH)
+    missed = judge(replace(alone, unmet=found[1:]), ALL_FREE).log_evidence
+    # what one sensor misses counts as 5 nats at most, and its detections are more to choose from
+    assert 5.0 - 1e-9 <= judge(alone, ALL_FREE).log_evidence - missed < 10.0

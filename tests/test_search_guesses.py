@@ -12,9 +12,9 @@ from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, 
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
-from mixpose.search.guesses import from_slips, kinds_of_guesses
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
+from mixpose.search.search import from_slips, kinds_of_guesses
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import PinholeCamera
 

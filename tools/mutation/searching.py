@@ -308,9 +308,9 @@ _SEARCH_EVIDENCE = (
 _SEARCH = (
     Mutant(
         "search-slips-not-tried",
-        "search/guesses.py",
-        "shifts[:, :3, 3] = body.means[i] - body.means[j]",
-        "shifts[:, :3, 3] = 0.0",
+        "search/search.py",
+        "from_parts(np.eye(3), body.means[i] - body.means[j])",
+        "from_parts(np.eye(3), 0 * body.means[i])",
         "a chessboard is found a square off",
     ),
     Mutant(
@@ -344,8 +344,8 @@ _SEARCH = (
     Mutant(
         "search-symmetric-poses-are-candidates",
         "search/refinement.py",
-        "images.append(transform(poses[k] @ body.symmetries, body.means))",
-        "images.append(transform(poses[k][None], body.means))",
+        "images.append(transform(pose @ body.symmetries, body.means))",
+        "images.append(transform(pose[None], body.means))",
         "candidates are the same pose several times",
     ),
     Mutant(
@@ -395,7 +395,7 @@ _SEARCH = (
     ),
     Mutant(
         "search-points-of-a-crowd-first",
-        "search/guesses.py",
+        "search/search.py",
         "kinds.insert(len(kinds) if crowded else 0,",
         "kinds.insert(0,",
         "the first frame of web cams takes a third longer",

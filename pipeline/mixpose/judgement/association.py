@@ -35,9 +35,7 @@ class Association:
     features: NDArray[np.intp]  # (n,) nodes of the body that are in view
     shares: Floats  # (n,) how far each was met, 0 to its weight
     places: Floats  # (n, m) where they are predicted, sensor units
-    offsets: (
-        Floats  # (n, m) observed minus predicted; 0 where not met; of two in one, their middle's
-    )
+    offsets: Floats  # (n, m) seen minus predicted; 0 where not met; of a merged pair its middle's
     J: Floats  # (n, m, 6) Jacobian of the predicted places by the pose, likewise
     expected: float  # sum of the weights of the features in view
     unseen: float  # sum of the weights of the features that face the sensor outside its view

@@ -1,9 +1,4 @@
-"""Search: the first pose from nothing, over all orientations and positions.
-
-Few features that are seen clearly name a pose: three points in space, a point and two rays, three
-rays of one camera.  Where none are seen clearly, all orientations are scored on blurred densities.
-Every guess is judged on all sensors, and the best descend through narrowing blurs.
-"""
+"""Search: the first pose from nothing, over all orientations and positions."""
 
 from __future__ import annotations
 

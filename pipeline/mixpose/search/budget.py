@@ -1,7 +1,6 @@
 """How much the search may try, and the thresholds that decide when it may stop.
 
-Every field says what it is and where it comes from: a derivation, a test, or a row of
-`tools/benchmark.py search` (written N/hidden/false).  They are no options of a session.
+Rows are those of `tools/benchmark.py search`, written N/hidden/false.
 """
 
 from __future__ import annotations
@@ -100,6 +99,7 @@ class SearchBudget:
         "nats behind the best from which a pose is no candidate: of 470 frames of the rows and of "
         "clutter in space none had the right pose more than 4.2 behind",
     )
+    candidates: int = constant(8, "poses told in the end, as far as they are distinct")
     hopeless: float = constant(
         -20.0, "the same whatever is best: fits gain 3 nats or, of a board in motion, 12"
     )

@@ -19,29 +19,16 @@ from mixpose.sensors import Rays
 
 @dataclass(frozen=True)
 class SensorDetections:
-    """One sensor with its detections.
+    """One sensor with its detections, all of the same weight.
 
-    Attributes
-    ----------
-    view : View
-        Its observation holds every detection with the same weight: a bright blob is not worth
-        more features than a faint one, nor are two that merged.
-    points : (M, m) float64
-        Detections in sensor coordinates; none for range profiles and for grey values of bodies
-        whose features are not points.
-    rays : Rays or None
-        None for sensors without lines of sight.
-    mean : (m,) float64
-        Middle of what the sensor saw.
-    spread : float
-        Root mean square distance from it, in sensor units.
+    A bright blob is not worth more features than a faint one, nor are two that merged.
     """
 
     view: View
-    points: Floats
-    rays: Rays | None
-    mean: Floats
-    spread: float
+    points: Floats  # (M, m) in sensor coordinates; none where features leave no points
+    rays: Rays | None  # None for sensors without lines of sight
+    mean: Floats  # (m,) middle of what the sensor saw
+    spread: float  # root mean square distance from it, in sensor units
 
     @property
     def sigma(self) -> float:

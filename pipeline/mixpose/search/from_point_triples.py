@@ -26,14 +26,10 @@ _FIRST, _SECOND = np.transpose(SIDES)
 
 
 class FeatureTriangles(NamedTuple):
-    """Ordered triples of features that span a triangle: (K, 3) corners, and (K, 3) sides.
+    """Ordered triples of features that span a triangle."""
 
-    Sides are the lengths between corners 0 and 1, 0 and 2, 1 and 2; `tree` is of them.
-    """
-
-    corners: Indices
-    sides: Floats
-    tree: cKDTree
+    corners: Indices  # (K, 3)
+    tree: cKDTree  # of the sides (K, 3): lengths between corners 0 and 1, 0 and 2, 1 and 2
 
 
 @lru_cache(maxsize=16)
@@ -49,8 +45,7 @@ def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTrian
         corners = np.random.default_rng(0).integers(0, n, (count, 3))
     sides = _sides(body.means, corners)
     wide = _is_wide(sides, min_height)
-    corners, sides = corners[wide], sides[wide]
-    return FeatureTriangles(corners, sides, cKDTree(sides.reshape(-1, 3)))
+    return FeatureTriangles(corners[wide], cKDTree(sides[wide].reshape(-1, 3)))
 
 
 def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kind:
@@ -59,7 +54,7 @@ def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kin
     triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
     if not len(triangles.corners) or len(found) < 3:
         return Kind("point triples", [], np.asarray)
-    longest = float(triangles.sides.max())
+    longest = float(triangles.tree.data.max())
     bent = budget.gate * np.sqrt(2) * body.spread  # of a side between two features that give way
 
     def poses(drawn: Indices) -> Floats:
@@ -76,7 +71,7 @@ def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kin
         )
         which, rank = np.nonzero(np.isfinite(away))
         chosen = index[which, rank]
-        off = np.abs(sides[which] - triangles.sides[chosen])
+        off = np.abs(sides[which] - triangles.tree.data[chosen])
         alike = (off <= allowed[which]).all(axis=1)
         which, chosen = which[alike], chosen[alike]
         world = found.points[triples[which]].transpose(1, 2, 0)
@@ -87,10 +82,9 @@ def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kin
 
 def by_promise(problem: SearchProblem, found: TriangulatedPoints) -> TriangulatedPoints:
     """The points that most sensors confirm, the closest first, each place once."""
-    support, error, count = np.zeros(len(found)), found.gap, problem.budget.max_points
+    support, error, count = np.zeros(len(found)), np.zeros(len(found)), problem.budget.max_points
     if len(problem.cameras) == 2:  # every feature once
-        return found.select(np.argsort(error, kind="stable")[:count])
-    error = np.zeros(len(found))
+        return found.select(np.argsort(found.gap, kind="stable")[:count])
     for each, _ in problem.cameras:
         y, seen = each.view.sensor.project(found.points)
         reach = problem.reach(each)
@@ -136,7 +130,7 @@ def _combinations(count: int) -> Indices:
 
 def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indices:
     """Triples (K, 3) drawn among points (P, 3) that are within reach of the first of them."""
-    rng = problem.rng()
+    rng = np.random.default_rng(problem.seed)
     pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
     pairs = np.concatenate([pairs, pairs[:, ::-1]])
     pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import combinations, permutations
 from math import comb, perm
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,29 +17,27 @@ from mixpose.search.three_points import SIDES, align_triples, depths
 from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
 
+Chunk: TypeAlias = tuple[Indices, Indices]
+
 _FIRST, _SECOND = np.transpose(SIDES)
 
 
 def from_three_rays(problem: SearchProblem, rays: Rays) -> Kind:
     """Poses from triples of one camera's rays."""
-    features, min_pixels = problem.body.means, problem.budget.min_pixels
     solve = _perspective if rays.central else _orthographic
-
-    def poses(chunk: tuple[Indices, Indices]) -> Floats:
-        return solve(rays, features, *chunk, min_pixels)
-
-    enough = len(rays) >= 3 and len(features) >= 3
-    return Kind("three rays", _problems(problem, rays) if enough else [], poses)
+    chunks = _problems(problem, rays) if min(len(rays), len(problem.body)) > 2 else []
+    return Kind("three rays", chunks, partial(solve, problem, rays))
 
 
-def _problems(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
+def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Chunk]:
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
     fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
     near detections as features that are near each other, at random.
     """
-    budget, features, rng = problem.budget, problem.body.means, problem.rng()
+    budget, features = problem.budget, problem.body.means
+    rng = np.random.default_rng(problem.seed)
     n, M, eyes = len(features), len(rays), len(problem.cameras)
     most = budget.max_shared_problems // eyes if eyes > 1 else budget.max_problems
     all_tried = comb(M, 3) * perm(n, 3) <= most
@@ -76,9 +76,8 @@ def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -
     return np.stack([first, *nearest[first, chosen]])
 
 
-def _perspective(
-    rays: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
-) -> Floats:
+def _perspective(problem: SearchProblem, rays: Rays, chunk: Chunk) -> Floats:
+    (detections, corners), features = chunk, problem.body.means
     distance2 = ((features[:, None] - features) ** 2).sum(axis=-1)
     between = rays.directions @ rays.directions.T
     cosines = between[detections[_FIRST], detections[_SECOND]]
@@ -86,23 +85,22 @@ def _perspective(
     distances, which = depths(cosines, squared)
     # smaller than this in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > min_pixels * rays.slope * distances.min(axis=0)
+    near = largest > problem.budget.min_pixels * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
     body = np.take(features.T, corners[:, which], axis=1).swapaxes(0, 1)
     directions = np.take(rays.directions.T, detections[:, which], axis=1).swapaxes(0, 1)
     return align_triples(body, rays.origins[0][:, None] + directions * distances[:, None])
 
 
-def _orthographic(
-    rays: Rays, features: Floats, detections: Indices, corners: Indices, min_pixels: float
-) -> Floats:
+def _orthographic(problem: SearchProblem, rays: Rays, chunk: Chunk) -> Floats:
     """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    body = np.take(features.T, corners, axis=1).swapaxes(0, 1)
+    detections, corners = chunk
+    body = np.take(problem.body.means.T, corners, axis=1).swapaxes(0, 1)
     seen = np.take(rays.origins.T, detections, axis=1).swapaxes(0, 1)
-    tolerance = 3 * min_pixels * rays.offset
+    tolerance = 3 * problem.budget.min_pixels * rays.offset
     length, flat = (np.linalg.norm(each[_SECOND] - each[_FIRST], axis=1) for each in (body, seen))
     rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
     rise[flat > length + tolerance] = np.nan

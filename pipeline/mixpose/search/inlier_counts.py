@@ -29,25 +29,14 @@ _NEARNESS = 256  # a cell holds label * 256 + nearness
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """Disks around the detections of one camera.
+    """Disks around the detections of one camera."""
 
-    Attributes
-    ----------
-    projection : (3, 4) float64
-        From the world to columns and rows of cells, homogeneous.
-    eye : (4,) float64
-        Centre of projection, or the way to it from everywhere, homogeneous.
-    cells : (rows, columns) int32
-        Detection 1 to M times 256, plus nearness: 255 at a detection, 0 at the rim.  Most are
-        empty, and take no memory; the outermost are.
-    count : int
-        M.
-    """
-
-    projection: Floats
-    eye: Floats
+    projection: Floats  # (3, 4) from the world to columns and rows of cells, homogeneous
+    eye: Floats  # (4,) centre of projection, or the way to it from everywhere, homogeneous
+    # (rows, columns) detection 1 to M times 256, plus nearness: 255 at a detection, 0 at the rim;
+    # most are empty, and take no memory, the outermost are for certain
     cells: Integers
-    count: int
+    count: int  # M
 
     def look_up(self, world: Floats) -> Integers:
         """Cells (K,) that points in the world (3, K) fall into."""

@@ -21,27 +21,14 @@ from mixpose.sensors import Rays
 
 @dataclass(frozen=True, eq=False)
 class SearchProblem:
-    """What stays the same during a search.
-
-    Attributes
-    ----------
-    detections : sequence of SensorDetections
-    body : Body
-    free : (6,) bool
-        Which directions may differ from the reference, order of `mixpose.rigid`.
-    T_reference : (4, 4) float64
-        Looked at only where a direction is not free.
-    budget : SearchBudget
-    seed : int
-        Of the order in which guesses are tried, where not all can be.
-    """
+    """What stays the same during a search."""
 
     detections: Sequence[SensorDetections]
     body: Body
-    free: NDArray[np.bool_]
-    T_reference: Floats
+    free: NDArray[np.bool_]  # (6,) which directions may differ from the reference
+    T_reference: Floats  # (4, 4), looked at only where a direction is not free
     budget: SearchBudget = THOROUGH
-    seed: int = 0
+    seed: int = 0  # of the order in which guesses are tried, where not all can be
 
     @cached_property
     def cameras(self) -> list[tuple[SensorDetections, Rays]]:
@@ -49,10 +36,6 @@ class SearchProblem:
         return [
             (one, one.rays) for one in self.detections if one.rays is not None and len(one.rays)
         ]
-
-    def rng(self) -> np.random.Generator:
-        """Random numbers, always the same."""
-        return np.random.default_rng(self.seed)
 
     def reach(self, seen: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""

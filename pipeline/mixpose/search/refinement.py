@@ -95,20 +95,20 @@ def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:
     return np.sort(np.unique(keys, return_index=True)[1])
 
 
-def first_of_each(body: Body, poses: Floats, values: Floats, count: int, alike: float) -> list[int]:
-    """Indices of the `count` best poses (H, 4, 4), each of which puts the body somewhere else.
+def first_of_each(body: Body, poses: Floats, count: int, alike: float) -> list[int]:
+    """Indices of the first `count` poses (H, 4, 4) that put the body somewhere else each.
 
     Poses are one where the root mean square distance of their features, symmetries aside, is less
-    than a share `alike` of the body's radius; `values` (H,) tell which are best.
+    than a share `alike` of the body's radius.
     """
     kept: list[int] = []
     images: list[Floats] = []
-    for k in np.argsort(-values, kind="stable"):
-        here = transform(poses[k], body.means)
+    for k, pose in enumerate(poses):
+        here = transform(pose, body.means)
         squares = [((here - image) ** 2).sum(axis=-1).mean(axis=-1).min() for image in images]
         if np.sqrt(min(squares, default=np.inf)) > alike * body.radius:
-            kept.append(int(k))
-            images.append(transform(poses[k] @ body.symmetries, body.means))
+            kept.append(k)
+            images.append(transform(pose @ body.symmetries, body.means))
         if len(kept) == count:
             break
     return kept

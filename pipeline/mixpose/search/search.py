@@ -13,11 +13,14 @@ from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.objective import View
 from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
 from mixpose.search.from_orientations import from_spread_orientations
-from mixpose.search.guesses import from_slips, kinds_of_guesses
+from mixpose.search.from_point_and_rays import from_point_and_rays
+from mixpose.search.from_point_triples import by_promise, from_point_triples
+from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import (
     Candidate,
@@ -29,6 +32,7 @@ from mixpose.search.problem import (
 )
 from mixpose.search.refinement import Descent, Stage, first_of_each, unlike
 from mixpose.search.spread import sparse
+from mixpose.search.triangulation import triangulate
 
 
 def search_frame(
@@ -37,7 +41,6 @@ def search_frame(
     *,
     free: NDArray[np.bool_],
     T_reference: Floats | None,
-    count: int = 8,
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
     state: SearchState = SearchState(),
@@ -53,8 +56,6 @@ def search_frame(
         World directions to search, order of `mixpose.rigid`.
     T_reference : (4, 4) array or None
         Where the directions that are not free stay; may be None when all are free.
-    count : int
-        Most candidates returned.
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
@@ -78,7 +79,33 @@ def search_frame(
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
     run = _Run(SearchProblem(detections, body, free, reference, budget, seed))
     after = run.find(state)
-    return SearchResult(run.candidates(count), SearchReport(**run.cost), after)
+    return SearchResult(run.candidates(), SearchReport(**run.cost), after)
+
+
+def kinds_of_guesses(problem: SearchProblem) -> list[Kind]:
+    """Kinds of guesses from rays, the quickest first.
+
+    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
+    """
+    budget, rays = problem.budget, [one for _, one in problem.cameras]
+    kinds = [from_three_rays(problem, one) for one in rays]
+    if len(rays) < 2:
+        return kinds
+    gates = [problem.reach(seen) for seen, _ in problem.cameras]
+    found = by_promise(problem, triangulate(rays, gates, budget.min_sine))
+    crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
+    # of the points tried in a crowd, and of the rays near them, few are right
+    kinds.insert(len(kinds) if crowded else 0, from_point_and_rays(problem, found))
+    return [from_point_triples(problem, found), *kinds]
+
+
+def from_slips(body: Body, pose: Floats) -> Floats:
+    """A pose with the body shifted by the way from any feature to any other (n (n - 1), 4, 4).
+
+    On a grid of features a pose that is a step off explains most of them.
+    """
+    i, j = np.nonzero(~np.eye(len(body), dtype=np.bool_))
+    return pose @ from_parts(np.eye(3), body.means[i] - body.means[j])
 
 
 class _Run:
@@ -88,16 +115,14 @@ class _Run:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         self._images = label_images(problem) if is_pointlike(self._body) else []
         self._explainable = sum(min(image.count, len(self._body)) for image in self._images)
-        # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = bool(self._images) and all(
-            one.rays is not None for one in problem.detections
-        )
+        cameras = [one for one in problem.detections if one.rays is not None]
         seen, budget = [one.view for one in problem.detections], self._budget
+        # ranges are met by chance too often, and err too coarsely, to be counted one by one
+        self._by_evidence = bool(self._images) and len(cameras) == len(seen)
+        self._may_be_sure = self._by_evidence and len(seen) > 1
         few = sparse(self._body, budget.descent_features)
-        self._descent = Descent(seen, self._body, problem.free, budget)
-        self._quick_descent = self._descent
-        if few is not self._body:
-            self._quick_descent = Descent(seen, few, problem.free, budget)
+        descents = {one: Descent(seen, one, problem.free, budget) for one in (self._body, few)}
+        self._descent, self._quick_descent = descents[self._body], descents[few]
         plan = budget.descent_plan if self._by_evidence else budget.wide_plan
         self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
         self._poses = np.zeros((0, 4, 4))
@@ -114,7 +139,7 @@ class _Run:
             self._keep(self._descent.refine(poses, stages))
         slippery = budget.min_slip_features <= len(self._body) <= budget.max_slip_features
         if len(self._body.grid_steps) and slippery and len(self._poses) and self._images:
-            slips = from_slips(self._body, self._poses[self._ranks.argmax()])
+            slips = from_slips(self._body, self._poses[0])
             self._keep(self._descended(self._shortlist([slips])))
         return after
 
@@ -147,23 +172,24 @@ class _Run:
         self._keep(self._descended(self._shortlist(guesses())))
         return done
 
-    def candidates(self, count: int) -> list[Candidate]:
+    def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._first(count), self._ranks
+        kept, ranks = self._first(self._budget.candidates), self._ranks
         if self._by_evidence and kept:
             least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
     def _first(self, count: int) -> list[int]:
-        alike = self._budget.alike
-        return first_of_each(self._body, self._poses, self._ranks, count, alike)
+        return first_of_each(self._body, self._poses, count, self._budget.alike)
 
     def _keep(self, poses: Floats) -> None:
         if len(poses):
             ranks, met = self._judged(poses)
-            self._poses = np.concatenate([self._poses, poses])
-            self._ranks, self._met = np.append(self._ranks, ranks), np.append(self._met, met)
+            ranks, met = np.append(self._ranks, ranks), np.append(self._met, met)
+            best = np.argsort(-ranks, kind="stable")
+            self._poses = np.concatenate([self._poses, poses])[best]
+            self._ranks, self._met = ranks[best], met[best]
 
     def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""
@@ -181,16 +207,16 @@ class _Run:
         budget, coverage = self._budget, self._coverage()
         if coverage >= budget.convincing:
             return True
-        if len(self._problem.detections) < 2 or not self._is_beyond_doubt():
+        if not self._is_beyond_doubt():
             return False
-        best = self._poses[self._ranks.argmax()][None]
         most = budget.sufficient * self._explainable
-        return coverage >= budget.sufficient or int(self._count(self._body, best)[0]) >= most
+        explained = self._count(self._body, self._poses[:1])[0]
+        return coverage >= budget.sufficient or int(explained) >= most
 
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
         budget, best = self._budget, self._ranks.max(initial=0.0)
-        if not self._by_evidence or best < budget.promising:
+        if not self._may_be_sure or best < budget.promising:
             return False
         two = self._first(2)
         lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
@@ -198,7 +224,7 @@ class _Run:
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
-        return float(self._met[self._ranks.argmax()]) if len(self._ranks) else 0.0
+        return float(self._met[:1].sum())
 
     def _descended(self, guesses: Floats) -> Floats:
         """Guesses refined from less to less blur, or to σ_ε where there are other than cameras."""
@@ -245,10 +271,10 @@ class _Run:
 
     def _is_found(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras leave no need for others."""
-        if not self._by_evidence or len(self._problem.detections) < 2:
-            return False
         doubtful = explained < self._budget.sufficient * self._explainable
-        if doubtful and self._judged(guesses)[0].max() < self._budget.hopeless:
+        if not self._may_be_sure or (
+            doubtful and self._judged(guesses)[0].max() < self._budget.hopeless
+        ):
             return False
         self._keep(self._descended(guesses))
         return self._is_beyond_doubt() and self._is_settled()

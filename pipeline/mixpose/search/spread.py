@@ -11,9 +11,6 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body
 from mixpose.records import Floats
 
-_PHI = np.sqrt(2.0)
-_PSI = 1.533751168756204288118041
-
 
 @lru_cache(maxsize=32)
 def sparse(body: Body, count: int) -> Body:
@@ -43,7 +40,7 @@ def spread_rotations(count: int) -> Floats:
     """
     s = np.arange(count) + 0.5
     r, R = np.sqrt(s / count), np.sqrt(1 - s / count)
-    alpha, beta = 2 * np.pi * s / _PHI, 2 * np.pi * s / _PSI
+    alpha, beta = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168756204288118041
     quaternions = np.stack(
         [r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)], axis=1
     )

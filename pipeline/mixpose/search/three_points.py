@@ -12,16 +12,12 @@ runs over long rows.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.search.triangulation import Indices
-
-Complex: TypeAlias = NDArray[np.complex128]
 
 _TINY = np.finfo(np.float64).tiny
 _FLAT = 1e-9  # sine of the angle at a corner, below which a triangle has no plane
@@ -61,7 +57,7 @@ def align_triples(body: Floats, world: Floats) -> Floats:
     return from_parts(R.transpose(2, 0, 1), t.T)
 
 
-def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, Complex]:
+def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.complex128]]:
     """Axes (3, K each), the first side's length (K,), and the third corner in the plane, x + iy."""
     side, second = triangles[1] - triangles[0], triangles[2] - triangles[0]
     length = np.sqrt(_dot(side, side))

@@ -18,27 +18,13 @@ Indices: TypeAlias = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class TriangulatedPoints:
-    """Points where a ray of one sensor comes close to a ray of another.
+    """Points where a ray of one sensor comes close to a ray of another."""
 
-    Attributes
-    ----------
-    points : (P, 3) float64
-        In the world.
-    tolerance : (P,) float64
-        How far off the point may be, in length units.
-    gap : (P,) float64
-        Distance of the two rays as a share of what the gates allow, 0 to 1.
-    sensors : (P, 2) int
-        The two sensors, first before second.
-    rays : (P, 2) int
-        The ray of either sensor.
-    """
-
-    points: Floats
-    tolerance: Floats
-    gap: Floats
-    sensors: Indices
-    rays: Indices
+    points: Floats  # (P, 3) in the world
+    tolerance: Floats  # (P,) how far off the point may be, in length units
+    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
+    sensors: Indices  # (P, 2) the two sensors, first before second
+    rays: Indices  # (P, 2) the ray of either sensor
 
     def __len__(self) -> int:
         return len(self.points)
@@ -53,14 +39,7 @@ def triangulate(
 ) -> TriangulatedPoints:
     """All pairs of rays of two sensors or more that meet within the error of the detections.
 
-    Parameters
-    ----------
-    rays : sequence of Rays
-        One per sensor.
-    gates : sequence of float
-        Largest error of a detection per sensor, in px.
-    min_sine : float
-        Of the angle between two rays that still fix a depth.
+    That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
     """
     found = []
     for first, second in combinations(range(len(rays)), 2):

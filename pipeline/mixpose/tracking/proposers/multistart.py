@@ -44,12 +44,7 @@ def _descended(data: FrameData, starts: Sequence[Floats], uncertainty: Floats) -
 def starts_around(data: FrameData, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
     """The most promising poses (4, 4) around a guess, best first, none close to another.
 
-    Parameters
-    ----------
-    data : FrameData
-    T_guess : (4, 4) array
-    uncertainty : (6,) array
-        Standard deviations of the guess; zero for directions that are not free.
+    Standard deviations (6,) of the guess are zero for directions that are not free.
     """
     rules = data.rules.proposals
     sigmas = blur_schedule(data.views, data.body, T_guess, uncertainty / rules.narrowing)[0]

@@ -31,9 +31,8 @@ def _is_met_as_before(data: FrameData, best: Judged) -> bool:
     However much of it is hidden: what slips by a step of its grid, or turns over, meets less.
     """
     track = data.track
-    if track.misses or track.doubted or len(track.branches) != 1:
-        return False
-    if track.believed < data.rules.proposals.believed:
+    is_new = track.believed < data.rules.proposals.believed
+    if is_new or track.misses or track.doubted or len(track.branches) != 1:
         return False
     before = sum(one.met for one in track.tallies.values())
     used = [one for one in best.associations if best.sensors[one.name].used]
