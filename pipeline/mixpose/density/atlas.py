@@ -42,13 +42,15 @@ it is as far as a fit moves; larger ones are drawn for little use."""
 MIN_GRID_TILE = 18
 """The same of grey values alone, at least; as a rule a standard deviation."""
 
-MOST_OWN = 128
-"""Places that have tiles of their own: those of more are often on pages that are drawn already."""
+MOST_OWN = 1200
+"""Places that have tiles of their own: with 600 features in two cameras a fit takes two thirds of
+what it takes on pages."""
 
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
-_LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
-_AT_ONCE = 300_000  # cells or pairs that are worked on together: they stay in the cache
-_MANY = 100  # detections of a sensor: of so many, those beside all tiles are left out first
+_ROWS = 64  # of tiles in a column: places in the array are rounded to 6e-5 cells
+_TOGETHER = 64  # tiles that are drawn at once: they have room for as many detections each
+_FEW_PAIRS = 5000  # of tiles and detections: looking at all is quicker than sorting
+_FARTHEST = 1e9  # cells: farther rows count as that
 _BESIDE = 2.0  # cells beside a place that are looked up, at most
 _SIDES = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
 _QUARTERS = np.full(4, 0.25, dtype=np.float32)
@@ -84,19 +86,20 @@ class Atlas:
         self._scale = scale = _Scale.of(dimensions, tuple(sigmas), steps_per_sigma)
         self.per_unit = scale.per_unit
         self.values = np.zeros((0, 0, 3), dtype=np.float32)
-        points = [pattern for pattern in patterns if isinstance(pattern, PointPattern)]
-        self._most = max([len(pattern.points) for pattern in points], default=0)
-        self._q = np.full((len(patterns), self._most, 2), np.inf)
-        self._share = np.zeros((len(patterns), self._most), dtype=np.float32)
+        counts = [len(one.points) if isinstance(one, PointPattern) else 0 for one in patterns]
+        q, share = np.empty((sum(counts), 2)), np.empty(sum(counts), dtype=np.float32)
         self._grids: dict[int, tuple[GridPattern, float, float]] = {}
-        for k, pattern in enumerate(patterns):
+        end = 0
+        for k, (pattern, count) in enumerate(zip(patterns, counts, strict=True)):
             if isinstance(pattern, GridPattern):
                 small, left = reduced(pattern, scale.widths[k])
                 self._grids[k] = small, left, mass(small)
-            else:
-                count = len(pattern.points)
-                self._q[k, :count] = pattern.points * scale.per_unit[k, 0, 0]
-                self._share[k, :count] = pattern.weights / pattern.weights.sum()
+                continue
+            part = slice(end, end := end + count)
+            q[part] = pattern.points * scale.per_unit[k, 0, 0]
+            share[part] = pattern.weights / pattern.weights.sum()
+        self._q, self._share = q, share
+        self._sensor = np.arange(len(counts)).repeat(counts)
         self.tile = max(math.ceil(steps_per_sigma), MIN_GRID_TILE) if self._grids else TILE
         self._own: _Tiles | None = None
 
@@ -125,27 +128,32 @@ class Atlas:
             flat = middles.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
             drawn = self._drawn(sensors, flat, *self._near(sensors, flat))
-            side = drawn.shape[1]
-            shifts = 0.5 * (side - 1) - flat
-            shifts[:, 1] += side * np.arange(len(flat))
-            values = drawn.reshape(-1, side, 3)
+            side, columns = drawn.shape[1], len(flat) // _ROWS + 1
+            shifts, row = 0.5 * (side - 1) - flat, np.arange(len(flat))
+            room = drawn[:, :, None]
+            if columns > 1:
+                row, column = np.divmod(row, columns)
+                room = np.empty((int(row[-1]) + 1, side, columns, 3 * side), dtype=np.float32)
+                room[row, :, column] = drawn
+                shifts[:, 0] += side * column
+            shifts[:, 1] += side * row
+            values = room.reshape(len(room) * side, columns * side, 3)
             tiles = self._own = _Tiles(middles, shifts.reshape(index.shape), values)
         index += tiles.shifts
         self.values = tiles.values
 
     def _to_pages(self, index: Floats) -> None:
         """Turn places in cells into those on pages, in place."""
-        at_once = max(_AT_ONCE // max((self.tile + 3) ** 2, self._most), 1)
-        self.pages.find(index, self._drawn_pages, at_once)
+        self.pages.find(index, self._drawn_pages)
         self.values = self.pages.values
 
     @cached_property
     def pages(self) -> Pages:
         """For many places, on planes that hold all that is seen."""
-        q = self._q[np.isfinite(self._q[..., 0])]
-        plane = Plane.of(q, [self._corners(k) for k in self._grids], self.tile, self._scale.reach)
+        corners = [self._corners(k) for k in self._grids]
+        plane = Plane.of(self._q, corners, self.tile, self._scale.reach)
         self.tile = plane.page
-        return Pages(plane, len(self._q))
+        return Pages(plane, len(self.per_unit))
 
     def _corners(self, sensor: int) -> Floats:
         """Corners (2, 2) of a grid, in cells."""
@@ -157,19 +165,51 @@ class Atlas:
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
-        reach, q, chosen = 0.5 * self.tile + self._scale.reach, self._q, None
-        if self._most > _MANY:
-            inside = (q > middles.min(axis=0) - reach) & (q < middles.max(axis=0) + reach)
-            chosen = np.flatnonzero(inside.all(axis=2).any(axis=0))
-            q = q[:, chosen]
-        away = q[sensors] - middles[:, None]
-        np.abs(away, out=away)
-        near = away < reach
-        of, which = np.nonzero(near[..., 0] & near[..., 1])
-        return of, which if chosen is None else chosen[which]
+        reach = 0.5 * self.tile + self._scale.reach
+        if len(sensors) * len(self._q) <= _FEW_PAIRS:
+            away = self._q - middles[:, None]
+            np.abs(away, out=away)
+            inside = away < reach
+            near = inside[..., 0] & inside[..., 1] & (self._sensor == sensors[:, None])
+            of, which = np.nonzero(near)
+            return of, which
+        order, sorted_keys = self._sorted
+        keys = middles[:, 1] + 4 * _FARTHEST * sensors
+        first = np.searchsorted(sorted_keys, keys - (reach + 1.0))
+        counts = np.searchsorted(sorted_keys, keys + (reach + 1.0)) - first
+        of = np.arange(len(keys)).repeat(counts)
+        which = order[np.arange(len(of)) + (first - np.cumsum(counts) + counts).repeat(counts)]
+        chosen = np.flatnonzero((np.abs(self._q[which] - middles[of]) < reach).all(axis=1))
+        return of[chosen], which[chosen]
+
+    @cached_property
+    def _sorted(self) -> tuple[Indices, Floats]:
+        """Detections (D,) by sensor and row, and numbers that are sorted alike."""
+        keys = np.clip(self._q[:, 1], -_FARTHEST, _FARTHEST) + 4 * _FARTHEST * self._sensor
+        order = np.argsort(keys)
+        return order, keys[order]
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
         """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections `_near` them.
+
+        Those that as many detections reach are drawn together.
+        """
+        count, side = len(middles), self.tile + 3
+        if count <= _TOGETHER:
+            return self._sums(sensors, middles, of, which)
+        tiles = np.empty((count, side, 3 * side), dtype=np.float32)
+        order = np.argsort(np.bincount(of, minlength=count), kind="stable")
+        for some in np.array_split(order, -(-count // _TOGETHER)):
+            number = np.full(count, -1)
+            number[some] = np.arange(len(some))
+            chosen = np.flatnonzero(number[of] >= 0)
+            chosen = chosen[np.argsort(number[of[chosen]], kind="stable")]
+            pairs = number[of[chosen]], which[chosen]
+            tiles[some] = self._sums(sensors[some], middles[some], *pairs)
+        return tiles
+
+    def _sums(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
+        """The same, of a few tiles.
 
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
@@ -178,14 +218,14 @@ class Atlas:
         place = np.arange(len(of)) - np.searchsorted(of, of)
         most = int(place.max(initial=0)) + 1
         sensor = sensors[of]
-        begin = (self._q[sensor, which] - middles[of]) * (1 / scale.sigma)
+        begin = (self._q[which] - middles[of]) * (1 / scale.sigma)
         cells = (np.arange(side, dtype=np.float32) - 0.5 * (side - 1)) * (1 / scale.sigma)
         away = begin.astype(np.float32)[..., None] - cells.astype(np.float32)
         bells = np.exp(np.float32(-0.5) * away * away)
         if scale.is_flat is not None:  # rows that are all alike
             flat = scale.is_flat[sensor]
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
-        bells[:, 1] *= self._share[sensor, which, None]
+        bells[:, 1] *= self._share[which, None]
         slopes = bells * away
         slots = most * of + place
         along_v = np.zeros((count * most, 2, side), dtype=np.float32)

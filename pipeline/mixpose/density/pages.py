@@ -16,6 +16,7 @@ MAX_PAGES = 250_000
 and pages of grey values are larger."""
 
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
+_AT_ONCE = 400  # pages that are drawn together: what is made for them stays in the cache
 _PENDING = -1  # in the table: not drawn yet
 
 
@@ -90,20 +91,12 @@ class Pages:
         return self._room.reshape(rows * side, columns * side, 3)
 
     def find(
-        self,
-        index: Floats,
-        draw: Callable[[Indices, Floats], tuple[Indices, Singles]],
-        at_once: int,
+        self, index: Floats, draw: Callable[[Indices, Floats], tuple[Indices, Singles]]
     ) -> None:
         """Turn places (L, H, n, 2) in cells into those in `values`, in place.
 
-        Parameters
-        ----------
-        draw : callable
-            Of sensors (P,) and the middles (P, 2) of pages: those on which there is something,
-            and what is on them, (F, side, 3 side).
-        at_once : int
-            Pages that it is to draw at once, at most.
+        Of sensors (P,) and the middles (P, 2) of pages `draw` tells those on which there is
+        something, and what is on them, (F, side, 3 side).
         """
         plane = self.plane
         index -= plane.origin
@@ -114,7 +107,7 @@ class Pages:
         number = self.table[squares]
         if number.min(initial=0) < 0:
             pending = np.unique(squares[number < 0])
-            for some in np.array_split(pending, -(-len(pending) // at_once)):
+            for some in np.array_split(pending, -(-len(pending) // _AT_ONCE)):
                 sensors, place = np.divmod(some, plane.squares)
                 rows, columns = np.divmod(place, plane.shape[0])
                 middles = plane.page * (np.stack([columns, rows], axis=1) + 0.5)
