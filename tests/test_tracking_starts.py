@@ -235,12 +235,16 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     track = replace(tracker.begin(), tallies={"0": SensorTally(5, 8)}, believed=3, frame=0)
 
-    def doubted(track: Track, met: int) -> bool:
+    def doubted(track: Track, met: int, log_evidence: float = 20.0) -> bool:
         seen = replace(association("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
         judged = replace(judged_at(TRUTH, seen), sensors={"0": SensorReport(True)})
-        return is_doubtful(data_of(tracker, [], track), [judged])
+        return is_doubtful(
+            data_of(tracker, [], track), [replace(judged, log_evidence=log_evidence)]
+        )
 
     assert not doubted(track, 5)
+    # as much of it, and yet not sure: a thing that shines alike came near
+    assert doubted(track, 5, log_evidence=5.0)
     assert not doubted(track, 4)
     # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
     assert doubted(replace(track, tallies={"0": SensorTally(8, 8)}), 5)
