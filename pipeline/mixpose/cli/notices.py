@@ -170,14 +170,16 @@ class Summary:
         """Which sensors are late by how much, as far as a moving body shows it."""
         remarks = []
         for name, seen in self.delays.items():
-            late = f"{seen.seconds:.4f} s (give or take {2 * seen.deviation:.4f})"
+            spread = f"(give or take {2 * seen.deviation:.4f})"
             if name in self.estimated:
+                late = f"{seen.seconds:.4f} s {spread}"
                 remarks.append(f"sensor {name!r}: delay estimated as {late}")
             elif abs(seen.seconds) > max(_SURELY_LATE * seen.deviation, _LATE_S):
                 told = self.told.get(name, 0.0) + seen.seconds
+                kind = "late" if seen.seconds > 0 else "early"
                 remarks.append(
-                    f"sensor {name!r} is late by {late}: delay = {told:.4f} in its [[sensor]] "
-                    "takes it off"
+                    f"sensor {name!r} is {kind} by {abs(seen.seconds):.4f} s {spread}: "
+                    f"delay = {told:.4f} in its [[sensor]] takes it off"
                 )
         return remarks
 

@@ -269,7 +269,12 @@ def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | N
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:
     line = _header_line(wanted)
-    for key in ("session_sha256", "unit", "seed", "mixpose"):
+    if found.get("session_sha256") != line["session_sha256"]:
+        raise SessionError(
+            f"--resume: the session has changed since {path} was written; leave out --resume to "
+            "replace these poses, or name another file with -o"
+        )
+    for key in ("unit", "seed", "mixpose"):
         if found.get(key) != line[key]:
             raise SessionError(
                 f"--resume: {path} was written with {key} = {found.get(key)!r}, this run has "
