@@ -19,7 +19,7 @@ whatever is seen beside it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -47,7 +47,6 @@ MOST_OWN = 1200
 what it takes on pages."""
 
 _SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
-_ROWS = 64  # of tiles in a column: places in the array are rounded to 6e-5 cells
 _TOGETHER = 64  # tiles that are drawn at once: they have room for as many detections each
 _FEW_PAIRS = 5000  # of tiles and detections: looking at all is quicker than sorting
 _FARTHEST = 1e9  # cells: farther rows count as that
@@ -122,25 +121,25 @@ class Atlas:
 
     def _to_own_tiles(self, index: Floats) -> None:
         """Turn places in cells into those in tiles around them, in place."""
-        tiles = self._own
-        if tiles is None or not tiles.hold(index):
+        own = self._own
+        if own is None or not own.hold(index):
             middles = np.rint(index)
-            flat = middles.reshape(-1, 2)
+            flat, side = middles.reshape(-1, 2), self.tile + 3
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
-            drawn = self._drawn(sensors, flat, *self._near(sensors, flat))
-            side, columns = drawn.shape[1], len(flat) // _ROWS + 1
-            shifts, row = 0.5 * (side - 1) - flat, np.arange(len(flat))
-            room = drawn[:, :, None]
-            if columns > 1:
-                row, column = np.divmod(row, columns)
-                room = np.empty((int(row[-1]) + 1, side, columns, 3 * side), dtype=np.float32)
-                room[row, :, column] = drawn
-                shifts[:, 0] += side * column
-            shifts[:, 1] += side * row
-            values = room.reshape(len(room) * side, columns * side, 3)
-            tiles = self._own = _Tiles(middles, shifts.reshape(index.shape), values)
-        index += tiles.shifts
-        self.values = tiles.values
+            groups = list(self._groups(len(flat), *self._near(sensors, flat)))
+            # columns of so few tiles that places in the array are rounded to 6e-5 cells
+            shape = min(len(flat), _TOGETHER), side, len(groups), 3 * side
+            room = np.empty(shape, dtype=np.float32)
+            shifts = 0.5 * (side - 1) - flat
+            for k, (some, of, which) in enumerate(groups):
+                tiles = room[: len(some), :, k]
+                self._draw(tiles, sensors[some], flat[some], of, which)
+                shifts[some, 0] += side * k
+                shifts[some, 1] += side * np.arange(len(some))
+            values = room.reshape(len(room) * side, len(groups) * side, 3)
+            own = self._own = _Tiles(middles, shifts.reshape(index.shape), values)
+        index += own.shifts
+        self.values = own.values
 
     def _to_pages(self, index: Floats) -> None:
         """Turn places in cells into those on pages, in place."""
@@ -189,27 +188,26 @@ class Atlas:
         order = np.argsort(keys)
         return order, keys[order]
 
-    def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections `_near` them.
-
-        Those that as many detections reach are drawn together.
-        """
-        count, side = len(middles), self.tile + 3
+    def _groups(
+        self, count: int, of: Indices, which: Indices
+    ) -> Iterator[tuple[Indices, Indices, Indices]]:
+        """Tiles that about as many detections reach, with the pairs of both, as of `_near`."""
         if count <= _TOGETHER:
-            return self._sums(sensors, middles, of, which)
-        tiles = np.empty((count, side, 3 * side), dtype=np.float32)
+            yield np.arange(count), of, which
+            return
         order = np.argsort(np.bincount(of, minlength=count), kind="stable")
-        for some in np.array_split(order, -(-count // _TOGETHER)):
+        for first in range(0, count, _TOGETHER):
+            some = order[first : first + _TOGETHER]
             number = np.full(count, -1)
             number[some] = np.arange(len(some))
             chosen = np.flatnonzero(number[of] >= 0)
             chosen = chosen[np.argsort(number[of[chosen]], kind="stable")]
-            pairs = number[of[chosen]], which[chosen]
-            tiles[some] = self._sums(sensors[some], middles[some], *pairs)
-        return tiles
+            yield some, number[of[chosen]], which[chosen]
 
-    def _sums(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """The same, of a few tiles.
+    def _draw(
+        self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
+    ) -> None:
+        """Draw tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
 
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
@@ -234,7 +232,7 @@ class Atlas:
         along_u[slots, 0, :, 0] = along_u[slots, 1, :, 2] = bells[:, 0]
         along_u[slots, 0, :, 1] = slopes[:, 0]
         rows = along_v.reshape(count, 2 * most, side).swapaxes(1, 2)
-        return np.asarray(rows @ along_u.reshape(count, 2 * most, 3 * side))
+        np.matmul(rows, along_u.reshape(count, 2 * most, 3 * side), out=tiles)
 
     def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
         """Those of pages around places (P, 2) in cells on which there is something, and they."""
@@ -248,7 +246,12 @@ class Atlas:
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         sensors, middles = sensors[filled], middles[filled]
-        tiles = self._drawn(sensors, middles, np.searchsorted(filled, of), which)
+        side = self.tile + 3
+        tiles = np.empty((len(filled), side, 3 * side), dtype=np.float32)
+        for some, *pairs in self._groups(len(filled), np.searchsorted(filled, of), which):
+            drawn = np.empty((len(some), side, 3 * side), dtype=np.float32)
+            self._draw(drawn, sensors[some], middles[some], *pairs)
+            tiles[some] = drawn
         for i, k in enumerate(sensors.tolist()):
             if k in self._grids:
                 tiles[i] = self._of_grid(k, middles[i])
