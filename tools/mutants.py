@@ -50,7 +50,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     "poses": ("test_poses_*.py",),
     "simulation": ("test_simulation_*.py",),
     "checking": ("test_check_*.py",),
-    "importing": ("test_import.py",),
+    "importing": ("test_import*.py",),
     "design": ("test_design.py",),
     "runner": ("test_runner_*.py",),
     "density": (
