@@ -26,9 +26,11 @@ BODY = Body("plate", tuple(PointFeature(point) for point in PLATE))
 MIRRORED = Body("mirrored", tuple(PointFeature(point) for point in PLATE * [1, 1, -1]))
 
 
-def status(cameras: list[PinholeCamera], shown: Body, *, mirrors: bool = True) -> str:
+def status(
+    cameras: list[PinholeCamera], shown: Body, *, given: Body = BODY, mirrors: bool = True
+) -> str:
     views = detect(cameras, shown, TRUTH, noise=0.2)
-    tracker = Tracker.create(BODY, EstimatorOptions())
+    tracker = Tracker.create(given, EstimatorOptions())
     if not mirrors:  # no rival is so much better
         acceptance = replace(tracker.rules.acceptance, standing_out=1e9)
         tracker = replace(tracker, rules=replace(tracker.rules, acceptance=acceptance))
@@ -41,6 +43,19 @@ def test_the_mirror_image_of_a_nearly_flat_body_is_not_the_body(
     # four of five markers are met to half a pixel
     assert status(pinhole_cameras, MIRRORED, mirrors=False) == "ok"
     assert status(pinhole_cameras, MIRRORED) == "ambiguous"
+
+
+def test_so_many_markers_of_a_mirror_image_are_met_that_it_is_no_chance_and_yet_not_the_body(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    more = np.array([[0.0, 70, 0.5], [-20, -75, -0.5], [75, 0, 0.5], [-85, 10, -0.5]])
+    points = np.concatenate([PLATE, more])
+    given, shown = (
+        Body("large plate", tuple(PointFeature(point) for point in points * [1, 1, side]))
+        for side in (1, -1)
+    )
+    assert status(pinhole_cameras[:2], shown, given=given, mirrors=False) == "ok"
+    assert status(pinhole_cameras[:2], shown, given=given) == "ambiguous"
 
 
 def test_a_flat_body_whose_marker_before_the_plane_is_hidden_is_not_its_mirror_image(
