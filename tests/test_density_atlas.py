@@ -218,6 +218,25 @@ def test_few_places_have_tiles_that_they_stay_in_for_half_a_tile() -> None:
     assert atlas.values is not drawn
 
 
+def test_what_is_seen_beside_a_tile_is_on_it_as_far_as_it_reaches() -> None:
+    first = far_apart(15, side=5)
+    beside = first + np.array([6.2 * SIGMA, 0])
+    points = np.concatenate([first, beside])
+    atlas = points_only(points, STEPS_PER_SIGMA)
+    looked_up(atlas, first)
+    drawn = atlas.values
+    # nearly at the edge of its tile, 3.4 σ from what is beside it
+    y = first + np.array([2.8 * SIGMA, 0])
+    value, _ = looked_up(atlas, y)
+    assert atlas.values is drawn
+    # the third derivative is 3.4³ times the value at most, of each of two
+    top = peak(len(points))
+    most = exact(points, y)[0].max() / top
+    off = (spline_error(STEPS_PER_SIGMA, 2 * 3.4**3 * most) + 2 * CUT) * top
+    assert off < 0.3 * math.exp(-(3.4**2) / 2) * top
+    np.testing.assert_allclose(value, exact(points, y)[0], atol=off)
+
+
 def test_few_places_and_many_are_looked_up_alike() -> None:
     rng = np.random.default_rng(14)
     points = far_apart(14, side=4)
