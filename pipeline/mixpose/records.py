@@ -67,6 +67,11 @@ class PointPattern:
         """m, the number of sensor coordinates."""
         return int(self.points.shape[1])
 
+    @property
+    def extent(self) -> tuple[Floats, Floats]:
+        """Smallest and largest sensor coordinates (m,); of one point at least."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
 
 @dataclass(frozen=True)
 class GridPattern:
@@ -90,6 +95,12 @@ class GridPattern:
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
         return len(self.origin)
+
+    @property
+    def extent(self) -> tuple[Floats, Floats]:
+        """Sensor coordinates (m,) of the first grid point and of the last."""
+        size = np.array(self.values.shape[::-1])[: self.dimension]
+        return self.origin, np.asarray(self.origin + (size - 1) * self.step)
 
 
 Pattern: TypeAlias = PointPattern | GridPattern

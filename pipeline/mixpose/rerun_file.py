@@ -164,7 +164,7 @@ class _Scene:
             size = (frame.data.shape[1], frame.data.shape[0])
         observation = observation_of(self.session, setup, frame)
         pattern = observation.pattern
-        if isinstance(pattern, PointPattern) and pattern.points.shape[1] == 2:
+        if isinstance(pattern, PointPattern) and pattern.dimension == 2:
             found, radius = pattern.points + _HALF, rr.Radius.ui_points(4)
             self._log([*place, "features"], rr.Points2D(found, radii=radius, colors=_FOUND))
         density = _density(observation, size)

@@ -272,8 +272,8 @@ _TRACKER = (
     Mutant(
         "tracking-sensors-left-out-are-tallied",
         "tracking/tracker.py",
-        "if best.sensors[one.name].used",
-        "if best.sensors[one.name].used or True",
+        "for one in best.used",
+        "for one in best.associations",
         "the next frame is looked at as a whole although all is well",
         (_STARTS,),
     ),

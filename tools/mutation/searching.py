@@ -124,8 +124,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-slips-never-looked-for",
         "tracking/proposers/stepped_aside.py",
-        "yield Start(poses[1 + k], close, T_moved=data.moves_alike(T))",
-        "yield Start(poses[0], close, T_moved=data.moves_alike(T))",
+        "yield Start(poses[1 + k], data.close, T_moved=data.moves_alike(T))",
+        "yield Start(poses[0], data.close, T_moved=data.moves_alike(T))",
         "a chessboard is followed a square off",
         (_STARTS,),
     ),

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from mixpose.density.blur import factors, mass, reduced
 from mixpose.density.grid import remap
-from mixpose.density.pages import Pages, Plane
+from mixpose.density.pages import RIM, Pages, Plane
 from mixpose.records import Floats, GridPattern, Indices, Pattern, PointPattern, Singles
 
 REACH = 4.25
@@ -101,6 +101,8 @@ class Atlas:
         self._sensor = np.arange(len(counts)).repeat(counts)
         self.tile = max(math.ceil(steps_per_sigma), MIN_GRID_TILE) if self._grids else TILE
         self._own: _Tiles | None = None
+        if self._grids:  # the larger the plane, the larger its pages
+            self.tile = self.pages.plane.page
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
@@ -124,7 +126,7 @@ class Atlas:
         own = self._own
         if own is None or not own.hold(index):
             middles = np.rint(index)
-            flat, side = middles.reshape(-1, 2), self.tile + 3
+            flat, side = middles.reshape(-1, 2), self._side
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
             groups = list(self._groups(len(flat), *self._near(sensors, flat)))
             # columns of so few tiles that places in the array are rounded to 6e-5 cells
@@ -151,16 +153,17 @@ class Atlas:
         """For many places, on planes that hold all that is seen."""
         corners = [self._corners(k) for k in self._grids]
         plane = Plane.of(self._q, corners, self.tile, self._scale.reach)
-        self.tile = plane.page
         return Pages(plane, len(self.per_unit))
+
+    @property
+    def _side(self) -> int:
+        """Cells along a tile with those beside it that look-ups reach."""
+        return self.tile + RIM
 
     def _corners(self, sensor: int) -> Floats:
         """Corners (2, 2) of a grid, in cells."""
-        pattern = self._grids[sensor][0]
-        corners = np.zeros((2, 2))
-        size = np.array(pattern.values.shape[::-1])[: pattern.dimension] - 1
-        corners[:, : pattern.dimension] = pattern.origin + [[0.0], [pattern.step]] * size
-        return np.asarray(corners * self.per_unit[sensor, 0, 0])
+        extent = np.array(self._grids[sensor][0].extent)
+        return np.asarray(extent * self.per_unit[sensor, 0, 0])
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
@@ -212,7 +215,7 @@ class Atlas:
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
         """
-        count, side, scale = len(middles), self.tile + 3, self._scale
+        count, side, scale = len(middles), self._side, self._scale
         place = np.arange(len(of)) - np.searchsorted(of, of)
         most = int(place.max(initial=0)) + 1
         sensor = sensors[of]
@@ -246,7 +249,7 @@ class Atlas:
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         sensors, middles = sensors[filled], middles[filled]
-        side = self.tile + 3
+        side = self._side
         tiles = np.empty((len(filled), side, 3 * side), dtype=np.float32)
         for some, *pairs in self._groups(len(filled), np.searchsorted(filled, of), which):
             drawn = np.empty((len(some), side, 3 * side), dtype=np.float32)
@@ -260,7 +263,7 @@ class Atlas:
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
         """A tile (side, 3 side) of grey values or a profile."""
         pattern, sigma, total = self._grids[sensor]
-        side, flat = self.tile + 3, pattern.dimension == 1
+        side, flat = self._side, pattern.dimension == 1
         cells = middle + (np.arange(side) - 0.5 * (side - 1))[:, None]
         u, v = (cells / self.per_unit[sensor, 0, 0, 0]).T
         layers = factors(pattern, sigma, u, None if flat else v, total).layers(gradient=True)

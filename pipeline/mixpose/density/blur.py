@@ -56,7 +56,7 @@ def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None, total: 
             return Factors(weights, np.zeros_like(weights), right, right_slope)
         left, left_slope = bell(v, pattern.points[:, 1], sigma)
         return Factors(left * weights, left_slope * weights, right, right_slope)
-    m = len(pattern.origin)
+    m = pattern.dimension
     columns, right, right_slope = _along(pattern, 0, sigma, u)
     scale = np.float32(pattern.step**m / total)
     if v is None:
@@ -108,7 +108,7 @@ def mass(pattern: Pattern) -> float:
     if isinstance(pattern, PointPattern):
         return float(pattern.weights.sum())
     absolute = float(np.abs(pattern.values).sum(dtype=np.float64))
-    return absolute * pattern.step ** len(pattern.origin)
+    return absolute * pattern.step**pattern.dimension
 
 
 def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
@@ -121,7 +121,7 @@ def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
     factor = odd_factor(sigma / (_SAMPLES_PER_SIGMA * pattern.step))
     if factor == 1:
         return pattern, sigma
-    flat = len(pattern.origin) == 1
+    flat = pattern.dimension == 1
     rows, columns = pattern.values.shape
     box = (factor, 1 if flat else factor)
     size = (-(-columns // factor) + 2, rows if flat else -(-rows // factor) + 2)

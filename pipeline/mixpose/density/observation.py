@@ -97,11 +97,7 @@ class Observation:
     @cached_property
     def extent(self) -> tuple[Floats, Floats]:
         """Smallest and largest sensor coordinates (m,) of the pattern."""
-        pattern = self.pattern
-        if isinstance(pattern, PointPattern):
-            return pattern.points.min(axis=0), pattern.points.max(axis=0)
-        size = np.array(pattern.values.shape[::-1])[: self.dimension]
-        return pattern.origin, np.asarray(pattern.origin + (size - 1) * pattern.step)
+        return self.pattern.extent
 
     def around(self, y: Floats, reach: float) -> Observation:
         """Detections within a reach, in σ_ε, of places (n, m), if there are any."""

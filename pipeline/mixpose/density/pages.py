@@ -15,6 +15,9 @@ MAX_PAGES = 250_000
 """Pages of a sensor's plane; detections that are too far from their middle for it are left out,
 and pages of grey values are larger."""
 
+RIM = 3
+"""Cells along a tile beside those whose places may be looked up: a spline reaches beyond."""
+
 _LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
 _AT_ONCE = 400  # pages that are drawn together: what is made for them stays in the cache
 _PENDING = -1  # in the table: not drawn yet
@@ -77,7 +80,7 @@ class Pages:
         self.plane = plane
         self.table = np.full(sensors * plane.squares, _PENDING, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
-        side = plane.page + 3
+        side = plane.page + RIM
         columns = min(len(self.table) * side // _LARGEST + 1, _LARGEST // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1

@@ -230,7 +230,7 @@ def contradict(
     `before` are the residuals of the frames before, and where two sensors `agreed` in one of them,
     one may miss the body now.
     """
-    used = [one for one in judged.associations if judged.sensors[one.name].used]
+    used = judged.used
     if len(used) != 2 or any(one.J.shape[1] != 2 for one in used):
         return False
     return _is_unmet(used, agreed, rules) or _is_between(used, before, rules, model)

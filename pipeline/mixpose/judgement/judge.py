@@ -51,6 +51,11 @@ class Judged:
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
 
     @property
+    def used(self) -> list[Association]:
+        """The pose against each sensor that took part."""
+        return [one for one in self.associations if self.sensors[one.name].used]
+
+    @property
     def is_unlike(self) -> bool:
         """Whether its residuals are larger than chance makes them."""
         return self.surplus > 1

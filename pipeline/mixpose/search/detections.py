@@ -80,7 +80,7 @@ def _weighted_places(pattern: GridPattern, budget: SearchBudget) -> tuple[Floats
     """Grid points (K, m) that stand out, and their values (K,)."""
     values = pattern.values.astype(np.float64)
     rows, columns = np.nonzero(values > budget.grey_floor * values.max())
-    places = np.stack([columns, rows], axis=1)[:, : len(pattern.origin)]
+    places = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
     return pattern.origin + pattern.step * places, values[rows, columns]
 
 

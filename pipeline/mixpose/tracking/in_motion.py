@@ -128,8 +128,8 @@ def fit_in_motion(
 def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judged:
     """A judged pose, as sure as its velocity lets it be."""
     free, expected = data.free, data.expected(judged.T_world_object)
-    used = [one for one in judged.associations if judged.sensors[one.name].used]
-    offsets, inner, count = offsets_of(data, used, expected), np.ix_(free, free), int(free.sum())
+    offsets, inner = offsets_of(data, judged.used, expected), np.ix_(free, free)
+    count = int(free.sum())
     rows, covariance = offsets.rows[:, free], judged.covariance.copy()
     alone = rows.T @ rows
     # the variance by which the covariance goes
@@ -258,7 +258,7 @@ class DelayEvidence:
 
     def joined(self, data: FrameData, best: Judged) -> DelayEvidence:
         """With one more frame, whose best pose is known as well as its features say."""
-        used = [one for one in best.associations if best.sensors[one.name].used]
+        used = best.used
         is_asked = data.frame % SOME_FRAMES == 0 or is_timed(data.views)
         if len(used) < 2 or not data.elapsed or not is_asked:
             return self

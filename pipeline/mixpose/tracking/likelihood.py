@@ -104,6 +104,11 @@ class FrameData:
         memory, known = self.rules.judgement.noise.memory, self.track.residuals.noise
         return [known.get(view.name, Noise()).faded(memory) for view in self.views]
 
+    @property
+    def close(self) -> Floats:
+        """Standard deviations (6,) of a start that was searched for, or is a rival's."""
+        return self.start_uncertainty / self.rules.proposals.narrowing**2
+
     @cached_property
     def anywhere(self) -> Prior:
         """What is known of a pose of which nothing is known."""

@@ -65,12 +65,11 @@ def is_reflection(data: FrameData, judged: Judged) -> bool:
     ahead, met = data.rules.acceptance.standing_out, _met(judged, data.body)
     # of these the mirror image may meet more than the body
     if sum(min(one.missed, one.surplus) for one in judged.associations) > 0.5:
-        close = data.start_uncertainty / data.rules.proposals.narrowing**2
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
         near = replace(data, body=flat, begun=None)
-        if _evidence(near, Start(judged.T_world_object, close)) > judged.log_evidence + ahead:
+        if _evidence(near, Start(judged.T_world_object, data.close)) > judged.log_evidence + ahead:
             return True
     if not _is_by_chance(data, judged):
         return False

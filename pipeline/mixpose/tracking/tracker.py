@@ -192,9 +192,7 @@ class Tracker:
         """The same poses judged by other views, and fitted to them, most evident first."""
         if not data.views:
             return []
-        likelihood, close = likelihood_of(data), None
-        if fitted:
-            close = data.start_uncertainty / data.rules.proposals.narrowing**2
+        likelihood, close = likelihood_of(data), data.close if fitted else None
         found: list[Judged] = []
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
@@ -250,8 +248,7 @@ class Tracker:
             found.append(Found(one.T_world_object, belief, spread, deviation))
         tallies = {
             one.name: SensorTally(int(np.count_nonzero(one.shares)), len(one.features))
-            for one in best.associations
-            if best.sensors[one.name].used
+            for one in best.used
         }
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
@@ -301,8 +298,7 @@ def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
         return {}
     return {
         one.name: Offsets(one.features, one.shares > 0, one.offsets, one.J[..., :3])
-        for one in judged.associations
-        if judged.sensors[one.name].used
+        for one in judged.used
     }
 
 

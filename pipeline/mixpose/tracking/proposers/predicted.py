@@ -35,6 +35,5 @@ def _is_met_as_before(data: FrameData, best: Judged) -> bool:
     if is_new or track.misses or track.doubted or len(track.branches) != 1:
         return False
     before = sum(one.met for one in track.tallies.values())
-    used = [one for one in best.associations if best.sensors[one.name].used]
-    met = sum(int(np.count_nonzero(one.shares)) for one in used)
+    met = sum(int(np.count_nonzero(one.shares)) for one in best.used)
     return met > data.rules.acceptance.convincing * before

@@ -50,7 +50,6 @@ def candidates_of(data: FrameData) -> list[Candidate]:
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
     """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
-    close = data.start_uncertainty / data.rules.proposals.narrowing**2
     for one in candidates:
         yield Start(one.T_world_object)
-        yield Start(one.T_world_object, close)
+        yield Start(one.T_world_object, data.close)

@@ -26,7 +26,6 @@ def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
     not tell: it says less of where a body's origin goes the farther that is from its middle.
     """
     best, steps, rules = None, data.body.grid_steps, data.rules.proposals
-    close = data.start_uncertainty / rules.narrowing**2
     for _ in range(_PASSES if len(steps) else 0):
         if not ranked or ranked[0] is best:
             return
@@ -39,7 +38,7 @@ def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
         # the value grows as the square of the features met
         values = np.sqrt(data.finest.shares(poses, whole=True).sum(axis=0))
         for k in np.flatnonzero(values[1:] > (1 - rules.aside / met) * values[0]):
-            yield Start(poses[1 + k], close, T_moved=data.moves_alike(T))
+            yield Start(poses[1 + k], data.close, T_moved=data.moves_alike(T))
 
 
 def is_a_step(body: Body, judged: Judged, other: Judged) -> bool:

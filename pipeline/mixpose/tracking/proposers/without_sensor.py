@@ -23,9 +23,8 @@ def without_sensor(data: FrameData, likelihood: Likelihood, judged: Judged) -> I
     if any(not report.used for report in judged.sensors.values()):
         return  # some are left out already
     rules = data.rules
-    close = data.start_uncertainty / rules.proposals.narrowing**2
     if apart := disagreeing(judged.associations, rules.acceptance, rules.judgement.noise):
-        yield Start(judged.T_world_object, close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
+        yield Start(judged.T_world_object, data.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
 
 
 def disagreeing(
