@@ -12,21 +12,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelihood, sums_of
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.options import EstimatorOptions, free_mask
 from mixpose.fit.prior import NormalPrior, believed, has_likelihood
+from mixpose.matching import (
+    AssociationRules,
+    ErrorRules,
+    Matches,
+    NoiseEstimate,
+    associate,
+    errors_seen,
+    log_likelihood,
+)
 from mixpose.objective import (
     MatchedObjective,
-    Quadratic,
     Together,
     View,
     build_objective,
@@ -80,6 +87,8 @@ class Fit:
     iterations: int  # evaluations at the finest blur
     freed: bool = False  # whether the body did not fit, and the pose was fitted to freed features
     motion: Motion | None = None  # of the body, where sensors see it at moments of their own
+    matches: Matches | None = None  # at the pose, at σ_ε, where detections were looked at
+    noise: NoiseEstimate | None = None  # as these show it
 
     @classmethod
     def of(cls, ascent: Ascent[Floats]) -> Fit:
@@ -113,9 +122,10 @@ def fit_near(
     begun: Ascent[Floats] | None = None,
     climbed: list[Climbed] | None = None,
     blur: float = 1.0,
-    noise: Sequence[Noise] | None = None,
+    noise: Floats | None = None,
     beside: float = 0.0,
     errors: ErrorRules = ErrorRules(),
+    association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
     """Descend from coarse blurs to the detections' noise and climb the objective at each.
@@ -140,32 +150,33 @@ def fit_near(
         at σ_ε where one of theirs did, theirs is returned, the very same.
     blur : float
         In σ_ε, where the start is as close as that: what is coarser is left out.
-    noise : sequence of Noise or None
-        What is known of each view's noise, in σ_ε; None: nothing.
+    noise : (2, L) array or None
+        Squares in σ_ε² and degrees of freedom of each view's noise so far; None: nothing.
     beside : float
         Standard deviation of what else features are off by, in σ_ε.
     errors : ErrorRules
+    association : AssociationRules
     rules : FitRules
     """
     free = free_mask(options)
     descend = partial(_through_blurs, views, body, T_start, uncertainty, options, samples, rules)
     if options.objective != "matched":
         return Fit.of(descend(None, FINE))
-    if finest is None or blur != 1:
-        sigmas = [blur * view.observation.sigma for view in views]
-        finest = matched_objective(views, body, sigmas)
+    sigmas = [view.observation.sigma for view in views]
+    finest = finest or matched_objective(views, body, sigmas)
+    first = finest if blur == 1 else matched_objective(views, body, [blur * s for s in sigmas])
     if has_likelihood(views):
         ascent = descend(finest, FINE)
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
         return replace(Fit.of(ascent), T_world_object=T, freed=is_freed)
-    ascent = begun or _at_once(finest, T_start, free, blur, rules) or descend(finest, SHARP)
+    ascent = begun or _at_once(first, T_start, free, blur, rules) or descend(first, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
     for one in climbed:
         if one.begins_at(ascent, rules):
             return one.fit
-    known = noise or [Noise()] * len(views)
-    fit = Fit.of(_to_the_noise(ascent, finest, free, known, beside, errors, rules, blur))
+    known = np.zeros((2, len(views))) if noise is None else noise
+    fit = _to_the_noise(ascent, finest, free, known, beside, errors, association, rules, blur)
     climbed.append(Climbed(ascent, fit))
     return fit
 
@@ -238,102 +249,67 @@ def _through_blurs(
 
 def _to_the_noise(
     ascent: Ascent[Floats],
-    objective: MatchedObjective,
+    finest: MatchedObjective,
     free: NDArray[np.bool_],
-    noise: Sequence[Noise],
+    known: Floats,
     beside: float,
     errors: ErrorRules,
+    association: AssociationRules,
     rules: FitRules,
-    blur: float = 1.0,
-) -> Ascent[Floats]:
+    blur: float,
+) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
-    known = sums_of(noise)
-    sigmas = np.array([view.observation.sigma for view in objective.views])
+    sigmas = np.array([view.observation.sigma for view in finest.views])
     blurs, count = np.full(len(sigmas), blur), int(free.sum())
-    likeliest, best = -np.inf, ascent
+    likeliest, best = -np.inf, None
     while True:
-        met = _met(objective, ascent, sigmas, beside, errors)
-        seen = errors_seen(met.offsets, count, known, errors)
+        matches = associate(finest, ascent.state[None], association, errors.narrowest).at(0)
+        if beside:
+            least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
+            matches = replace(matches, finest=least)
+        noise = errors_seen(matches, count, known, errors)
+        fit = replace(Fit.of(ascent), matches=matches, noise=noise)
         # offsets of a bent pose hide how small the noise is
-        variances = np.minimum(seen.variances, (seen.before / errors.blur) ** 2)
-        end = np.minimum(np.minimum(seen.blurs, seen.before), blurs)
+        variances = np.minimum(noise.variances, (noise.before / errors.blur) ** 2)
+        end = np.minimum(np.minimum(noise.blurs, noise.before), blurs)
         narrower = np.maximum(end, blurs / rules.schedule.ratio)
-        is_end = met.is_noise(variances, errors) or bool((narrower > rules.narrower * blurs).all())
-        if best is ascent and is_end:
-            return ascent
+        is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
+        is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
+        if best is None and is_end:
+            return fit
         # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
         alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-        if best is ascent and alike and met.moved(free, blurs, end, variances) < rules.moved**2:
-            return ascent
-        likelihood = log_likelihood(seen.blurs, met.offsets, count, errors)
-        if likelihood > likeliest:
-            likeliest, best = likelihood, ascent
+        moved = _moved(matches, free, blurs, end, variances) if best is None and alike else np.inf
+        if moved < rules.moved**2:
+            return fit
+        likelihood = log_likelihood(noise.blurs, matches, count, errors)
+        if best is None or likelihood > likeliest:
+            likeliest, best = likelihood, fit
         if is_end:
             return best
         blurs = narrower
-        # a fine grid has to hold no more than what was detected around the features
-        near = [
-            replace(view, observation=view.observation.around(places, errors.reach))
-            for view, places in zip(objective.views, met.places, strict=True)
-        ]
-        objective = matched_objective(near, objective.projection.body, (blurs * sigmas).tolist())
+        objective = _narrowed(finest, matches, (blurs * sigmas).tolist(), errors.reach)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 
-class _Met(NamedTuple):
-    """Where the features are met in each sensor; without share where they are not."""
-
-    offsets: Offsets
-    away: Floats  # (L, n, 2) the offsets themselves, in σ_ε
-    J: Floats  # (L, n, 2, 6) of the features by the pose, in σ_ε
-    places: list[Floats]  # (k, m) of all features that a sensor sees, in its units
-
-    def is_noise(self, variances: Floats, errors: ErrorRules) -> bool:
-        """Whether no offset is larger than noise of variances (L,) lets it be."""
-        limits = errors.outlying**2 * variances[:, None]
-        return not self.offsets.shares[self.offsets.squared > limits].any()
-
-    def moved(
-        self, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
-    ) -> float:
-        """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
-        squared, weights = self.offsets.squared, self.offsets.shares / variances[:, None]
-        now, then = (np.exp(-0.25 * squared / one[:, None] ** 2) for one in (blurs, narrower))
-        J = self.J[..., free].reshape(self.away.size, -1)
-        gradient = (weights * (then - now)).repeat(2) * self.away.ravel() @ J
-        rows = (weights * then).repeat(2)[:, None] * J
-        return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])
+def _narrowed(
+    finest: MatchedObjective, matches: Matches, sigmas: Sequence[float], reach: float
+) -> MatchedObjective:
+    """At narrower blurs, of what was detected around the features: a fine grid holds no more."""
+    near = []
+    for k, view in enumerate(finest.views):
+        places = matches.places[k, matches.weights[k] > 0, : matches.dimensions[k]]
+        near.append(replace(view, observation=view.observation.around(places, reach)))
+    return matched_objective(near, finest.projection.body, sigmas)
 
 
-def _met(
-    objective: MatchedObjective,
-    ascent: Ascent[Floats],
-    sigmas: Floats,
-    beside: float,
-    errors: ErrorRules,
-) -> _Met:
-    """How far off features are met, as the density around them shows it: v ∇C / C.
-
-    What was looked up is where the last step began; the step is taken off.
-    """
-    assert isinstance(ascent.last, Quadratic), "an ascent of the matched objective"
-    assert ascent.last.match is not None
-    at, sampled, _ = ascent.last.match
-    seen, C, y = at.seen[:, 0], sampled[:, 0, :, 0], at.y[:, 0]
-    J = at.J[:, 0] / sigmas[:, None, None, None]
-    is_near = C > 0
-    scale = objective.variances / (np.where(is_near, C, 1.0) * sigmas[:, None])
-    away = sampled[:, 0, :, 1:] * scale[..., None]
-    if ascent.step is not None:
-        away -= J @ ascent.step
-    squared = (away * away).sum(axis=2)
-    is_near &= squared < errors.met**2
-    shares = at.weights[:, 0] * is_near
-    dimensions = objective.projection.dimensions
-    places = [one[of, :m] for one, of, m in zip(y, seen, dimensions.tolist(), strict=True)]
-    finest = [
-        view.observation.narrowest(errors.narrowest, one)
-        for view, one in zip(objective.views, places, strict=True)
-    ]
-    least = np.minimum(np.maximum(errors.blur * beside, finest), 1.0)
-    return _Met(Offsets(squared, shares, dimensions, least), away, J, places)
+def _moved(
+    matches: Matches, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
+) -> float:
+    """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
+    weights = matches.shares / variances[:, None]
+    now, then = (np.exp(-0.25 * matches.squared / one[:, None] ** 2) for one in (blurs, narrower))
+    J = matches.J[..., free].reshape(matches.offsets.size, -1)
+    gradient = (weights * (then - now)).repeat(2) * matches.offsets.ravel() @ J
+    rows = (weights * then).repeat(2)[:, None] * J
+    return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])

@@ -14,7 +14,6 @@ from mixpose.judgement.acceptance import (
     is_possible,
     is_sure,
 )
-from mixpose.judgement.association import Association, Matches, associate
 from mixpose.judgement.evidence import (
     DetectionModel,
     Prior,
@@ -25,29 +24,26 @@ from mixpose.judgement.evidence import (
 from mixpose.judgement.expected_covariance import expected_covariance, invert_information
 from mixpose.judgement.judge import (
     Case,
-    Judged,
     JudgementRules,
+    ScoredPose,
     beliefs,
     judge,
     judge_together,
     nearest_alike,
 )
-from mixpose.judgement.noise import NoiseModel, Residuals
+from mixpose.judgement.noise import NoiseModel, RememberedNoise
 
 __all__ = [
     "APART",
     "AcceptanceRules",
-    "Association",
     "Case",
     "DetectionModel",
-    "Judged",
     "JudgementRules",
-    "Matches",
     "NoiseModel",
     "Prior",
-    "Residuals",
+    "RememberedNoise",
+    "ScoredPose",
     "Verdict",
-    "associate",
     "beliefs",
     "contradict",
     "convinces",

@@ -12,10 +12,9 @@ from scipy.special import fdtri
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import Noise
-from mixpose.judgement.association import Association
-from mixpose.judgement.judge import Judged, beliefs, nearest_alike
+from mixpose.judgement.judge import ScoredPose, beliefs, nearest_alike
 from mixpose.judgement.noise import NoiseModel
+from mixpose.matching import Matches, Noise
 from mixpose.records import Status
 from mixpose.rigid import rotation_angle_deg, twist_between
 
@@ -100,8 +99,8 @@ class Verdict:
     """The decision about a frame."""
 
     status: Status
-    best: Judged | None  # None where the frame is lost
-    kept: list[tuple[Judged, float]]  # poses worth telling with their beliefs, best first
+    best: ScoredPose | None  # None where the frame is lost
+    kept: list[tuple[ScoredPose, float]]  # poses worth telling with their beliefs, best first
     doubt: str = ""  # why a frame is ambiguous, other than for its rivals
 
     def doubted(self, doubt: str) -> Verdict:
@@ -109,12 +108,14 @@ class Verdict:
         return replace(self, status="ambiguous", doubt=doubt) if doubt else self
 
 
-def is_possible(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+def is_possible(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose is worth telling by itself."""
     return _is_fixed(judged, free) and judged.log_evidence > rules.possible
 
 
-def stands_out(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+def stands_out(
+    ranked: Sequence[ScoredPose], free: NDArray[np.bool_], rules: AcceptanceRules
+) -> bool:
     """Whether the first pose meets most of the body and is far likelier than all others.
 
     Poses that meet detections by chance come in numbers, and about equally good.
@@ -127,21 +128,21 @@ def stands_out(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: Accepta
     return ranked[0].log_evidence > max(rules.doubtful, float(rest) + rules.standing_out)
 
 
-def _is_fixed(judged: Judged, free: NDArray[np.bool_]) -> bool:
+def _is_fixed(judged: ScoredPose, free: NDArray[np.bool_]) -> bool:
     return judged.measurements >= int(free.sum())
 
 
-def is_recognised(judged: Judged, rules: AcceptanceRules) -> bool:
+def is_recognised(judged: ScoredPose, rules: AcceptanceRules) -> bool:
     """Whether enough of the body is met that another one cannot pass for it.
 
     Three markers of another body may well lie as three of this one, where it was expected even.
     """
-    in_view = {int(i) for one in judged.associations for i in one.features}
-    met = {int(i) for one in judged.associations for i in one.features[one.shares > 0]}
-    return len(met) >= min(rules.majority * len(in_view), rules.enough)
+    in_view = int(np.count_nonzero(judged.matches.weights.any(axis=0)))
+    met = int(np.count_nonzero(judged.matches.met_by))
+    return met >= min(rules.majority * in_view, rules.enough)
 
 
-def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+def is_sure(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose is believed, if no rival casts doubt on it."""
     if not is_possible(judged, free, rules) or judged.log_evidence <= rules.sure:
         return False
@@ -151,15 +152,17 @@ def is_sure(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> 
     return is_turned and is_recognised(judged, rules)
 
 
-def convinces(judged: Judged, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
+def convinces(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
     """Whether a pose near its prediction needs no other to compare with."""
-    agreeing = [one.coverage for one in judged.associations if one.coverage >= rules.agreeing]
+    agreeing = [share for share in judged.matches.coverage.tolist() if share >= rules.agreeing]
     # of two sensors or more that agree, others may be covered, blind or out of step
     share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else judged.coverage
     return share > rules.convincing and is_sure(judged, free, rules)
 
 
-def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceRules) -> Verdict:
+def decide(
+    ranked: Sequence[ScoredPose], free: NDArray[np.bool_], rules: AcceptanceRules
+) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
     told = (one for one in ranked if is_possible(one, free, rules))
     best = ranked[0] if stands_out(ranked, free, rules) else next(told, None)
@@ -181,8 +184,8 @@ def decide(ranked: Sequence[Judged], free: NDArray[np.bool_], rules: AcceptanceR
 
 
 def insert(
-    ranked: list[Judged],
-    new: Judged,
+    ranked: list[ScoredPose],
+    new: ScoredPose,
     body: Body,
     free: NDArray[np.bool_],
     rules: AcceptanceRules,
@@ -201,7 +204,7 @@ def insert(
 
 
 def _alike(
-    a: Judged, b: Judged, body: Body, free: NDArray[np.bool_], rules: AcceptanceRules
+    a: ScoredPose, b: ScoredPose, body: Body, free: NDArray[np.bool_], rules: AcceptanceRules
 ) -> bool:
     T_a = a.T_world_object
     T_b = nearest_alike(b.T_world_object, body, T_a)
@@ -222,7 +225,7 @@ def _alike(
 
 
 def contradict(
-    judged: Judged, before: Noise, agreed: bool, rules: AcceptanceRules, model: NoiseModel
+    judged: ScoredPose, before: Noise, agreed: bool, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
     """Whether the two sensors of a frame contradict each other: no pose is right for both.
 
@@ -231,49 +234,47 @@ def contradict(
     one may miss the body now.
     """
     used = judged.used
-    if len(used) != 2 or any(one.J.shape[1] != 2 for one in used):
+    if used.dimensions.tolist() != [2, 2]:
         return False
     return _is_unmet(used, agreed, rules) or _is_between(used, before, rules, model)
 
 
-def _is_unmet(used: Sequence[Association], agreed: bool, rules: AcceptanceRules) -> bool:
+def _is_unmet(used: Matches, agreed: bool, rules: AcceptanceRules) -> bool:
     """One meets most of the body; the other misses it, and sees as much beside it.
 
     Where the two never agreed, wherever it sees that.
     """
-    least, most = sorted(used, key=lambda one: one.coverage)
-    if not least.coverage < rules.agreeing <= most.coverage:
+    least, most = np.argsort(used.coverage, kind="stable").tolist()
+    if not used.coverage[least] < rules.agreeing <= used.coverage[most]:
         return False
     if not agreed:
-        return least.count - least.met >= rules.agreeing * most.met
-    return least.missed > 0 and least.surplus >= rules.agreeing * least.missed
+        return bool(used.count[least] - used.met[least] >= rules.agreeing * used.met[most])
+    missed = float(used.missed[least])
+    return bool(missed > 0 and used.unmatched_nearby[least] >= rules.agreeing * missed)
 
 
-def _is_between(
-    used: Sequence[Association], before: Noise, rules: AcceptanceRules, model: NoiseModel
-) -> bool:
+def _is_between(used: Matches, before: Noise, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Offsets far beyond the noise so far, which a pose of its own takes away in each sensor."""
     if not is_far_off(used, before, rules, model):
         return False
-    J = block_diag(*(one.rows[:, :6] for one in used))
-    J, offsets = J / np.maximum(np.linalg.norm(J, axis=0), 1e-12), [one.rows[:, 6] for one in used]
-    taken, _, rank, _ = np.linalg.lstsq(J, np.concatenate(offsets), rcond=1e-6)
-    alone = float(((np.concatenate(offsets) - J @ taken) ** 2).sum())
+    rows, offsets = used.rows()
+    J = block_diag(*rows)
+    J /= np.maximum(np.linalg.norm(J, axis=0), 1e-12)
+    taken, _, rank, _ = np.linalg.lstsq(J, offsets.ravel(), rcond=1e-6)
+    alone = float(((offsets.ravel() - J @ taken) ** 2).sum())
     # two poses take up more than the one that both have in common
-    own, more = sum(one.measurements for one in used) - rank, max(rank - 6, 1.0)
-    gained = (sum(one.squares for one in used) - alone) / more
+    own, more = float(used.measurements.sum()) - rank, max(rank - 6, 1.0)
+    gained = (float(used.squares.sum()) - alone) / more
     return bool(own >= 1 and gained > fdtri(more, own, model.by_chance) * alone / own)
 
 
-def is_far_off(
-    used: Sequence[Association], before: Noise, rules: AcceptanceRules, model: NoiseModel
-) -> bool:
+def is_far_off(used: Matches, before: Noise, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Whether features are met far beyond the noise so far, or what is typical."""
-    degrees = sum(one.measurements for one in used) - 6
+    degrees = float(used.measurements.sum()) - 6
     if degrees < 1:
         return False
     is_known = before.degrees >= model.known
     known = before.variance if is_known else model.errors.typical**2
     times = rules.disagreeing if is_known else rules.strange
-    squares = sum(one.squares for one in used)
+    squares = float(used.squares.sum())
     return bool(squares / degrees >= times * max(known, model.smallest**2))

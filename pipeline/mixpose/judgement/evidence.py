@@ -25,7 +25,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.association import Matches
+from mixpose.matching import Matches
 from mixpose.records import Floats
 
 

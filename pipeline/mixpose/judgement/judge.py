@@ -1,20 +1,20 @@
-"""What a pose is worth: per-sensor reports, covariance and evidence."""
+"""What a pose is worth: matches, noise, covariance and evidence, worked out once and kept."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import AssociationRules
-from mixpose.judgement.association import Association, Matches, associate
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
 from mixpose.judgement.moments import inverses
-from mixpose.judgement.noise import NoiseModel, Residuals, information_of, noises_of
+from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, noises_of
+from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
 from mixpose.records import Floats, SensorReport
 
@@ -28,37 +28,87 @@ class JudgementRules:
     noise: NoiseModel = NoiseModel()
 
 
-@dataclass(frozen=True)
-class Judged:
-    """A pose, and how well it explains the frame."""
+@dataclass(frozen=True, eq=False)
+class ScoredPose:
+    """A pose, and how well it explains the frame.
 
-    T_world_object: Floats  # (4, 4)
-    sensors: dict[str, SensorReport]
-    score: float  # mean cosine between predicted and observed densities, 0 to 1
-    coverage: float  # mean share of the body's features in view that are met
-    measurements: float  # number of met sensor coordinates
-    covariance: Floats  # (6, 6) zero in directions that are not estimated
-    log_evidence: float  # logarithm of the odds for this pose against mere clutter
-    residuals: Residuals  # of this frame and, fading, of those before it, for the next frame
-    associations: tuple[Association, ...] = ()  # the pose against each sensor that saw something
-    spread: Floats | None = None  # (6,) standard deviations where they are as large as its motion
-    proposer: str = ""  # where the pose came from
-    value: float = 0.0  # of what was climbed, at the pose
-    # (6, 6) of the covariance, what lasts from frame to frame
-    lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    surplus: float = 0.0  # how many times larger its residuals are than chance makes them
-    # (6, 6) where features are off by all that the spreads of a body that gives way let them be
+    Attributes
+    ----------
+    T_world_object : (4, 4)
+    matches : Matches
+        Against each sensor that saw something.
+    covariance : (6, 6)
+        Zero in directions that are not estimated.
+    log_evidence : float
+        Logarithm of the odds for this pose against mere clutter.
+    noise : RememberedNoise
+        Of this frame and, fading, of those before it, for the next frame.
+    left_out : mapping of str to str
+        Sensors that the pose was fitted without, and why.
+    persistent : (6, 6)
+        Of the covariance, what lasts from frame to frame.
+    residual_ratio : float
+        Of its residuals to the largest that chance makes.
+    bent : (6, 6)
+        Covariance where features are off by all that the spreads of a body that gives way allow.
+    spread : (6,) or None
+        Standard deviations where they are as large as the body's motion.
+    proposer : str
+        Where the pose came from.
+    """
+
+    T_world_object: Floats
+    matches: Matches
+    covariance: Floats
+    log_evidence: float
+    noise: RememberedNoise = RememberedNoise()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    residual_ratio: float = 0.0
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    spread: Floats | None = None
+    proposer: str = ""
 
-    @property
-    def used(self) -> list[Association]:
-        """The pose against each sensor that took part."""
-        return [one for one in self.associations if self.sensors[one.name].used]
+    @cached_property
+    def used(self) -> Matches:
+        """The matches of the sensors that took part."""
+        return taken_part(self.matches, self.left_out)
+
+    @cached_property
+    def coverage(self) -> float:
+        """Mean share of the body's features in view that are met."""
+        return float(self.used.coverage.mean())
+
+    @cached_property
+    def measurements(self) -> float:
+        """Number of sensor coordinates that are met."""
+        return float(self.used.measurements.sum())
+
+    @cached_property
+    def score(self) -> float:
+        """Mean cosine between predicted and observed densities, 0 to 1."""
+        return float(np.sqrt(self.used.explained).mean())
 
     @property
     def is_unlike(self) -> bool:
         """Whether its residuals are larger than chance makes them."""
-        return self.surplus > 1
+        return self.residual_ratio > 1
+
+    @property
+    def sensors(self) -> dict[str, SensorReport]:
+        """How each sensor took part."""
+        rows = zip(self.matches.names, self.matches.explained.tolist(), self.matches.rms)
+        return {
+            name: SensorReport(name not in self.left_out, explained, rms, self.left_out.get(name))
+            for name, explained, rms in rows
+        }
+
+
+def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
+    """The matches of the sensors that are not left out."""
+    if not left_out:
+        return matches
+    return matches.of_sensors([k for k, name in enumerate(matches.names) if name not in left_out])
 
 
 @dataclass(frozen=True)
@@ -67,80 +117,93 @@ class Case:
 
     objective: MatchedObjective  # at σ_ε of every sensor
     T_world_object: Floats  # (4, 4)
-    before: Residuals = Residuals()  # of the frames before
+    before: RememberedNoise = RememberedNoise()  # of the frames before
     prior: Prior | None = None  # what was known of the pose; None: nothing
-    unmet: Sequence[Association] = ()  # other sensors, which count as if they had met nothing
+    left_out: Mapping[str, str] = field(default_factory=dict)  # count as if they had met nothing
+    matches: Matches | None = None  # of the pose, where the fit has them
+    noise: NoiseEstimate | None = None  # likewise
 
 
-def judge(case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()) -> Judged:
+def judge(
+    case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()
+) -> ScoredPose:
     """Judge a pose, estimated in free directions (6,), by matched densities at the finest blur."""
     return judge_together([case], free, rules)[0]
 
 
 def judge_together(
     cases: Sequence[Case], free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()
-) -> list[Judged]:
-    """Judge poses that the same sensors see, at once: as `judge` does each."""
-    narrowest = rules.noise.errors.narrowest
-    pairs = [
-        associate(one.objective, one.T_world_object, rules.association, narrowest) for one in cases
+) -> list[ScoredPose]:
+    """Judge poses that the same sensors see and take part in, at once: as `judge` does each."""
+    narrowest, left_out = rules.noise.errors.narrowest, cases[0].left_out
+    whole = [
+        one.matches
+        or associate(one.objective, one.T_world_object[None], rules.association, narrowest).at(0)
+        for one in cases
     ]
-    found = Matches.of([associations for associations, _ in pairs])
-    noises = noises_of(found, free, [one.before for one in cases], rules.noise)
+    matches = Matches.stacked([taken_part(one, left_out) for one in whole])
+    before, estimates = [one.before for one in cases], [one.noise for one in cases]
+    noises = noises_of(matches, free, before, rules.noise, estimates)
     variances = np.array([noise.variances for noise in noises])
-    evidence, bent = _evidence(cases, found, variances, free, rules.detection)
-    parts = zip(cases, pairs, noises, evidence.tolist(), bent, strict=True)
+    scored, widened = matches, variances
+    if left_out:
+        scored, widened = _unmet(whole, variances, left_out)
+    evidence, bent = _evidence(cases, scored, widened, free, rules.detection)
     return [
-        Judged(
+        ScoredPose(
             T_world_object=case.T_world_object,
-            sensors={one.name: SensorReport(True, one.explained, one.rms) for one in own},
-            score=sum(math.sqrt(one.explained) for one in own) / len(own),
-            coverage=sum(one.coverage for one in own) / len(own),
-            measurements=sum(one.measurements for one in own),
+            matches=own,
             covariance=noise.covariance,
-            lasting=noise.lasting,
             log_evidence=log_odds,
-            residuals=noise.remembered,
-            associations=tuple(own),
-            value=value,
-            surplus=noise.surplus,
+            noise=noise.remembered,
+            left_out=left_out,
+            persistent=noise.persistent,
+            residual_ratio=noise.residual_ratio,
             bent=apart,
         )
-        for case, (own, value), noise, log_odds, apart in parts
+        for case, own, noise, log_odds, apart in zip(
+            cases, whole, noises, evidence.tolist(), bent, strict=True
+        )
     ]
+
+
+def _unmet(
+    whole: Sequence[Matches], variances: Floats, left_out: Mapping[str, str]
+) -> tuple[Matches, Floats]:
+    """All sensors with noise (K, L), those left out as if they had met nothing."""
+    stacked = Matches.stacked(whole)
+    used = np.array([name not in left_out for name in stacked.names])
+    all_of_them = np.ones((len(whole), len(used)))
+    all_of_them[:, used] = variances
+    return replace(stacked, shares=stacked.shares * used[:, None]), all_of_them
 
 
 def _evidence(
     cases: Sequence[Case],
-    found: Matches,
+    whole: Matches,
     variances: Floats,
     free: NDArray[np.bool_],
     detection: DetectionModel,
 ) -> tuple[Floats, Floats]:
     """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
     bodies = [one.objective.projection.body for one in cases]
-    whole, widened = found, variances
-    blind = [[replace(s, shares=np.zeros(len(s.features))) for s in one.unmet] for one in cases]
-    if any(blind):
-        whole = Matches.of([[*own, *others] for own, others in zip(found.each, blind, strict=True)])
-        widened = np.hstack([variances, np.ones((len(cases), len(blind[0])))])
     priors = [
         one.prior or flat_prior(body, free, detection)
         for one, body in zip(cases, bodies, strict=True)
     ]
     sizes = np.array([2 * body.radius for body in bodies])
-    beside = whole, widened, free, priors, sizes, detection
-    evidence = log_evidence(*beside, information_of(found, variances))
+    given = whole, variances, free, priors, sizes, detection
+    evidence = log_evidence(*given, information_of(whole, variances))
     bent = np.zeros((len(cases), 6, 6))
     if any(body.spread for body in bodies):
         spreads = np.zeros((len(cases), whole.shares.shape[2], 3, 3))
         for own, body, case in zip(spreads, bodies, cases, strict=True):
-            turned = body.node_spreads(case.T_world_object)[: len(own)]
+            turned = body.node_spreads(case.T_world_object)
             own[: len(turned)] = turned
         # rigid as a rule, and bent now and then: as often the one as the other
-        information = information_of(whole, widened, spreads)
+        information = information_of(whole, variances, spreads)
         at_all = spreads.any(axis=(1, 2, 3))
-        both = np.logaddexp(evidence, log_evidence(*beside, information, spreads)) - math.log(2)
+        both = np.logaddexp(evidence, log_evidence(*given, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)
         bent[np.ix_(at_all, free, free)] = inverses(information[:, free][..., free])[at_all]
     return evidence, bent
@@ -160,7 +223,7 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     return np.asarray(alike[int(np.argmax(traces))])
 
 
-def beliefs(judged: Sequence[Judged]) -> list[float]:
+def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
     """Share of belief of each pose among its rivals."""
     if not judged:
         return []

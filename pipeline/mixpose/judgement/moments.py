@@ -5,14 +5,13 @@ The formulae stand in `noise`; here they are worked out for K frames at once.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.judgement.association import Association, Matches
-from mixpose.judgement.lasting import Lasting
+from mixpose.judgement.persistent_bias import PersistentBias
+from mixpose.matching import Matches
 from mixpose.records import Floats
 
 LEAST = 1e-6  # degrees of freedom: less is as good as none
@@ -36,7 +35,7 @@ class Frame(NamedTuple):
 
     moments: Moments
     parts: Floats  # (4, k, k) covariances that unit variances of each kind make
-    lasting: Lasting  # what it says of fields that last
+    bias: PersistentBias  # what it says of fields that last
     by_fields: Floats  # (k, q) how these move the pose
     by_calibration: Floats  # (k, K) how calibrations do, off by a deviation in one thing each
     rest: Floats  # (R, 1 + q) weighted residuals, and what a pose leaves of fields that may last
@@ -58,16 +57,14 @@ def frames_of(
 
     Detections are left out that are farther off than `outlying` standard deviations of the noise.
     """
-    squared = (found.offsets * found.offsets).sum(axis=3)
-    clear = squared <= outlying**2 * variances[..., None]
-    shares = np.where(clear, found.shares, 0.0)
+    clear = found.squared <= outlying**2 * variances[..., None]
+    shares, most = np.where(clear, found.shares, 0.0), int(found.dimensions.max())
     noise, frames = np.sqrt(variances), len(shares)
     scale = (np.sqrt(shares) / noise[..., None])[..., None]
-    rows = scale[..., None] * found.J
-    r, J = (scale * found.offsets).reshape(frames, -1, 1), rows[..., free]
-    doubts = [_doubts(*one) for one in zip(found.each, scale, J, strict=True)]
-    J = J.reshape(frames, -1, J.shape[4])
-    fields, kinds = _fields(found.places, shares, found.dimensions)
+    rows = scale[..., None] * found.J[..., :most, :]
+    r = (scale * found.offsets[..., :most]).reshape(frames, -1, 1)
+    J = rows[..., free].reshape(frames, r.shape[1], -1)
+    fields, kinds = _fields(found.places[..., :most], shares, found.dimensions)
     inverse = inverses(J.swapaxes(1, 2) @ J)
     drawn = inverse @ (J.swapaxes(1, 2) @ fields)
     left = fields - J @ drawn
@@ -84,13 +81,16 @@ def frames_of(
     # the noise of the sensor that each field is of
     sizes = np.repeat(noise, len(kinds) // noise.shape[1], axis=1)[:, None]
     information /= sizes.swapaxes(1, 2) * sizes
-    names = tuple(one.name for one in found.each[0])
+    by_calibration = np.zeros((frames, J.shape[2], 0))
+    if found.by_calibration is not None:
+        pulls = (scale[..., None] * found.by_calibration[..., :most, :]).reshape(*r.shape[:2], -1)
+        by_calibration = inverse @ (J.swapaxes(1, 2) @ pulls)
     each = zip(
         [Moments(*one) if one[1][0, 0] > 0 else Moments() for one in zip(seen, expected)],
         parts,
-        [Lasting(names, *one) for one in zip(information, vector / sizes[:, 0])],
+        [PersistentBias(found.names, *one) for one in zip(information, vector / sizes[:, 0])],
         drawn / sizes,
-        [moves @ doubt for moves, doubt in zip(inverse, doubts)],
+        by_calibration,
         np.concatenate([r, left / sizes], axis=2),
         fields,
         [kinds] * frames,
@@ -155,20 +155,6 @@ def _moments(
     expected[:, 3, 1:] = expected[:, 1:, 3] = both
     # the part is not less than nothing where a direction is hardly determined
     return seen, expected, drawn @ drawn.swapaxes(1, 2)
-
-
-def _doubts(each: Sequence[Association], scale: Floats, J: Floats) -> Floats:
-    """How calibrations that are off pull at a pose (k, K)."""
-    pulls = [
-        np.einsum(
-            "nmc,nmq->cq",
-            J[i, one.features, : one.J.shape[1]],
-            scale[i, one.features, :, None] / one.sigma * one.by_calibration,
-        )
-        for i, one in enumerate(each)
-        if one.by_calibration is not None
-    ]
-    return np.hstack([np.zeros((J.shape[3], 0)), *pulls])
 
 
 def inverses(information: Floats) -> Floats:

@@ -12,9 +12,8 @@ s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as the F d
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -23,10 +22,9 @@ from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
-from mixpose.density import ErrorRules, Noise, Offsets, Seen, errors_seen, pooled, sums_of
-from mixpose.judgement.association import Association, Matches
-from mixpose.judgement.lasting import Lasting, LastingRules
 from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
+from mixpose.judgement.persistent_bias import BiasRules, PersistentBias
+from mixpose.matching import ErrorRules, Matches, Noise, NoiseEstimate, errors_seen, pooled
 from mixpose.records import Floats
 
 _LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
@@ -37,7 +35,7 @@ class NoiseModel:
     """What is believed of detection noise before residuals are seen, and for how long."""
 
     errors: ErrorRules = ErrorRules()
-    fields: LastingRules = LastingRules()
+    bias: BiasRules = BiasRules()
     smallest: float = constant(1e-3, "of σ_ε: float32 densities do not resolve residuals below")
     by_chance: float = constant(
         0.999, "frames whose residuals are larger than so many by chance stand on their own"
@@ -70,20 +68,54 @@ class NoiseModel:
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """What is remembered of residuals: each sensor's noise in σ_ε, and what fields have of it.
+class RememberedNoise:
+    """What is remembered of residuals, for the next frame.
 
-    Some fields change from frame to frame, as `moments` know; some last.
+    Attributes
+    ----------
+    names : tuple of str
+        Sensors that were seen so far.
+    sums : (2, L) float64
+        Squares of their residuals in σ_ε², and degrees of freedom.
+    moments : Moments
+        Of fields that change from frame to frame.
+    biases : tuple of PersistentBias
+        Fields that last, by sets of sensors.
     """
 
-    noise: Mapping[str, Noise] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+    sums: Floats = field(default_factory=lambda: np.zeros((2, 0)))
     moments: Moments = Moments()
-    lasting: tuple[Lasting, ...] = ()
+    biases: tuple[PersistentBias, ...] = ()
 
     @property
     def total(self) -> Noise:
         """Noise of all sensors."""
-        return reduce(Noise.joined, self.noise.values(), Noise())
+        return Noise(*self.sums.sum(axis=1).tolist())
+
+    def of(self, names: Sequence[str]) -> Floats:
+        """Squares and degrees of freedom (2, L) of some sensors."""
+        if tuple(names) == self.names:
+            return self.sums
+        sums, numbers = np.zeros((2, len(names))), {name: k for k, name in enumerate(self.names)}
+        for k, name in enumerate(names):
+            if name in numbers:
+                sums[:, k] = self.sums[:, numbers[name]]
+        return sums
+
+    def after(
+        self,
+        names: tuple[str, ...],
+        sums: Floats,
+        frame: Moments,
+        biases: tuple[PersistentBias, ...],
+    ) -> RememberedNoise:
+        """With what a frame shows of some sensors."""
+        others = [k for k, name in enumerate(self.names) if name not in names]
+        if others:
+            names = (*names, *(self.names[k] for k in others))
+            sums = np.hstack([sums, self.sums[:, others]])
+        return RememberedNoise(names, sums, frame, biases)
 
 
 class FrameNoise(NamedTuple):
@@ -91,29 +123,33 @@ class FrameNoise(NamedTuple):
 
     variances: Floats  # (L,) of each sensor, in σ_ε²; the typical one counts, too
     covariance: Floats  # (6, 6) zero where the pose is not free
-    lasting: Floats  # (6, 6) of it, what lasts from frame to frame and leaves velocities alone
-    remembered: Residuals  # for the next frame
-    surplus: float  # how many times larger residuals are than those before let chance make them
+    persistent: Floats  # (6, 6) of it, what lasts from frame to frame and leaves velocities alone
+    remembered: RememberedNoise  # for the next frame
+    residual_ratio: float  # of residuals to the largest that those before them let chance make
 
 
 def noises_of(
     found: Matches,
     free: NDArray[np.bool_],
-    before: Sequence[Residuals],
+    before: Sequence[RememberedNoise],
     model: NoiseModel,
+    estimates: Sequence[NoiseEstimate | None] = (),
 ) -> list[FrameNoise]:
     """The noise of K frames, from the residuals of each and from those before it.
 
     As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes.
+    own, and is remembered as one that has the largest that chance makes.  `estimates` are what the
+    fits saw already.
     """
-    pairs = list(zip(found.each, before, strict=True))
+    known = estimates or [None] * len(before)
     levels = [
-        _level(*one, found.residuals(k), int(free.sum()), model) for k, one in enumerate(pairs)
+        _level(found.at(k), memory, int(free.sum()), model, estimate)
+        for k, (memory, estimate) in enumerate(zip(before, known, strict=True))
     ]
     frames = frames_of(found, np.array([one.scale for one in levels]), free, model.errors.outlying)
-    parts = zip(pairs, levels, frames, strict=True)
-    return [_frame_noise(*pair, level, frame, free, model) for pair, level, frame in parts]
+    met = found.met.mean(axis=1).tolist()
+    parts = zip(before, levels, frames, met, strict=True)
+    return [_frame_noise(found.names, *part, free, model) for part in parts]
 
 
 class _Level(NamedTuple):
@@ -123,44 +159,43 @@ class _Level(NamedTuple):
     scale: Floats  # (L,) the same, drawn to that of all sensors, which residuals are measured in
     told: Floats  # (2, L) squares and degrees of freedom that are remembered
     degrees: float  # of freedom, of all that was seen
-    surplus: float  # as `FrameNoise` has it
+    residual_ratio: float  # as `FrameNoise` has it
 
 
 def _level(
-    associations: Sequence[Association],
-    before: Residuals,
-    offsets: Offsets,
+    matches: Matches,
+    before: RememberedNoise,
     count: int,
     model: NoiseModel,
+    estimate: NoiseEstimate | None,
 ) -> _Level:
-    rules = model.errors
-    past = sums_of([before.noise.get(one.name, Noise()) for one in associations])
+    rules, past = model.errors, before.of(matches.names)
     sums = model.memory * past
-    seen = errors_seen(offsets, count, sums, rules)
-    surplus = _surplus(past, seen, model)
-    told = sums + seen.own / [[max(surplus, 1.0)], [1.0]]
-    if surplus > 1:
+    seen = estimate or errors_seen(matches, count, sums, rules)
+    ratio = _residual_ratio(past, seen, model)
+    told = sums + seen.own / [[max(ratio, 1.0)], [1.0]]
+    if ratio > 1:
         sums = np.zeros_like(past)
-        seen = errors_seen(offsets, count, sums, rules)
+        seen = errors_seen(matches, count, sums, rules)
     sums = sums + seen.own
     degrees = float(sums[1].sum())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return _Level(seen.variances, np.maximum(scale, model.smallest**2), told, degrees, surplus)
+    return _Level(seen.variances, np.maximum(scale, model.smallest**2), told, degrees, ratio)
 
 
 def _frame_noise(
-    associations: Sequence[Association],
-    before: Residuals,
+    names: tuple[str, ...],
+    before: RememberedNoise,
     level: _Level,
     frame: Frame,
+    met: float,
     free: NDArray[np.bool_],
     model: NoiseModel,
 ) -> FrameNoise:
-    lasting = frame.lasting.after(before.lasting, model.fields)
-    sizes = lasting[0].sizes(model.fields)
+    biases = frame.bias.after(before.biases, model.bias)
+    sizes = biases[0].sizes(model.bias, model.by_chance)
     own = frame.moments if sizes is None else frame.without(sizes[0])
     moments = before.moments.joined(own, model.memory)
-    met = float(np.mean([one.met for one in associations]))
     variances, of_fields = _shares(moments, own, met, model)
     # fields last: a further frame shows no more of them
     factors = model.enlargement(int(free.sum()), np.array([level.degrees, *of_fields]))
@@ -171,12 +206,11 @@ def _frame_noise(
         steady[np.ix_(free, free)] = frame.by_fields @ sizes[1] @ frame.by_fields.T
     covariance[np.ix_(free, free)] = inner
     covariance += steady
-    noise = {one.name: Noise(*pair) for one, pair in zip(associations, level.told.T.tolist())}
-    remembered = Residuals({**before.noise, **noise}, moments, lasting)
-    return FrameNoise(level.seen, covariance, steady, remembered, level.surplus)
+    remembered = before.after(names, level.told, moments, biases)
+    return FrameNoise(level.seen, covariance, steady, remembered, level.residual_ratio)
 
 
-def _surplus(past: Floats, seen: Seen, model: NoiseModel) -> float:
+def _residual_ratio(past: Floats, seen: NoiseEstimate, model: NoiseModel) -> float:
     """How many times larger a frame's residuals are than chance makes them; 1 is just by chance."""
     known, degrees = float(past[1].sum()), float(seen.own[1].sum())
     if known < model.known or degrees < 1:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import AssociationRules, Observation
-from mixpose.judgement import Association, associate
+from mixpose.density import Observation
+from mixpose.judgement import JudgementRules
+from mixpose.matching import AssociationRules, Matches, associate
 from mixpose.objective import View, matched_objective
 from mixpose.pictures.overlay import projected_features
 from mixpose.records import Estimate, PointPattern, RawFrame
@@ -165,27 +166,27 @@ def _expect(view: View, body: Body, T: Floats, points: Floats | None, *, sure: b
     found = _association(view, body, T)
     met = np.zeros(len(body), dtype=np.bool_)
     if found is not None:
-        feature = body.nodes.feature[found.features]
-        shares = np.bincount(feature, found.shares, minlength=len(body))
+        shares = np.bincount(body.nodes.feature, found.shares[0], minlength=len(body))
         full = np.bincount(body.nodes.feature, body.nodes.weights, minlength=len(body))
         met = seen & (shares > AssociationRules().min_share * full)
     unexplained = np.zeros(0, dtype=np.bool_)
     if points is not None:
         nodes, in_view = view.sensor.project(transform(T, body.nodes.points))
         if found is not None:
-            in_view[np.setdiff1d(np.arange(len(in_view)), found.features)] = False
+            in_view &= found.weights[0] > 0
         away = np.linalg.norm(points[:, None] - nodes[in_view], axis=-1)
         reach = view.observation.sigma * np.sqrt(2 * AssociationRules().reach_squared)
         unexplained = away.min(axis=1, initial=np.inf) > reach
-    explained = 0.0 if found is None else found.explained
-    rms = None if found is None else found.rms
+    explained = 0.0 if found is None else float(found.explained[0])
+    rms = None if found is None else found.rms[0]
     return Expectation(y, seen, met, unexplained, explained, rms, sure)
 
 
-def _association(view: View, body: Body, T: Floats) -> Association | None:
+def _association(view: View, body: Body, T: Floats) -> Matches | None:
     """The pose against the sensor's density; None where the sensor has nothing of either."""
     if view.observation.is_empty:
         return None
     objective = matched_objective([view], body, [view.observation.sigma])
-    found = associate(objective, T, AssociationRules())[0][0]
-    return found if len(found.features) else None
+    rules = JudgementRules()
+    found = associate(objective, T[None], rules.association, rules.noise.errors.narrowest).at(0)
+    return found if found.weights.any() else None

@@ -14,14 +14,14 @@ from functools import lru_cache
 import numpy as np
 
 from mixpose.body import Body, SharedPart, shared_parts
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.scene.members import Member
 from mixpose.tracking.likelihood import FrameData
 
 
 def may_be_another(
     k: int,
-    best: Judged,
+    best: ScoredPose,
     members: Sequence[Member],
     data: Mapping[int, FrameData],
     elsewhere: Sequence[bool],
@@ -32,7 +32,7 @@ def may_be_another(
     Parameters
     ----------
     k : int
-    best : Judged
+    best : ScoredPose
     members : sequence of Member
     data : mapping of int to FrameData
         The frame as it is left for each.
@@ -42,7 +42,7 @@ def may_be_another(
         How far markers of two bodies may be off each other, of the smaller one's radius; at least
         as far as either gives way.
     """
-    met = {int(i) for one in best.associations for i in one.features[one.shares > 0]}
+    met = set(np.flatnonzero(best.matches.met_by).tolist())
     body = members[k].tracker.body
     for j, other in enumerate(members):
         theirs = other.tracker.body

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.judgement import Judged, convinces, is_possible
+from mixpose.judgement import ScoredPose, convinces, is_possible
 from mixpose.objective import SharedDensities, View, project_body
 from mixpose.records import PointPattern
 from mixpose.scene.members import Member
@@ -51,7 +51,7 @@ class Joint:
     ----------
     data : dict of int to FrameData
         By member: the frame as it is left for it.
-    ranked : dict of int to list of Judged
+    ranked : dict of int to list of ScoredPose
         Its poses, most evident first.
     close_calls : set of int
         Members that won or lost their detections by little.
@@ -68,7 +68,7 @@ class Joint:
     ) -> None:
         self.members, self.tracks = members, tracks
         self.data: dict[int, FrameData] = {}
-        self.ranked: dict[int, list[Judged]] = {}
+        self.ranked: dict[int, list[ScoredPose]] = {}
         self.close_calls: set[int] = set()
         self._frame, self._time_s, self._rules = frame, time_s, rules
         self._views = [view for view in views if not view.observation.is_empty]
@@ -189,7 +189,7 @@ class Joint:
             self.ranked[k] = self.ranked[twin]
             self._left[k], self._owners[k] = self._left[twin], owners
 
-    def _look(self, k: int, owners: Owners, start: Sequence[Judged] = ()) -> None:
+    def _look(self, k: int, owners: Owners, start: Sequence[ScoredPose] = ()) -> None:
         """Poses of a body on what others leave; with `start`, from these poses alone."""
         tracker = self.members[k].tracker
         left = left_for(k, self._views, owners)

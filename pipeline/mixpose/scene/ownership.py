@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from mixpose.density import Observation
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.objective import View
 from mixpose.records import PointPattern
 
@@ -79,15 +79,14 @@ def _part(view: View, pattern: PointPattern, kept: NDArray[np.intp]) -> View:
     return replace(view, observation=Observation(part, seen.sigma, seen.intrinsic))
 
 
-def claims_of(judged: Judged, left: Left) -> dict[str, Claim]:
+def claims_of(judged: ScoredPose, left: Left) -> dict[str, Claim]:
     """The detections that a pose meets, numbered as in the whole views."""
-    claims = {}
-    for one in judged.associations:
-        if one.name not in left.kept or not judged.sensors[one.name].used:
-            continue
-        met = one.detections >= 0
-        numbers = left.kept[one.name][one.detections[met]]
-        claims[one.name] = Claim(numbers, one.places[met], one.squared[met])
+    claims, used = {}, judged.used
+    for k, (name, m) in enumerate(zip(used.names, used.dimensions)):
+        if name in left.kept:
+            met = used.detections[k] >= 0
+            numbers = left.kept[name][used.detections[k, met]]
+            claims[name] = Claim(numbers, used.places[k, met, :m], used.squared[k, met])
     return claims
 
 
@@ -150,9 +149,12 @@ def claimed(views: Sequence[View], claims: Mapping[int, Mapping[str, Claim]]) ->
     return owners
 
 
-def unmet_places(judged: Judged) -> dict[str, Floats]:
+def unmet_places(judged: ScoredPose) -> dict[str, Floats]:
     """Where a pose has features that nothing was found at, by sensor."""
-    return {one.name: one.places[one.shares == 0] for one in judged.associations}
+    seen = judged.matches
+    unmet = (seen.weights > 0) & (seen.shares == 0)
+    sensors = enumerate(zip(seen.names, seen.dimensions))
+    return {name: seen.places[k, unmet[k], :m] for k, (name, m) in sensors}
 
 
 def merged_spots(

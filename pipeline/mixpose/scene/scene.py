@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from mixpose.judgement import Judged, Verdict
+from mixpose.judgement import ScoredPose, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.scene.doubt import may_be_another
@@ -73,7 +73,7 @@ class Scene:
         ]
         return self._acquainted(outcomes)
 
-    def _decided(self, k: int, data: FrameData, ranked: Sequence[Judged]) -> Decided:
+    def _decided(self, k: int, data: FrameData, ranked: Sequence[ScoredPose]) -> Decided:
         verdict = self.members[k].tracker.verdict(data, ranked)
         best = verdict.best if verdict.status == "ok" else None
         if best and not is_known(data, best):
@@ -139,10 +139,10 @@ class Decided(NamedTuple):
     """A body's verdict by itself; what is told of it where others cast doubt; all its poses."""
 
     verdict: Verdict
-    ranked: Sequence[Judged]
+    ranked: Sequence[ScoredPose]
     told: Verdict | None = None
 
-    def doubted(self, rivals: Sequence[tuple[Judged, float]]) -> Decided:
+    def doubted(self, rivals: Sequence[tuple[ScoredPose, float]]) -> Decided:
         """The same, told to be ambiguous with poses that it may have instead, and their odds."""
         best = self.verdict.best
         if best is None:

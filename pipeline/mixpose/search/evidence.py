@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.density import AssociationRules, ErrorRules, crowding
-from mixpose.judgement import DetectionModel, Matches, odds_of, paid_by_count
+from mixpose.judgement import DetectionModel, odds_of, paid_by_count
+from mixpose.matching import AssociationRules, ErrorRules, Matches, crowding
 from mixpose.objective import Projected, project_body
 from mixpose.records import Floats
 from mixpose.search.detections import SensorDetections
@@ -41,7 +41,8 @@ def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
 def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) -> Matches:
     """What sensors have at the places where they are predicted to see the body."""
     sigmas = np.array([one.sigma for one in seen])[:, None, None, None]
-    shares, offsets = np.zeros(at.seen.shape), np.zeros(at.y.shape)
+    shares: Floats = np.zeros(at.seen.shape)
+    offsets: Floats = np.zeros(at.y.shape)
     crowd = []
     for k, one in enumerate(seen):
         points, m = one.points, one.points.shape[1]
@@ -63,14 +64,22 @@ def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) ->
         lower[empty], upper[empty] = 0.0, 0.0
         smallest = _ASSOCIATION.min_region * one.sigma
         crowd.append(crowding(points, lower, upper, smallest) * one.sigma**m)
+    counts = np.tile([float(len(one.points)) for one in seen], (at.seen.shape[1], 1))
     return Matches(
+        names=tuple(one.view.name for one in seen),
         dimensions=np.array([one.points.shape[1] for one in seen]),
+        sigmas=sigmas.ravel(),
         weights=at.seen.swapaxes(0, 1).astype(np.float64),
         shares=shares.swapaxes(0, 1),
         places=at.y.swapaxes(0, 1),
         offsets=offsets.swapaxes(0, 1),
         J=(at.J / sigmas[..., None]).swapaxes(0, 1),
         crowd=np.stack(crowd, axis=1),
-        count=np.tile([float(len(one.points)) for one in seen], (len(shares[0]), 1)),
+        detections=np.zeros((at.seen.shape[1], 0), dtype=np.intp),
+        explained=np.zeros_like(counts),
+        merged=np.zeros(counts.shape, dtype=np.intp),
+        count=counts,
         unseen=np.count_nonzero(at.faced & ~at.seen, axis=2).T,
+        unmatched_nearby=np.zeros_like(counts),
+        finest=np.ones_like(counts),
     )

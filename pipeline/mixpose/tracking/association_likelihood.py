@@ -23,9 +23,16 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import Noise
 from mixpose.fit import Fit, NormalPrior, blur_schedule
-from mixpose.judgement import Case, DetectionModel, Judged, Residuals, judge, nearest_alike
+from mixpose.judgement import (
+    Case,
+    DetectionModel,
+    RememberedNoise,
+    ScoredPose,
+    judge,
+    nearest_alike,
+)
+from mixpose.matching import Noise
 from mixpose.objective import Quadratic, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import PointPattern
@@ -183,7 +190,7 @@ class AssociationLikelihood:
             found = ascend(posterior, perturb, found.state, data.free, _OPTIONS)
         return Fit(found.state, found.value, found.converged, found.iterations)
 
-    def judge(self, fit: Fit, start: Start) -> Judged:
+    def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by the sum over all associations, with the prior of the start."""
         data, T, free, model = self.data, fit.T_world_object, self.data.free, self.data.rules
         judged = judge(Case(data.finest, T), free, model.judgement)
@@ -208,9 +215,10 @@ class AssociationLikelihood:
             judged,
             covariance=covariance,
             log_evidence=log_odds + data.prior(T).log_density + float(volume),
-            residuals=Residuals({"": before.faded(memory).joined(noise)}),
+            noise=RememberedNoise(
+                ("",), memory * data.track.residuals.of(("",)) + [[noise.squares], [noise.degrees]]
+            ),
             spread=np.sqrt(np.diag(covariance)),
-            value=log_odds,
         )
 
     def _prior(self, start: Start) -> NormalPrior | None:

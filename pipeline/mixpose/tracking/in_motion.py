@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import errors_seen, sums_of
 from mixpose.fit import Fit
-from mixpose.judgement import Association, Judged, Matches, associate, nearest_alike
+from mixpose.judgement import ScoredPose, nearest_alike
 from mixpose.judgement.moments import inverses
+from mixpose.matching import Matches, associate, errors_seen
 from mixpose.objective import View
 from mixpose.records import DelaySeen
 from mixpose.rigid import Floats, perturb
@@ -114,8 +114,10 @@ def fit_in_motion(
             fit = climb(seen, T, _in_view(seen, T, expected))
             T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
         expected = data.expected(T)
-        found, _ = associate(seen.finest, T, data.rules.judgement.association)
-        offsets = offsets_of(seen, found, expected)
+        rules = data.rules.judgement
+        narrowest = rules.noise.errors.narrowest
+        matches = associate(seen.finest, T[None], rules.association, narrowest).at(0)
+        offsets = offsets_of(seen, matches, expected)
         change = _change(offsets, motion.velocity, expected, data.free)
         moved = float(np.abs(offsets.rows @ change * offsets.late).max(initial=0.0))
         T = np.asarray(perturb(T, offsets.followed(change, data.free)))
@@ -125,7 +127,7 @@ def fit_in_motion(
     return replace(fit, T_world_object=T, motion=motion)
 
 
-def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judged:
+def with_motion_unknown(judged: ScoredPose, data: FrameData, motion: Motion) -> ScoredPose:
     """A judged pose, as sure as its velocity lets it be."""
     free, expected = data.free, data.expected(judged.T_world_object)
     offsets, inner = offsets_of(data, judged.used, expected), np.ix_(free, free)
@@ -144,32 +146,33 @@ def with_motion_unknown(judged: Judged, data: FrameData, motion: Motion) -> Judg
     return replace(judged, covariance=covariance)
 
 
-def offsets_of(
-    data: FrameData, found: Sequence[Association], expected: Expected | None = None
-) -> Offsets:
+def offsets_of(data: FrameData, matches: Matches, expected: Expected | None = None) -> Offsets:
     """How far off features are met, as they pull, and when they were seen.
 
     What is farther off than noise and an expected velocity let it be counts for little.
     """
     names = [view.name for view in data.views]
-    chosen = [names.index(one.name) for one in found]
-    views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(found))
+    chosen = [names.index(name) for name in matches.names]
+    views, blurs = [(data.still or data).views[k] for k in chosen], np.ones(len(chosen))
     if expected is not None:
-        errors, known = data.rules.judgement.noise.errors, sums_of([data.noise[k] for k in chosen])
-        met = Matches.of([found]).residuals()
-        noise = errors_seen(met, int(data.free.sum()), known, errors).blurs
-        pairs = zip(found, views, strict=True)
-        unsure = [_unsure_by(one.J, one.places, view, expected) for one, view in pairs]
+        errors, known = data.rules.judgement.noise.errors, data.noise[:, chosen]
+        noise = errors_seen(matches, int(data.free.sum()), known, errors).blurs
+        unsure = []
+        for k, view in enumerate(views):
+            seen, m = matches.weights[k] > 0, int(matches.dimensions[k])
+            J = matches.sigmas[k] * matches.J[k, seen, :m]
+            unsure.append(_unsure_by(J, matches.places[k, seen, :m], view, expected))
         # a pose that was climbed to at another velocity is off by as much in all sensors
         blurs = np.minimum(np.hypot(noise, errors.blur * max(unsure, default=0.0)), 1.0)
     parts = []
-    for k, (one, view, blur) in enumerate(zip(found, views, blurs.tolist(), strict=True)):
-        seconds = moments(view.sensor, one.places, view.delay, view.readout)
-        pull = np.sqrt(one.shares * np.exp(-0.25 * one.squared / blur**2))
-        m = one.J.shape[1]
-        root = np.repeat(pull / one.sigma, m)
-        own = one.J.reshape(-1, 6) * root[:, None], np.repeat(seconds, m)
-        parts.append((*own, one.offsets.reshape(-1) * root, np.full(len(root), k)))
+    for k, (view, blur) in enumerate(zip(views, blurs.tolist(), strict=True)):
+        seen, m = matches.weights[k] > 0, int(matches.dimensions[k])
+        seconds = moments(view.sensor, matches.places[k, seen, :m], view.delay, view.readout)
+        pull = np.sqrt(matches.shares[k] * np.exp(-0.25 * matches.squared[k] / blur**2))
+        root = np.repeat(pull[seen], m)
+        rows = matches.J[k, seen, :m].reshape(-1, 6) * root[:, None]
+        offsets = matches.offsets[k, seen, :m].reshape(-1) * root
+        parts.append((rows, np.repeat(seconds, m), offsets, np.full(len(root), k)))
     rows, late, offsets, sensor = (np.concatenate(part) for part in zip(*parts, strict=True))
     delays = [(k, view.unsure) for k, view in enumerate(views) if view.unsure is not None]
     return Offsets(rows, late, offsets, sensor, tuple(delays))
@@ -256,14 +259,14 @@ class DelayEvidence:
             return applied
         return [replace(view, delay=0.0) for view in applied]
 
-    def joined(self, data: FrameData, best: Judged) -> DelayEvidence:
+    def joined(self, data: FrameData, best: ScoredPose) -> DelayEvidence:
         """With one more frame, whose best pose is known as well as its features say."""
         used = best.used
         is_asked = data.frame % SOME_FRAMES == 0 or is_timed(data.views)
-        if len(used) < 2 or not data.elapsed or not is_asked:
+        if len(used.names) < 2 or not data.elapsed or not is_asked:
             return self
         expected = data.expected(best.T_world_object)
-        own = {one.name: k for k, one in enumerate(used)}
+        own = {name: k for k, name in enumerate(used.names)}
         views = [view for view in data.views if view.name in own]
         told = [view.name for view in views if view.unsure is None]
         reference = self.reference or (told[0] if told else "")

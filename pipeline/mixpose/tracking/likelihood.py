@@ -15,21 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.density import Noise
 from mixpose.fit import Climbed, EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
-    Association,
     Case,
-    Judged,
     Prior,
-    associate,
+    ScoredPose,
     flat_prior,
     judge,
     nearest_alike,
 )
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.optimise import Ascent
-from mixpose.records import SensorReport
 from mixpose.rigid import Floats, twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
@@ -65,7 +61,7 @@ class Begun(NamedTuple):
 
     objective: MatchedObjective  # at σ_ε
     fit: Fit | None = None  # that this was climbed to with others'
-    judged: Judged | None = None  # the pose of that fit
+    judged: ScoredPose | None = None  # the pose of that fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +95,10 @@ class FrameData:
         return self.track.seconds_until(self.time_s)
 
     @cached_property
-    def noise(self) -> list[Noise]:
-        """What is remembered of each view's noise."""
-        memory, known = self.rules.judgement.noise.memory, self.track.residuals.noise
-        return [known.get(view.name, Noise()).faded(memory) for view in self.views]
+    def noise(self) -> Floats:
+        """What is remembered of each view's noise: squares in σ_ε², degrees of freedom (2, L)."""
+        names = [view.name for view in self.views]
+        return self.rules.judgement.noise.memory * self.track.residuals.of(names)
 
     @property
     def close(self) -> Floats:
@@ -242,6 +238,7 @@ class MatchedLikelihood:
                 noise=seen.noise,
                 beside=max(beside, given),
                 errors=seen.rules.judgement.noise.errors,
+                association=seen.rules.judgement.association,
                 rules=seen.rules.fit,
             )
 
@@ -249,31 +246,22 @@ class MatchedLikelihood:
             return fit_in_motion(data, start.T_world_object, climb)
         return climb(data, start.T_world_object)
 
-    def judge(self, fit: Fit, start: Start) -> Judged:
+    def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         begun = self.data.begun
         if begun is not None and fit is begun.fit and begun.judged is not None:
             return begun.judged
-        data = self.data.without(start.left_out)
+        data, motion = self.data, fit.motion
         T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
-        motion = fit.motion
         if is_timed(data.views):
             motion = motion or data.expected(T).at(T)
             data = data.in_motion(motion)
-        others: list[Association] = []
-        if start.left_out:
-            found, _ = associate(self.data.finest, T, data.rules.judgement.association)
-            others = [one for one in found if one.name in start.left_out]
         prior = data.prior(T if start.T_moved is None else start.T_moved)
-        case = Case(data.finest, T, data.track.residuals, prior, others)
+        case = Case(data.finest, T, data.track.residuals, prior, start.left_out)
+        if T is fit.T_world_object and motion is None and not start.left_out:
+            case = replace(case, matches=fit.matches, noise=fit.noise)
         judged = judge(case, data.free, data.rules.judgement)
-        if motion is not None:
-            judged = with_motion_unknown(judged, data, motion)
-        sensors = dict(judged.sensors)
-        for one in others:
-            why = start.left_out[one.name]
-            sensors[one.name] = SensorReport(False, one.explained, one.rms, why)
-        return replace(judged, sensors=sensors, associations=(*judged.associations, *others))
+        return judged if motion is None else with_motion_unknown(judged, data, motion)
 
 
 Likelihood: TypeAlias = MatchedLikelihood | AssociationLikelihood

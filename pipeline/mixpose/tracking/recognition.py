@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import Judged, is_far_off
+from mixpose.judgement import ScoredPose, is_far_off
 from mixpose.tracking.likelihood import FrameData, SearchLog, Start, likelihood_of
 from mixpose.tracking.proposers.searched import candidates_of, starts_at
 from mixpose.tracking.track import Track
@@ -31,13 +31,13 @@ _CORNERS = 3
 _FLAT = 1e-6  # thickness by length, below which no camera tells one side's markers from the other's
 
 
-def is_alone(data: FrameData, judged: Judged, sensors: int) -> bool:
+def is_alone(data: FrameData, judged: ScoredPose, sensors: int) -> bool:
     """Whether one of some sensors with a frame meets a body that none was sure of, as this."""
-    lonely = sensors > 1 and sum(one.met > 0 for one in judged.associations) == 1
+    lonely = sensors > 1 and np.count_nonzero(judged.matches.met) == 1
     return lonely and is_from_doubt(data, judged)
 
 
-def is_from_doubt(data: FrameData, judged: Judged) -> bool:
+def is_from_doubt(data: FrameData, judged: ScoredPose) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
     if data.track.believed:
         return False
@@ -45,11 +45,11 @@ def is_from_doubt(data: FrameData, judged: Judged) -> bool:
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
 
-def is_known(data: FrameData, judged: Judged) -> bool:
+def is_known(data: FrameData, judged: ScoredPose) -> bool:
     """Whether a pose is the body's, by what it meets or by where it was expected."""
-    if any(one.J.shape[1] == 1 for one in judged.associations):
+    if (judged.matches.dimensions == 1).any():
         return True  # ranges are no markers in space
-    others = np.sort(_met(judged, data.body))[:-_CORNERS]
+    others = np.sort(judged.matches.met_by)[:-_CORNERS]
     # one sensor of several may meet a marker by chance
     if not len(others) or others.sum() >= max(len(data.views) / 2, 1):
         return True
@@ -58,13 +58,14 @@ def is_known(data: FrameData, judged: Judged) -> bool:
     return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())
 
 
-def is_reflection(data: FrameData, judged: Judged) -> bool:
+def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
-    if not data.body.is_exact or not judged.associations or _is_flat(data.body):
+    if not data.body.is_exact or _is_flat(data.body):
         return False
-    ahead, met = data.rules.acceptance.standing_out, _met(judged, data.body)
+    ahead, seen = data.rules.acceptance.standing_out, judged.matches
+    met = seen.met_by
     # of these the mirror image may meet more than the body
-    if sum(min(one.missed, one.surplus) for one in judged.associations) > 0.5:
+    if np.minimum(seen.missed, seen.unmatched_nearby).sum() > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
@@ -93,27 +94,21 @@ def _is_flat(body: Body) -> bool:
     return len(extents) < 3 or bool(extents[2] < _FLAT * extents[0])
 
 
-def _is_by_chance(data: FrameData, judged: Judged) -> bool:
+def _is_by_chance(data: FrameData, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
-    rules, seen = data.rules, judged.associations
+    rules, seen = data.rules, judged.matches
     if judged.measurements - 6 > rules.proposals.by_chance:
         return False
-    if data.track.believed >= rules.proposals.believed or any(one.J.shape[1] != 2 for one in seen):
+    if data.track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
     before, noise = data.track.residuals.total, rules.judgement.noise
     off = is_far_off(seen, before, rules.acceptance, noise)
-    return off or any(one.missed > 0.5 for one in seen)
+    return off or bool((seen.missed > 0.5).any())
 
 
 def _evidence(data: FrameData, start: Start) -> float:
     likelihood = likelihood_of(data)
     return likelihood.judge(likelihood.fit(start), start).log_evidence
-
-
-def _met(judged: Judged, body: Body) -> NDArray[np.intp]:
-    """By how many sensors each node of a body was met (N,)."""
-    found = [one.features[one.shares > 0] for one in judged.associations]
-    return np.bincount(np.concatenate(found), minlength=len(body.nodes.points))
 
 
 def _reflected(body: Body, near: NDArray[np.bool_]) -> Body:

@@ -40,7 +40,10 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
             start = Start(expected.T_world_object, expected.uncertainty, expected)
             fits[k] = MatchedLikelihood(data).fit(start, ascent)
             T = nearest_alike(fits[k].T_world_object, data.body, data.T_reference)
-            cases.append(Case(data.finest, T, data.track.residuals, data.prior(T)))
+            case = Case(data.finest, T, data.track.residuals, data.prior(T))
+            if T is fits[k].T_world_object:
+                case = replace(case, matches=fits[k].matches, noise=fits[k].noise)
+            cases.append(case)
     judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
     for (k, fit), found in zip(fits.items(), judged, strict=True):
         begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, found))

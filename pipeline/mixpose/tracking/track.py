@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.judgement import Prior, Residuals, nearest_alike
+from mixpose.judgement import Prior, RememberedNoise, nearest_alike
 from mixpose.rigid import Floats, inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.in_motion import DelayEvidence
@@ -97,7 +97,7 @@ class Track:
     frame: int | None = None  # the last with a pose; None before the first
     time_s: float | None = None  # of that frame
     misses: int = 0  # frames since then
-    residuals: Residuals = Residuals()  # so far
+    residuals: RememberedNoise = RememberedNoise()  # so far
     walk: RandomWalk | None = None  # None before two uncertain poses
     tallies: Mapping[str, SensorTally] = field(default_factory=dict)  # of the last pose, by sensor
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces

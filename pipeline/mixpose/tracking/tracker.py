@@ -17,7 +17,7 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import APART, Judged, Verdict, contradict, decide, insert, is_sure
+from mixpose.judgement import APART, ScoredPose, Verdict, contradict, decide, insert, is_sure
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.rigid import Floats, is_rigid
@@ -139,7 +139,7 @@ class Tracker:
             estimate = replace(estimate, guesses=data.log.report)
         return followed, replace(estimate, delays=followed.delays.seconds())
 
-    def verdict(self, data: FrameData, ranked: Sequence[Judged]) -> Verdict:
+    def verdict(self, data: FrameData, ranked: Sequence[ScoredPose]) -> Verdict:
         """The decision about a frame from all its poses, the most evident first."""
         rules = self.rules.acceptance
         verdict = decide(ranked, self.free, rules)
@@ -158,18 +158,18 @@ class Tracker:
         apart = contradict(best, before, data.track.agreed, rules, noise)
         return verdict.doubted(APART if apart else "")
 
-    def ranked(self, data: FrameData, *, quickly: bool = False) -> list[Judged]:
+    def ranked(self, data: FrameData, *, quickly: bool = False) -> list[ScoredPose]:
         """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
         `quickly`: where the body is expected only.
         """
-        ranked: list[Judged] = []
+        ranked: list[ScoredPose] = []
         if not data.views:
             return ranked
         likelihood = likelihood_of(data)
         fits: list[Fit] = []
 
-        def consider(start: Start, name: str) -> Judged | None:
+        def consider(start: Start, name: str) -> ScoredPose | None:
             fit = likelihood.fit(start)
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
@@ -188,12 +188,14 @@ class Tracker:
                         consider(better, refine.__name__)
         return ranked
 
-    def again(self, data: FrameData, ranked: Sequence[Judged], *, fitted: bool) -> list[Judged]:
+    def again(
+        self, data: FrameData, ranked: Sequence[ScoredPose], *, fitted: bool
+    ) -> list[ScoredPose]:
         """The same poses judged by other views, and fitted to them, most evident first."""
         if not data.views:
             return []
         likelihood, close = likelihood_of(data), data.close if fitted else None
-        found: list[Judged] = []
+        found: list[ScoredPose] = []
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
             start = Start(one.T_world_object, close, left_out=left_out)
@@ -202,7 +204,7 @@ class Tracker:
         return found
 
     def estimate(
-        self, data: FrameData, views: Sequence[View], verdict: Verdict, ranked: Sequence[Judged]
+        self, data: FrameData, views: Sequence[View], verdict: Verdict, ranked: Sequence[ScoredPose]
     ) -> Estimate:
         """The estimate of a frame, with reports of the best pose, believed or not."""
         best = verdict.best
@@ -243,18 +245,17 @@ class Tracker:
             # what may be mere clutter counts as little in the next frame
             belief = weight * float(expit(one.log_evidence))
             spread = one.spread if self.options.fuse else None
-            momentary = np.diagonal(one.covariance - one.lasting)
+            momentary = np.diagonal(one.covariance - one.persistent)
             deviation = np.sqrt(momentary) if is_timed(data.views) else None
             found.append(Found(one.T_world_object, belief, spread, deviation))
-        tallies = {
-            one.name: SensorTally(int(np.count_nonzero(one.shares)), len(one.features))
-            for one in best.used
-        }
+        used = best.used
+        met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
+        tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
         # sensors whose delays are not known contradict each other until they are
         late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
         return replace(
             follow(data, found),
-            residuals=best.residuals if is_ok else track.residuals,
+            residuals=best.noise if is_ok else track.residuals,
             tallies=tallies,
             delays=track.delays.joined(data, best) if is_ok or late else track.delays,
             agreed=track.agreed or sum(one.is_met for one in tallies.values()) > 1,
@@ -292,14 +293,20 @@ class Tracker:
         return data
 
 
-def _offsets(judged: Judged, body: Body) -> dict[str, Offsets]:
+def _offsets(judged: ScoredPose, body: Body) -> dict[str, Offsets]:
     """By how much each sensor met the features of a body whose features are points."""
     if len(body.nodes.points) != len(body):
         return {}
-    return {
-        one.name: Offsets(one.features, one.shares > 0, one.offsets, one.J[..., :3])
-        for one in judged.used
-    }
+    used, offsets = judged.used, {}
+    for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
+        features = np.flatnonzero(used.weights[k])
+        offsets[name] = Offsets(
+            features,
+            used.shares[k, features] > 0,
+            sigma * used.offsets[k, features, :m],
+            sigma * used.J[k, features, :m, :3],
+        )
+    return offsets
 
 
 def estimate_pose(

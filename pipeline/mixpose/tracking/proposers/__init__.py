@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Protocol
 
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.mirrored import mirrored
@@ -26,7 +26,7 @@ class Proposer(Protocol):
 
     __name__: str
 
-    def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+    def __call__(self, data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
         """Where fits may begin; nothing where the proposer does not apply."""
 
 
@@ -35,7 +35,9 @@ class Refinement(Protocol):
 
     __name__: str
 
-    def __call__(self, data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
+    def __call__(
+        self, data: FrameData, likelihood: Likelihood, judged: ScoredPose
+    ) -> Iterable[Start]:
         """Where fits may begin; nothing where the pose leaves nothing to mend."""
 
 

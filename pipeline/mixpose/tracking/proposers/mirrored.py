@@ -11,17 +11,18 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.rigid import from_parts
 from mixpose.tracking.likelihood import FrameData, Start
 
 
-def mirrored(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+def mirrored(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
     """The best pose tilted the other way, where one camera alone meets a nearly flat body."""
     body, views = data.body, data.views
     if ranked and len(views) > 1:
         least = data.rules.acceptance.agreeing
-        met = {one.name for one in ranked[0].associations if one.coverage >= least}
+        seen = ranked[0].matches
+        met = {n for n, share in zip(seen.names, seen.coverage) if share >= least}
         views = [view for view in views if view.name in met]
     if not ranked or len(views) != 1 or views[0].sensor.dimension != 2:
         return []

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from mixpose.fit import blur_schedule
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.objective import matched_objective
 from mixpose.records import Floats
 from mixpose.rigid import perturb
@@ -16,7 +16,7 @@ from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
 
 
-def multistart(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+def multistart(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
     """The most promising poses around the first prediction, until something convinces."""
     if not data.predictions or not is_doubtful(data, ranked):
         return

@@ -10,26 +10,27 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mixpose.density import pooled, sums_of
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
+from mixpose.matching import pooled
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 
 
-def narrowed(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
+def narrowed(data: FrameData, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """The predictions at narrow blurs, where residuals are larger than chance makes them."""
     if not judged.is_unlike or not likelihood.knows_detections:
         return
     if any(view.observation.cell is not None for view in data.views):
         return
     errors = data.rules.judgement.noise.errors
-    variances = pooled(sums_of(data.noise), errors, errors.typical_degrees)
-    largest = {view.name: errors.outlying**2 * v for view, v in zip(data.views, variances)}
+    variances = pooled(data.noise, errors, errors.typical_degrees)
+    largest = errors.outlying**2 * variances[:, None]
     narrowest = errors.blur * float(np.sqrt(variances.max()))
     for one in data.predictions:
         for blur in [blur for blur in data.rules.proposals.blurs if blur > narrowest]:
             start = Start(one.T_world_object, one.uncertainty, blur=blur)
             found = likelihood.judge(likelihood.fit(start), start)
+            met = found.matches.shares > 0
+            off = np.count_nonzero(met & (found.matches.squared > largest), axis=1)
             # where all of a sensor are off it is out of step, and the others no better for it
-            off = ((one.squared[one.shares > 0], largest[one.name]) for one in found.associations)
-            if not any(np.count_nonzero(each > most) > len(each) / 2 for each, most in off):
+            if not (off > np.count_nonzero(met, axis=1) / 2).any():
                 yield Start(found.T_world_object)

@@ -7,13 +7,13 @@ from dataclasses import replace
 from functools import partial
 from operator import add
 
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.search import Candidate, SearchReport, SearchState, search_frame
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
 
 
-def searched(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+def searched(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Candidates of the search where nothing convinces yet."""
     return starts_at(data, candidates_of(data)) if is_doubtful(data, ranked) else []
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.rigid import from_parts
 from mixpose.tracking.likelihood import FrameData, Start
 
@@ -19,7 +19,7 @@ _PASSES = 2  # what has slipped by two steps; and all of them move as the best o
 ASIDE = "the body explains as much a step of its grid aside"
 
 
-def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+def stepped_aside(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
     """The best pose shifted by each step of the body's grid, where about as much is met there.
 
     All of them move alike.  Where the frame before left open which of them is right, motion does
@@ -30,7 +30,7 @@ def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
         if not ranked or ranked[0] is best:
             return
         best = ranked[0]
-        met = max((float(one.shares.sum()) for one in best.associations), default=0.0)
+        met = float(best.matches.met.max())
         if met < 1:
             return
         T, shifts = best.T_world_object, from_parts(np.eye(3), np.vstack([np.zeros(3), steps]))
@@ -41,7 +41,7 @@ def stepped_aside(data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
             yield Start(poses[1 + k], data.close, T_moved=data.moves_alike(T))
 
 
-def is_a_step(body: Body, judged: Judged, other: Judged) -> bool:
+def is_a_step(body: Body, judged: ScoredPose, other: ScoredPose) -> bool:
     """Whether one pose is another shifted by a step of the body's grid, within a tenth of it."""
     steps = body.grid_steps
     if not len(steps):

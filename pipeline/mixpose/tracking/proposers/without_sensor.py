@@ -6,52 +6,45 @@ out counts as missed in the evidence.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
+import numpy as np
 from scipy.special import fdtri
 
-from mixpose.judgement import AcceptanceRules, Association, Judged, NoiseModel
+from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose
+from mixpose.matching import Matches
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 
 OUT_OF_STEP = "out of step or bumped"
 
 
-def without_sensor(data: FrameData, likelihood: Likelihood, judged: Judged) -> Iterable[Start]:
+def without_sensor(data: FrameData, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """The pose fitted without the sensors that disagree with two others or more."""
     if not likelihood.knows_detections or len(data.views) < 3:
         return
-    if any(not report.used for report in judged.sensors.values()):
+    if judged.left_out:
         return  # some are left out already
     rules = data.rules
-    if apart := disagreeing(judged.associations, rules.acceptance, rules.judgement.noise):
+    if apart := disagreeing(judged.matches, rules.acceptance, rules.judgement.noise):
         yield Start(judged.T_world_object, data.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
 
 
-def disagreeing(
-    associations: Sequence[Association], rules: AcceptanceRules, model: NoiseModel
-) -> list[str]:
+def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
     """Sensors that see the body elsewhere than two others or more do.
 
     One that meets little of it, with as many detections beside it that belong to nothing; or one
     whose residuals are far larger than the others', more than chance would make them.
     """
-    agreeing = [one for one in associations if one.coverage >= rules.agreeing]
-    apart = [
-        one.name
-        for one in associations
-        if one.coverage < rules.agreeing
-        and one.expected > 0
-        and one.surplus >= rules.agreeing * one.missed
-    ]
-    for one in agreeing:
-        others = [other for other in agreeing if other is not one]
-        degrees = sum(other.measurements for other in others)
-        if len(others) < 2 or degrees == 0:
+    agreeing = seen.coverage >= rules.agreeing
+    apart = ~agreeing & (seen.expected > 0)
+    apart &= seen.unmatched_nearby >= rules.agreeing * seen.missed
+    squares, degrees = seen.squares * agreeing, seen.measurements * agreeing
+    for k in np.flatnonzero(agreeing & (degrees > 0)):
+        rest, own = float(degrees.sum() - degrees[k]), float(degrees[k])
+        if np.count_nonzero(agreeing) < 3 or rest == 0:
             continue
-        variance = sum(other.squares for other in others) / degrees
-        own = one.squares / one.measurements
-        limit = max(rules.disagreeing, float(fdtri(one.measurements, degrees, model.by_chance)))
-        if own > limit * max(variance, model.smallest**2):
-            apart.append(one.name)
-    left = [one for one in agreeing if one.name not in apart]
-    return apart if len(left) >= 2 else []
+        variance = float(squares.sum() - squares[k]) / rest
+        limit = max(rules.disagreeing, float(fdtri(own, rest, model.by_chance)))
+        apart[k] = squares[k] / own > limit * max(variance, model.smallest**2)
+    names = [seen.names[k] for k in np.flatnonzero(apart)]
+    return names if np.count_nonzero(agreeing & ~apart) >= 2 else []

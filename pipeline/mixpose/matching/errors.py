@@ -8,14 +8,14 @@ down and from what is known upwards, to where they agree.  Lengths are in σ_ε 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.constants import constant
-from mixpose.records import Floats, Indices
+from mixpose.matching.matches import Matches
+from mixpose.records import Floats
 
 _NOTHING = 1e-12
 _ALIKE = 1.2  # blurs that differ by less are the same
@@ -79,21 +79,7 @@ class Noise:
         return Noise(self.squares + other.squares, self.degrees + other.degrees)
 
 
-def sums_of(noises: Sequence[Noise]) -> Floats:
-    """Squares and degrees of freedom (2, L) of the noise of L sensors."""
-    return np.array([(one.squares, one.degrees) for one in noises]).T
-
-
-class Offsets(NamedTuple):
-    """Offsets of N features in L sensors."""
-
-    squared: Floats  # (L, N) in σ_ε²
-    shares: Floats  # (L, N) how far each feature was met
-    dimensions: Indices  # (L,) coordinates of each sensor
-    finest: Floats  # (L,) narrowest blur of each sensor, in σ_ε
-
-
-class Seen(NamedTuple):
+class NoiseEstimate(NamedTuple):
     """What offsets show."""
 
     own: Floats  # (2, L) squares, in σ_ε², and degrees of freedom of each sensor in this frame
@@ -103,13 +89,13 @@ class Seen(NamedTuple):
 
 
 def errors_seen(
-    offsets: Offsets, free: int, known: Floats, rules: ErrorRules = ErrorRules()
-) -> Seen:
+    matches: Matches, free: int, known: Floats, rules: ErrorRules = ErrorRules()
+) -> NoiseEstimate:
     """How large the extraction's errors are.
 
     Parameters
     ----------
-    offsets : Offsets
+    matches : Matches
         At a pose that was fitted to them.
     free : int
         Directions in which it was.
@@ -118,10 +104,10 @@ def errors_seen(
     rules : ErrorRules
     """
     before = rules.blur * np.sqrt(pooled(known, rules, rules.typical_degrees))
-    before = np.minimum(np.maximum(before, offsets.finest), 1.0)
-    blurs = np.ones(len(offsets.dimensions))
+    before = np.minimum(np.maximum(before, matches.finest), 1.0)
+    blurs = np.ones(len(matches.dimensions))
     while True:
-        seen = _seen_at(blurs, before, offsets, free, known, rules)
+        seen = _seen_at(blurs, before, matches, free, known, rules)
         if all((seen.blurs > 0.9 * blurs).tolist()):
             break
         blurs = np.minimum(seen.blurs, blurs)
@@ -129,18 +115,18 @@ def errors_seen(
     if all((seen.blurs <= _ALIKE * blurs).tolist()):
         return seen
     for _ in range(_ROUNDS):
-        narrow = _seen_at(blurs, before, offsets, free, known, rules)
+        narrow = _seen_at(blurs, before, matches, free, known, rules)
         if (narrow.blurs <= _ALIKE * blurs).all():
             break
         blurs = narrow.blurs
-    return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, offsets, free, rules))
+    return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, matches, free, rules))
 
 
 def _seen_at(
-    blurs: Floats, before: Floats, offsets: Offsets, free: int, known: Floats, rules: ErrorRules
-) -> Seen:
+    blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
+) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, shares, dimensions, finest = offsets
+    squared, shares, dimensions = matches.squared, matches.shares, matches.dimensions
     weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])
     totals, sums = weights.sum(axis=1).tolist(), (weights * squared).sum(axis=1).tolist()
     squares, degrees = [], []
@@ -159,25 +145,25 @@ def _seen_at(
     wide = np.maximum(variances, pooled(own, rules, 0.0))
     each = dimensions * totals + _NOTHING
     wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
-    blurs = np.minimum(np.maximum(rules.blur * np.sqrt(wide), finest), 1.0)
-    return Seen(own, variances, blurs, before)
+    blurs = np.minimum(np.maximum(rules.blur * np.sqrt(wide), matches.finest), 1.0)
+    return NoiseEstimate(own, variances, blurs, before)
 
 
 def log_likelihood(
-    blurs: Floats, offsets: Offsets, free: int, rules: ErrorRules = ErrorRules()
+    blurs: Floats, matches: Matches, free: int, rules: ErrorRules = ErrorRules()
 ) -> float:
     """Of offsets, normal ones and some that are anywhere, less that of none being noise.
 
     What a pose is free to fit is paid for.  Blurs (L,) go by the noise.
     """
-    m, variances = offsets.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2
+    m, variances = matches.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2
     peaks = (2 * np.pi * variances) ** (-0.5 * m)
     anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
-    odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * offsets.squared / variances)
-    believed = m * offsets.shares * odds / (1 + odds)
+    odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * matches.squared / variances)
+    believed = m * matches.shares * odds / (1 + odds)
     logs = believed * np.log(2 * np.pi * variances)
     price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), _NOTHING)
-    return float((offsets.shares * np.log1p(odds)).sum()) + price
+    return float((matches.shares * np.log1p(odds)).sum()) + price
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
