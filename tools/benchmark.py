@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from benchmarks import (  # noqa: E402
+    calls_case,
     memory_case,
     objective_case,
     pose_case,
@@ -35,6 +36,7 @@ from benchmarks import (  # noqa: E402
 CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "objective": objective_case.run,
     "pose": pose_case.run,
+    "calls": calls_case.run,
     "stream": stream_case.run,
     "search": search_rows.run,
     "scaling": scaling_case.run,

@@ -158,6 +158,12 @@ class Body:
         return found[[keeps_normals(T, points, self.node_normals) for T in found]]
 
     @cached_property
+    def identity(self) -> int:
+        """Which of the symmetries leaves the body as it is."""
+        away = np.abs(self.symmetries - np.eye(4)).max(axis=(1, 2))
+        return int(away.argmin())
+
+    @cached_property
     def grid_steps(self) -> Floats:
         """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
         tolerance = max(default_tolerance(self.means), self.spread)

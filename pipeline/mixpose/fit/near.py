@@ -263,7 +263,7 @@ def _to_the_noise(
     blurs, count = np.full(len(sigmas), blur), int(free.sum())
     likeliest, best = -np.inf, None
     while True:
-        matches = associate(finest, ascent.state[None], association, errors.narrowest).at(0)
+        matches = associate(finest, ascent.state, association, errors.narrowest)
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
             matches = replace(matches, finest=least)

@@ -137,8 +137,7 @@ def judge_together(
     """Judge poses that the same sensors see and take part in, at once: as `judge` does each."""
     narrowest, left_out = rules.noise.errors.narrowest, cases[0].left_out
     whole = [
-        one.matches
-        or associate(one.objective, one.T_world_object[None], rules.association, narrowest).at(0)
+        one.matches or associate(one.objective, one.T_world_object, rules.association, narrowest)
         for one in cases
     ]
     matches = Matches.stacked([taken_part(one, left_out) for one in whole])
@@ -220,7 +219,9 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     reference = np.eye(4) if T_reference is None else T_reference
     # the angle grows as the trace of the difference falls
     traces = np.einsum("ij,kij->k", reference[:3, :3], alike[:, :3, :3])
-    return np.asarray(alike[int(np.argmax(traces))])
+    nearest = int(np.argmax(traces))
+    # the very same, where it is that: what was worked out for it holds
+    return T_world_object if nearest == body.identity else np.asarray(alike[nearest])
 
 
 def beliefs(judged: Sequence[ScoredPose]) -> list[float]:

@@ -6,7 +6,6 @@ left of the density once the neighbours' share of it is taken off.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 from mixpose.density import MOST_SIGMAS, Observation, peak
 from mixpose.matching.matches import Matches
 from mixpose.matching.rules import AssociationRules
-from mixpose.objective import Match, MatchedObjective, View, in_image
+from mixpose.objective import Match, MatchedObjective, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
@@ -28,171 +27,175 @@ class _Detections(NamedTuple):
     """Detections of L sensors side by side, M at most."""
 
     points: Floats  # (L, M, 2)
-    number: Floats  # (L,) or as many equal features as would give the energy of grey values
+    number: Floats  # (L,)
+    crowd: Floats  # (L,) per m-th power of σ_ε, in the region of all
+    region: Floats  # (L, 1) what the side of a region counts at least, sensor units
     is_grid: tuple[bool, ...]
+    is_flat: tuple[bool, ...]  # of one coordinate
 
 
 def associate(
-    objective: MatchedObjective, poses: Floats, rules: AssociationRules, narrowest: float
+    objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what poses predict with what every sensor observed.
+    """Compare what a pose predicts with what every sensor observed.
 
     Parameters
     ----------
     objective : MatchedObjective
         At σ_ε of every sensor.
-    poses : (K, 4, 4) array
+    T_world_object : (4, 4) array
     rules : AssociationRules
     narrowest : float
         Narrowest blur of interest, σ_ε.
-
-    Returns
-    -------
-    Matches
-        With a leading axis over the poses.
     """
-    match, views = objective.match(poses), objective.views
-    at, sampled, over = match
-    sigmas, dimensions = np.sqrt(objective.variances / 2), objective.projection.dimensions
-    energies = objective.energies
-    detections = _side_by_side(tuple(view.observation for view in views))
-    product = (sampled[..., 0] * at.weights).sum(axis=2)
-    explained = np.minimum(np.maximum(product, 0.0) ** 2 / (energies * over.norm), 1.0)
-    shares, offsets, by, partner = _met(objective, match, poses, product, detections, rules)
-    box = _boxes(at.y, at.seen)
-    J = at.J / sigmas[..., None, None, None]
-    if (partner >= 0).any():
-        k, h, i = np.nonzero(partner >= 0)
-        J[k, h, i] = (J[k, h, i] + at.J[k, h, partner[k, h, i]] / sigmas[k, 0, None, None]) / 2
-    equal = objective.tops / energies
-    count, crowd = _crowding(views, box, sigmas, dimensions, detections, equal, rules)
-    hidden = at.faced & ~at.seen
-    away = (objective.projection.body.nodes.weights * hidden).sum(axis=2)
-    complete = np.count_nonzero(shares, axis=2) == np.count_nonzero(at.seen, axis=2)
-    nearby = np.zeros(product.shape)
-    if not complete.all():
-        met = shares.sum(axis=2)
-        nearby = np.where(complete, 0.0, _unmatched(box, dimensions, detections, met, rules))
-    extent = (box[1] - box[0]).max(axis=2)
-    finest = np.minimum(np.maximum(narrowest, extent / (MOST_SIGMAS * sigmas)), 1.0)
-    finest[~at.seen.any(axis=2) | np.array(detections.is_grid)[:, None]] = 1.0
-    by_sensor = {
-        "weights": at.weights,
-        "shares": shares,
-        "places": at.y,
-        "offsets": offsets / sigmas[..., None, None],
-        "J": J,
-        "detections": by,
-        "explained": explained,
-        "unseen": away,
-        "merged": np.count_nonzero(partner >= 0, axis=2) // 2,
-        "count": count,
-        "crowd": crowd,
-        "unmatched_nearby": nearby,
-        "finest": finest,
-    }
+    match, views = objective.match(T_world_object[None]), objective.views
+    at, y, seen, weights = match.at, match.at.y[:, 0], match.at.seen[:, 0], match.at.weights[:, 0]
+    sigmas = np.array([view.observation.sigma for view in views])
+    detections = _side_by_side(tuple([view.observation for view in views]), rules)
+    product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
+    energy, norm = objective.energies[:, 0], match.over.norm[:, 0]
+    explained = np.minimum(np.maximum(product, 0.0) ** 2 / (energy * norm), 1.0)
+    shares, offsets, by, partner = _met(
+        objective, match, T_world_object, product, detections, rules
+    )
+    J, merged = at.J[:, 0] / sigmas[:, None, None, None], np.zeros(len(views), dtype=np.intp)
+    paired = np.nonzero(partner >= 0)
+    if len(paired[0]):
+        J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
+        merged = np.bincount(paired[0], minlength=len(views)) // 2
+    if seen.all():
+        lower, upper = y.min(axis=1), y.max(axis=1)
+        hidden, blind = np.zeros(len(views)), None
+    else:
+        lower, upper, blind = _box(y, seen)
+        hidden = (at.faced[:, 0] & ~seen) @ objective.projection.body.nodes.weights
+    finest = np.maximum(narrowest, (upper - lower).max(axis=1) / (MOST_SIGMAS * sigmas))
+    finest = np.minimum(finest, 1.0)
+    if blind is not None:
+        finest[blind] = 1.0
+    crowd, nearby = _around(lower, upper, sigmas, detections, rules)
+    missing = np.count_nonzero(shares, axis=1) < np.count_nonzero(seen, axis=1)
+    nearby = np.where(missing, np.maximum(nearby - shares.sum(axis=1), 0.0), 0.0)
+    count = detections.number
+    if any(detections.is_grid):
+        count, crowd = _of_grids(objective, count, crowd, rules)
+        finest[list(detections.is_grid)] = 1.0
     return Matches(
-        tuple([view.name for view in views]),
-        dimensions,
-        sigmas[:, 0],
-        by_calibration=_by_calibration(objective, poses, sigmas),
-        **{name: array.swapaxes(0, 1) for name, array in by_sensor.items()},
+        names=tuple([view.name for view in views]),
+        dimensions=objective.projection.dimensions,
+        sigmas=sigmas,
+        weights=weights,
+        shares=shares,
+        places=y,
+        offsets=offsets / sigmas[:, None, None],
+        J=J,
+        detections=by,
+        explained=explained,
+        unseen=hidden,
+        merged=merged,
+        count=count,
+        crowd=crowd,
+        unmatched_nearby=nearby,
+        finest=finest,
+        by_calibration=_by_calibration(objective, T_world_object, sigmas),
     )
 
 
 @lru_cache(maxsize=8)
-def _side_by_side(observations: tuple[Observation, ...]) -> _Detections:
+def _side_by_side(observations: tuple[Observation, ...], rules: AssociationRules) -> _Detections:
     patterns = [one.pattern for one in observations]
     points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
+    sigmas = np.array([one.sigma for one in observations])
     side = np.full((len(points), max(map(len, points)), 2), _FAR)
-    for row, some in zip(side, points, strict=True):
-        row[: len(some), : some.shape[1]] = some
-        row[: len(some), some.shape[1] :] = 0.0
-    counts = np.array([float(len(some)) for some in points])
-    return _Detections(side, counts, tuple([one.cell is not None for one in observations]))
+    crowd, region = np.zeros(len(points)), rules.min_region * sigmas
+    for k, some in enumerate(points):
+        m = some.shape[1]
+        side[k, : len(some), :m], side[k, : len(some), m:] = some, 0.0
+        if len(some):
+            extent = np.maximum(np.ptp(some, axis=0), region[k])
+            crowd[k] = len(some) / float(extent.prod()) * sigmas[k] ** m
+    return _Detections(
+        side,
+        np.array([float(len(some)) for some in points]),
+        crowd,
+        region[:, None],
+        tuple([one.cell is not None for one in observations]),
+        tuple([one.dimension == 1 for one in observations]),
+    )
 
 
 def _met(
     objective: MatchedObjective,
     match: Match,
-    poses: Floats,
+    T_world_object: Floats,
     product: Floats,
     detections: _Detections,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Indices, Indices]:
-    """Shares, offsets in sensor units, detections and partners of features in merged pairs."""
-    at, body = match.at, objective.projection.body
-    shares, offsets = np.zeros(at.weights.shape), np.zeros(at.y.shape)
-    by, partner = np.full((2, *at.weights.shape), -1)
-    is_open = at.seen & (product > 0)[..., None]
+    """Shares, offsets in sensor units, detections, and partners of features in merged pairs."""
+    at, variances = match.at, objective.variances
+    y, weights = at.y[:, 0], at.weights[:, 0]
+    shares, offsets = np.zeros(weights.shape), np.zeros(y.shape)
+    by, partner = np.full((2, *weights.shape), -1)
+    is_open = at.seen[:, 0] & (product > 0)[:, None]
     if detections.points.shape[1]:
-        reach = rules.reach_squared * objective.variances[..., None]
-        if body.spread:
-            spreads = np.array([body.node_spreads(T) for T in poses])
-            reach = reach + rules.reach_squared * _spread(objective, at.J, spreads)
-        _to_nearest(match, detections, reach, is_open, rules, (shares, offsets, by, partner))
+        reach = rules.reach_squared * variances
+        if objective.projection.body.spread:
+            reach = reach + rules.reach_squared * _spread(objective, at.J[:, 0], T_world_object)
+        _to_nearest(y, weights, detections, reach, is_open, rules, (shares, offsets, by, partner))
     unlike = all(detections.is_grid)
-    for k in np.flatnonzero(detections.is_grid):
-        m = int(objective.projection.dimensions[k])
-        for h in range(len(poses)):
-            of = np.flatnonzero(is_open[k, h])
-            if len(of):
-                amplitude = product[k, h] / match.over.norm[k, h]
-                shares[k, h, of], offsets[k, h, of, :m] = _residuals(
-                    at.y[k, h, of, :m],
-                    at.weights[k, h, of],
-                    float(objective.variances[k, 0]),
-                    match.sampled[k, h, of, : 1 + m],
-                    float(amplitude),
-                    rules,
-                    unlike,
-                )
+    for k in np.flatnonzero(detections.is_grid) if any(detections.is_grid) else ():
+        of, m = np.flatnonzero(is_open[k]), int(objective.projection.dimensions[k])
+        if len(of):
+            amplitude, variance = product[k] / match.over.norm[k, 0], float(variances[k, 0])
+            sampled = match.sampled[k, 0, of, : 1 + m]
+            shares[k, of], offsets[k, of, :m] = _residuals(
+                y[k, of, :m], weights[k, of], variance, sampled, float(amplitude), rules, unlike
+            )
     return shares, offsets, by, partner
 
 
-def _spread(objective: MatchedObjective, J: Floats, spreads: Floats) -> Floats:
-    """Variances (L, H, n) along an axis by which features of a body that gives way may be off."""
-    m = objective.projection.dimensions
-    return np.array([in_image(spreads, own[..., :size, :]) for own, size in zip(J, m.tolist())])
+def _spread(objective: MatchedObjective, J: Floats, T_world_object: Floats) -> Floats:
+    """Variances (L, n) along an axis by which features of a body that gives way may be off."""
+    spreads = objective.projection.body.node_spreads(T_world_object)
+    m = objective.projection.dimensions.tolist()
+    return np.array([in_image(spreads, own[..., :size, :]) for own, size in zip(J, m)])
 
 
 def _to_nearest(
-    match: Match,
+    y: Floats,
+    weights: Floats,
     detections: _Detections,
     reach: Floats,
     is_open: Mask,
     rules: AssociationRules,
-    found: tuple[Floats, Floats, Indices, Indices],
+    result: tuple[Floats, Floats, Indices, Indices],
 ) -> None:
     """Features met by the nearest detections, each taken once; two that share one, in pairs.
 
-    `reach` (L, H, n) is squared, in sensor units; arrays that are `found` are written to.
+    `reach` (L, n) is squared, in sensor units; the arrays of the result are written to.
     """
-    at, (shares, offsets, by, partner) = match.at, found
-    away = detections.points[:, None, None] - at.y[..., None, :]
-    squared = (away * away).sum(axis=-1)
+    shares, offsets, by, partner = result
+    away = detections.points[:, None] - y[:, :, None]
+    squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
-    if not len(pairs[0]):
+    k, i, j = pairs
+    if not len(k):
         return
-    k, h, i, j = pairs
-    row = k * at.y.shape[1] + h
-    features = row * at.y.shape[2] + i
-    chosen = _once_each(features, row * squared.shape[3] + j, squared[pairs])
-    at_chosen = k[chosen], h[chosen], i[chosen]
-    shares[at_chosen] = at.weights[at_chosen]
-    offsets[at_chosen] = away[(*at_chosen, j[chosen])]
-    by[at_chosen] = j[chosen]
+    features, taken = k * y.shape[1] + i, k * squared.shape[2] + j
+    chosen = _once_each(features, taken, squared[pairs])
+    at = k[chosen], i[chosen]
+    shares[at], offsets[at], by[at] = weights[at], away[(*at, j[chosen])], j[chosen]
     if rules.merged and len(chosen) < len(features):
         # only a feature near a detection that is taken can share it
-        left = np.flatnonzero(shares[k, h, i] == 0)
-        for a, b in sorted(set(zip(k[left].tolist(), h[left].tolist()))):
-            of = np.flatnonzero(is_open[a, b])
-            own = [np.array(one[a, b, of]) for one in found]
-            limits = np.broadcast_to(reach, is_open.shape)[a, b, of]
-            _run_together(at.y[a, b, of], at.weights[a, b, of], limits, *own)
-            for one, part in zip(found[:3], own, strict=False):
-                one[a, b, of] = part
-            partner[a, b, of] = np.where(own[3] >= 0, of[own[3]], -1)
+        left = shares[k, i] == 0
+        for row in np.unique(k[left]).tolist():
+            of = np.flatnonzero(is_open[row])
+            own = [np.array(array[row, of]) for array in result]
+            limits = np.broadcast_to(reach, weights.shape)[row, of]
+            _run_together(y[row, of], weights[row, of], limits, *own)
+            shares[row, of], offsets[row, of], by[row, of] = own[:3]
+            partner[row, of] = np.where(own[3] >= 0, of[own[3]], -1)
 
 
 def _once_each(features: Indices, detections: Indices, squared: Floats) -> Indices:
@@ -279,38 +282,52 @@ def _residuals(
     return np.where(is_met, shares * weights, 0.0), np.where(is_met[:, None], offsets, 0.0)
 
 
-def _boxes(y: Floats, seen: Mask) -> tuple[Floats, Floats]:
-    """Corners (L, H, 2) of the boxes around the features in view; 0 where there is none."""
-    visible, some = seen[..., None], seen.any(axis=2)[..., None]
-    lower = np.where(visible, y, np.inf).min(axis=2)
-    upper = np.where(visible, y, -np.inf).max(axis=2)
-    return np.where(some, lower, 0.0), np.where(some, upper, 0.0)
+def _box(y: Floats, seen: Mask) -> tuple[Floats, Floats, Mask]:
+    """Corners (L, 2) of the box around the features in view, and which sensors have none."""
+    blind = ~seen.any(axis=1)
+    lower = np.where(seen[..., None], y, np.inf).min(axis=1)
+    upper = np.where(seen[..., None], y, -np.inf).max(axis=1)
+    lower[blind], upper[blind] = 0.0, 0.0
+    return lower, upper, np.asarray(blind)
 
 
-def _crowding(
-    views: Sequence[View],
-    box: tuple[Floats, Floats],
+def _around(
+    lower: Floats,
+    upper: Floats,
     sigmas: Floats,
-    dimensions: Indices,
     detections: _Detections,
-    equal: Floats,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats]:
-    """Number of detections (L, H), and how many per m-th power of σ_ε around the prediction."""
-    count = np.tile(detections.number[:, None], (1, box[0].shape[1]))
-    crowd = np.zeros(count.shape)
-    for k, (view, m, sigma) in enumerate(zip(views, dimensions.tolist(), sigmas[:, 0].tolist())):
-        lower, upper = (corner[k, :, :m] for corner in box)
-        smallest = rules.min_region * sigma
-        if detections.is_grid[k]:  # as many equal features as would give the energy
-            near, far = view.observation.extent
+    """How dense detections (L,) are around the body, and how many lie there.
+
+    They are counted in its box, per m-th power of σ_ε, where they are denser than elsewhere; and in
+    the box and as far around it as a grid may slip.
+    """
+    size = upper - lower
+    sides = np.maximum(size, detections.region)
+    middle, flat = (lower + upper) / 2, list(detections.is_flat)
+    away = np.abs(detections.points - middle[:, None])
+    inside = np.count_nonzero((away <= sides[:, None] / 2).all(axis=2), axis=1)
+    scaled = sides / sigmas[:, None]
+    if any(flat):
+        scaled[flat, 1] = 1.0
+    dense = inside / (scaled[:, 0] * scaled[:, 1]) if rules.crowded else 0.0
+    half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
+    near = np.count_nonzero((away <= half[:, None]).all(axis=2), axis=1).astype(np.float64)
+    near[flat] = 0.0
+    return np.maximum(detections.crowd, dense), near
+
+
+def _of_grids(
+    objective: MatchedObjective, count: Floats, crowd: Floats, rules: AssociationRules
+) -> tuple[Floats, Floats]:
+    """The same of grey values: as many equal features as would give their energy."""
+    count, equal = count.copy(), (objective.tops / objective.energies)[:, 0]
+    for k, view in enumerate(objective.views):
+        if view.observation.cell is not None:
+            near, far = (corner / view.observation.sigma for corner in view.observation.extent)
             count[k] = equal[k]
-            crowd[k] = equal[k] / float(np.maximum(far - near, smallest).prod()) * sigma**m
-            continue
-        points = detections.points[k, : int(detections.number[k]), :m]
-        if not rules.crowded:
-            lower, upper = points.min(axis=0)[None], points.max(axis=0)[None]
-        crowd[k] = crowding(points, lower, upper, smallest) * sigma**m
+            crowd[k] = equal[k] / float(np.maximum(far - near, rules.min_region).prod())
     return count, crowd
 
 
@@ -334,34 +351,19 @@ def crowding(points: Floats, lower: Floats, upper: Floats, smallest: float) -> F
     return np.asarray(np.maximum(overall, inside / sides.prod(axis=1)))
 
 
-def _unmatched(
-    box: tuple[Floats, Floats],
-    dimensions: Indices,
-    detections: _Detections,
-    met: Floats,
-    rules: AssociationRules,
-) -> Floats:
-    """Detections (L, H) not met in the box of the body, and as far around it as a grid may slip."""
-    lower, upper = box
-    size = upper - lower
-    half = size / 2 + rules.slip * size.max(axis=2, keepdims=True)
-    away = np.abs(detections.points[:, None] - ((lower + upper) / 2)[:, :, None])
-    inside = np.count_nonzero((away <= half[:, :, None]).all(axis=3), axis=2)
-    return np.where(dimensions[:, None] == 2, np.maximum(inside - met, 0.0), 0.0)
-
-
-def _by_calibration(objective: MatchedObjective, poses: Floats, sigmas: Floats) -> Floats | None:
-    """By how much features are elsewhere (K, L, N, 2, Q), in σ_ε, for calibrations that are off."""
+def _by_calibration(
+    objective: MatchedObjective, T_world_object: Floats, sigmas: Floats
+) -> Floats | None:
+    """By how much features are elsewhere (L, N, 2, Q), in σ_ε, for calibrations that are off."""
     views = objective.views
     if not any(view.doubts for view in views):
         return None
-    points = objective.projection.body.nodes.points
-    shape = len(poses), len(views), len(points), 2
-    offs = []
+    points = transform(T_world_object, objective.projection.body.nodes.points)
+    columns = []
     for k, view in enumerate(views):
         if view.doubts:
-            shifts = np.array([by_calibration(view.doubts, transform(T, points)) for T in poses])
-            own = np.zeros((*shape, shifts.shape[3]))
-            own[:, k, :, : shifts.shape[2]] = shifts / sigmas[k, 0]
-            offs.append(own)
-    return np.concatenate(offs, axis=-1)
+            shifts = by_calibration(view.doubts, points)
+            own = np.zeros((len(views), len(points), 2, shifts.shape[2]))
+            own[k, :, : shifts.shape[1]] = shifts / sigmas[k]
+            columns.append(own)
+    return np.concatenate(columns, axis=-1)

@@ -108,11 +108,11 @@ def errors_seen(
     blurs = np.ones(len(matches.dimensions))
     while True:
         seen = _seen_at(blurs, before, matches, free, known, rules)
-        if all((seen.blurs > 0.9 * blurs).tolist()):
+        if (seen.blurs > 0.9 * blurs).all():
             break
         blurs = np.minimum(seen.blurs, blurs)
     blurs = before
-    if all((seen.blurs <= _ALIKE * blurs).tolist()):
+    if (seen.blurs <= _ALIKE * blurs).all():
         return seen
     for _ in range(_ROUNDS):
         narrow = _seen_at(blurs, before, matches, free, known, rules)
@@ -126,25 +126,22 @@ def _seen_at(
     blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, shares, dimensions = matches.squared, matches.shares, matches.dimensions
-    weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])
-    totals, sums = weights.sum(axis=1).tolist(), (weights * squared).sum(axis=1).tolist()
-    squares, degrees = [], []
-    for total, weighted, m, blur in zip(totals, sums, dimensions.tolist(), blurs.tolist()):
-        q = weighted / max(m * total, _NOTHING)
-        # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
-        factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))
-        # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
-        degrees.append(factor ** (m / 2) * m * total)
-        squares.append(factor * q * degrees[-1])
-    most = sum(degrees)
+    squared, m = matches.squared, matches.dimensions
+    variances = blurs * blurs
+    weights = matches.shares * np.exp(squared * (-0.25 / variances)[:, None])
+    coordinates = m * weights.sum(axis=1) + _NOTHING
+    q = (weights * squared).sum(axis=1) / coordinates
+    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+    factor = 1 / (1 - np.minimum(0.5 * q / variances, 0.5))
+    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+    degrees = factor ** (m / 2) * coordinates
+    most = float(degrees.sum())
     left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
-    own = np.array([squares if left else [0.0] * len(squares), [one * left for one in degrees]])
+    own = np.array([factor * q * degrees if left else 0.0 * q, degrees * left])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
-    each = dimensions * totals + _NOTHING
-    wide += rules.shared * (float(wide @ each) / float(each.sum()) - wide)
+    wide += rules.shared * (float(wide @ coordinates) / float(coordinates.sum()) - wide)
     blurs = np.minimum(np.maximum(rules.blur * np.sqrt(wide), matches.finest), 1.0)
     return NoiseEstimate(own, variances, blurs, before)
 
@@ -172,9 +169,9 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
     that of all sensors, in degrees of freedom.
     """
-    squares, degrees = sums.tolist()
-    most = sum(degrees) + typical
-    common = (sum(squares) + typical * rules.typical**2) / max(most, _NOTHING)
+    squares, degrees = sums
+    total_squares, total_degrees = sums.sum(axis=1).tolist()
+    most = total_degrees + typical
+    common = (total_squares + typical * rules.typical**2) / max(most, _NOTHING)
     pull = min(rules.typical_degrees, most)
-    pairs = zip(squares, degrees)
-    return np.array([(one + pull * common) / max(d + pull, _NOTHING) for one, d in pairs])
+    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, _NOTHING))

@@ -9,7 +9,7 @@ Jacobians are in σ_ε of their sensor; a sensor of one coordinate has 0 as its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -82,36 +82,36 @@ class Matches:
 
     def at(self, pose: int) -> Matches:
         """At one of K poses."""
-        return self._each(lambda array: array[pose])
+        return self._part(pose)
 
-    def of_sensors(self, chosen: Sequence[int] | NDArray[np.bool_] | Indices) -> Matches:
+    def of_sensors(self, chosen: Sequence[int]) -> Matches:
         """Some of the sensors, at one pose."""
-        numbers = np.arange(len(self.names))[np.asarray(chosen)]
-        some = self._each(lambda array: array[numbers])
-        names = tuple(self.names[k] for k in numbers)
-        return replace(
-            some, names=names, dimensions=self.dimensions[numbers], sigmas=self.sigmas[numbers]
-        )
+        numbers = list(chosen)
+        names = tuple([self.names[k] for k in numbers])
+        per_sensor = self.dimensions[numbers], self.sigmas[numbers]
+        some = self._part(numbers)
+        return replace(some, names=names, dimensions=per_sensor[0], sigmas=per_sensor[1])
 
-    def _each(self, part: Callable[[Any], Any]) -> Matches:
-        arrays = {name: getattr(self, name) for name in _PER_POSE}
-        chosen = {name: part(array) for name, array in arrays.items() if array is not None}
-        return Matches(self.names, self.dimensions, self.sigmas, **chosen)
+    def _part(self, index: int | list[int]) -> Matches:
+        parts: list[Any] = [getattr(self, name) for name in _PER_POSE]
+        parts = [None if array is None else array[index] for array in parts]
+        return Matches(self.names, self.dimensions, self.sigmas, *parts)
 
     @classmethod
     def stacked(cls, poses: Sequence[Matches]) -> Matches:
         """K poses of the same sensors, of bodies of their own; fewer features are filled up."""
-        most = max(one.weights.shape[-1] for one in poses)
-        arrays = {}
+        first, most = poses[0], max([one.weights.shape[-1] for one in poses])
+        arrays: list[Any] = []
         for name in _PER_POSE:
             parts = [getattr(one, name) for one in poses]
             if any(part is None for part in parts):
-                continue
-            if name in _PER_FEATURE:
-                parts = [_filled(part, most, -1 if name == "detections" else 0) for part in parts]
-            arrays[name] = np.stack(parts)
-        first = poses[0]
-        return cls(first.names, first.dimensions, first.sigmas, **arrays)
+                arrays.append(None)
+            elif len(poses) == 1:
+                arrays.append(parts[0][None])
+            else:
+                filled = [_filled(part, most, name) for part in parts]
+                arrays.append(np.stack(filled))
+        return cls(first.names, first.dimensions, first.sigmas, *arrays)
 
     @cached_property
     def squared(self) -> Floats:
@@ -171,10 +171,9 @@ _PER_POSE = tuple(one.name for one in fields(Matches))[3:]
 _PER_FEATURE = ("weights", "shares", "places", "offsets", "J", "detections", "by_calibration")
 
 
-def _filled(array: NDArray[np.generic], count: int, value: int) -> NDArray[np.generic]:
-    """An array (L, N, ...) with `count` features."""
-    missing = count - array.shape[1]
-    if not missing:
+def _filled(array: NDArray[Any], count: int, name: str) -> NDArray[Any]:
+    """An array (L, N, ...) with `count` features; one (L,) as it is."""
+    if name not in _PER_FEATURE or array.shape[1] == count:
         return array
-    width = [(0, 0), (0, missing)] + [(0, 0)] * (array.ndim - 2)
-    return np.pad(array, width, constant_values=value)
+    width = [(0, 0), (0, count - array.shape[1])] + [(0, 0)] * (array.ndim - 2)
+    return np.pad(array, width, constant_values=-1 if name == "detections" else 0)

@@ -188,5 +188,5 @@ def _association(view: View, body: Body, T: Floats) -> Matches | None:
         return None
     objective = matched_objective([view], body, [view.observation.sigma])
     rules = JudgementRules()
-    found = associate(objective, T[None], rules.association, rules.noise.errors.narrowest).at(0)
+    found = associate(objective, T, rules.association, rules.noise.errors.narrowest)
     return found if found.weights.any() else None

@@ -116,7 +116,7 @@ def fit_in_motion(
         expected = data.expected(T)
         rules = data.rules.judgement
         narrowest = rules.noise.errors.narrowest
-        matches = associate(seen.finest, T[None], rules.association, narrowest).at(0)
+        matches = associate(seen.finest, T, rules.association, narrowest)
         offsets = offsets_of(seen, matches, expected)
         change = _change(offsets, motion.velocity, expected, data.free)
         moved = float(np.abs(offsets.rows @ change * offsets.late).max(initial=0.0))
