@@ -145,9 +145,12 @@ def odds_of(
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
     is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
-    even = found.weights / np.maximum(found.weights.sum(axis=2, keepdims=True), 1.0)
-    missed = np.where(is_blind, even * detection.log_blind, missed).sum(axis=1)
-    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
+    shares = found.shares
+    if is_blind.any():
+        even = found.weights / np.maximum(found.expected, 1.0)[..., None]
+        missed = np.where(is_blind, even * detection.log_blind, missed)
+        gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, shares)
+    missed = missed.sum(axis=1)
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
     gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
@@ -168,9 +171,9 @@ def odds_of(
 
 def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
     """What offsets (K, L, N) cost: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
-    offsets = found.offsets / roots[..., None, None]
     if spreads is None:
-        return np.asarray((offsets**2).sum(axis=3) / 2)
+        return np.asarray(found.squared / (2 * roots**2)[..., None])
+    offsets = found.offsets / roots[..., None, None]
     by_world = found.J[..., :3] / roots[..., None, None, None]
     S = np.eye(offsets.shape[3]) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
     r = offsets[..., None]
@@ -196,14 +199,17 @@ def _in_space(
     met, J, r = near[at], found.J[at][..., :3] / roots[..., None], found.offsets[at] / roots
     rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
     A = np.eye(3) / sizes[:, None, None] ** 2 + rows @ rows.swapaxes(1, 2)
-    place = np.linalg.solve(A, rows @ r.reshape(len(pose), -1, 1))
+    pull = rows @ r.reshape(len(pose), -1, 1)
+    place = np.linalg.solve(A, pull)
     share = (met * found.shares[at]).max(axis=1)
     # detections per area, of which each has a depth
-    across = 0.5 * np.log(np.maximum(np.linalg.det(J @ J.swapaxes(2, 3)), 1e-300))
+    (aa, ab), (_, bb) = (J @ J.swapaxes(2, 3)).transpose(2, 3, 0, 1)
+    across = 0.5 * np.log(np.maximum(aa * bb - ab * ab, 1e-300))
     rarity = np.log(sizes)[:, None] - np.log(np.maximum(crowd[pose], 1e-300)) - across
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
         A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads[chosen], A))
-    away = (place * (A @ place)).sum(axis=(1, 2))
+        pull = A @ place
+    away = (place * pull).sum(axis=(1, 2))
     tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
     log_rarity = np.where(met, rarity, -np.inf).max(axis=1)
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share

@@ -5,6 +5,7 @@ The formulae stand in `noise`; here they are worked out for K frames at once.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -113,11 +114,19 @@ def _fields(places: Floats, shares: Floats, dimensions: NDArray[np.intp]) -> tup
     away /= np.maximum(size, LEAST)[..., None, None]
     by_feature = np.concatenate([np.ones((*away.shape[:3], 1)), away], axis=3)
     by_feature *= np.sqrt(shares)[..., None]
-    axes = np.arange(most) < dimensions[:, None]
-    own = np.einsum("lk,ij,li->likj", np.eye(sensors), np.eye(most), axes)
-    fields = by_feature[:, :, :, None, None, None] * own[:, None, ..., None]
-    kinds = np.tile(np.repeat(np.eye(2), [1, most], axis=0), (sensors * most, 1))
+    columns, kinds = _columns(tuple(dimensions.tolist()), most)
+    fields = by_feature[:, :, :, None, None, None] * columns[:, None, ..., None]
     return fields.reshape(frames, sensors * n * most, -1), kinds
+
+
+@lru_cache(maxsize=64)
+def _columns(dimensions: tuple[int, ...], most: int) -> tuple[Floats, Floats]:
+    """Which rows (L, m) each sensor's columns (L, m) are of, and the kinds of these."""
+    sensors = len(dimensions)
+    axes = np.arange(most) < np.array(dimensions)[:, None]
+    columns = np.einsum("lk,ij,li->likj", np.eye(sensors), np.eye(most), axes)
+    kinds = np.tile(np.repeat(np.eye(2), [1, most], axis=0), (sensors * most, 1))
+    return columns, kinds
 
 
 def _moments(

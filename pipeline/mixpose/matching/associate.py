@@ -73,9 +73,10 @@ def associate(
     finest = np.minimum(finest, 1.0)
     if blind is not None:
         finest[blind] = 1.0
-    crowd, nearby = _around(lower, upper, sigmas, detections, rules)
-    missing = np.count_nonzero(shares, axis=1) < np.count_nonzero(seen, axis=1)
-    nearby = np.where(missing, np.maximum(nearby - shares.sum(axis=1), 0.0), 0.0)
+    missing = (seen & (shares == 0)).any(axis=1)
+    crowd, nearby = _around(lower, upper, sigmas, detections, missing, rules)
+    if missing.any():
+        nearby = np.where(missing, np.maximum(nearby - shares.sum(axis=1), 0.0), 0.0)
     count = detections.number
     if any(detections.is_grid):
         count, crowd = _of_grids(objective, count, crowd, rules)
@@ -296,12 +297,13 @@ def _around(
     upper: Floats,
     sigmas: Floats,
     detections: _Detections,
+    missing: Mask,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats]:
     """How dense detections (L,) are around the body, and how many lie there.
 
-    They are counted in its box, per m-th power of σ_ε, where they are denser than elsewhere; and in
-    the box and as far around it as a grid may slip.
+    They are counted in its box, per m-th power of σ_ε, where they are denser than elsewhere; and,
+    where features are missing, in the box and as far around it as a grid may slip.
     """
     size = upper - lower
     sides = np.maximum(size, detections.region)
@@ -312,9 +314,11 @@ def _around(
     if any(flat):
         scaled[flat, 1] = 1.0
     dense = inside / (scaled[:, 0] * scaled[:, 1]) if rules.crowded else 0.0
-    half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
-    near = np.count_nonzero((away <= half[:, None]).all(axis=2), axis=1).astype(np.float64)
-    near[flat] = 0.0
+    near = np.zeros(len(sides))
+    if missing.any():
+        half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
+        near += np.count_nonzero((away <= half[:, None]).all(axis=2), axis=1)
+        near[flat] = 0.0
     return np.maximum(detections.crowd, dense), near
 
 

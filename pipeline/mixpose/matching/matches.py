@@ -92,7 +92,7 @@ class Matches:
         some = self._part(numbers)
         return replace(some, names=names, dimensions=per_sensor[0], sigmas=per_sensor[1])
 
-    def _part(self, index: int | list[int]) -> Matches:
+    def _part(self, index: int | list[int] | None) -> Matches:
         parts: list[Any] = [getattr(self, name) for name in _PER_POSE]
         parts = [None if array is None else array[index] for array in parts]
         return Matches(self.names, self.dimensions, self.sigmas, *parts)
@@ -100,17 +100,16 @@ class Matches:
     @classmethod
     def stacked(cls, poses: Sequence[Matches]) -> Matches:
         """K poses of the same sensors, of bodies of their own; fewer features are filled up."""
-        first, most = poses[0], max([one.weights.shape[-1] for one in poses])
+        first, most = poses[0], max(one.weights.shape[-1] for one in poses)
+        if len(poses) == 1:
+            return first._part(None)
         arrays: list[Any] = []
         for name in _PER_POSE:
             parts = [getattr(one, name) for one in poses]
             if any(part is None for part in parts):
                 arrays.append(None)
-            elif len(poses) == 1:
-                arrays.append(parts[0][None])
             else:
-                filled = [_filled(part, most, name) for part in parts]
-                arrays.append(np.stack(filled))
+                arrays.append(np.stack([_filled(part, most, name) for part in parts]))
         return cls(first.names, first.dimensions, first.sigmas, *arrays)
 
     @cached_property
