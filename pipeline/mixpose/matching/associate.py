@@ -281,7 +281,7 @@ def _residuals(
 
 def _boxes(y: Floats, seen: Mask) -> tuple[Floats, Floats]:
     """Corners (L, H, 2) of the boxes around the features in view; 0 where there is none."""
-    visible, some = seen[..., None], seen.any(axis=2)[..., None]
+    visible, some = seen[..., None], seen.any(axis=2, keepdims=True)
     lower = np.where(visible, y, np.inf).min(axis=2)
     upper = np.where(visible, y, -np.inf).max(axis=2)
     return np.where(some, lower, 0.0), np.where(some, upper, 0.0)
