@@ -36,16 +36,20 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extraction": GROUND,
     "optimise": set(),
     "objective": GROUND | {"sensors", "body", "density"},
-    "search": GROUND | {"sensors", "body", "density", "objective", "optimise", "judgement"},
-    "fit": GROUND | {"sensors", "body", "density", "objective", "optimise"},
-    "judgement": GROUND | {"sensors", "body", "density", "objective"},
+    "matching": GROUND | {"sensors", "body", "density", "objective"},
+    "search": GROUND
+    | {"sensors", "body", "density", "matching", "objective", "optimise", "judgement"},
+    "fit": GROUND | {"sensors", "body", "density", "matching", "objective", "optimise"},
+    "judgement": GROUND | {"sensors", "body", "density", "matching", "objective"},
     "tracking": GROUND
-    | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
-    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
+    | {"sensors", "body", "density", "matching", "objective", "optimise", "search"}
+    | {"fit", "judgement"},
+    "scene": GROUND
+    | {"sensors", "body", "density", "matching", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
-    | {"fit", "judgement", "tracking"},
+    | {"fit", "judgement", "matching", "tracking"},
     "poses": GROUND,
     "session": GROUND | {"sensors", "body", "extraction", "objective", "fit"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
@@ -53,8 +57,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
-    | {"frames", "session"},
+    | {"sensors", "body", "density", "extraction", "objective", "matching", "tracking"}
+    | {"scene", "frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matches import Seen, scored
 
 from mixpose.cli.findings import Stretches
-from mixpose.density import Noise
-from mixpose.judgement import AcceptanceRules, Association, NoiseModel, Residuals, contradict
-from mixpose.judgement.judge import Judged
-from mixpose.records import SensorReport
+from mixpose.judgement import AcceptanceRules, NoiseModel, contradict
+from mixpose.matching import Noise
 from mixpose.rigid import Floats
 from mixpose.session import load_session
 
@@ -128,21 +129,13 @@ def test_a_body_that_is_one_per_cent_too_small_is_named_by_what_it_is_met_off(
     assert "'tracker' are met as if it were 1.01 times as large" in said
 
 
-def association(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Association:
-    return Association(
-        name=name, explained=0.5, features=np.arange(len(met)), shares=met, offsets=offsets, J=J,
-        places=np.zeros_like(offsets), finest=1.0,
-        expected=float(len(met)), unseen=0.0, sigma=1.0, crowd=1e-5, count=count,
-        surplus=max(count - float(met.sum()), 0.0),
-    )  # fmt: skip
+def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Seen:
+    unmatched = max(count - float(met.sum()), 0.0)
+    return Seen(J, name, offsets, met, count=count, unmatched_nearby=unmatched)
 
 
-def judged_of(*associations: Association) -> Judged:
-    return Judged(
-        T_world_object=np.eye(4), sensors={one.name: SensorReport(True) for one in associations},
-        score=1.0, coverage=1.0, measurements=20.0, covariance=np.eye(6), log_evidence=50.0,
-        residuals=Residuals(), associations=associations, value=1.0,
-    )  # fmt: skip
+def is_contradiction(sensors: Sequence[Seen], before: Noise = QUIET, agreed: bool = True) -> bool:
+    return contradict(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
 
 
 @pytest.fixture
@@ -150,43 +143,41 @@ def jacobians() -> Floats:
     return np.random.default_rng(0).normal(size=(3, 7, 2, 6))
 
 
-def seen(jacobians: Floats, shifts: list[float], noise: float = 0.01) -> list[Association]:
+def seen(jacobians: Floats, shifts: list[float], noise: float = 0.01) -> list[Seen]:
     """Sensors that each see the body at a pose of their own."""
     rng = np.random.default_rng(1)
     found = []
     for k, shift in enumerate(shifts):
         twist = shift * np.array([1.0, -1.0, 0.5, 0.3, 0.2, -0.6])
         offsets = jacobians[k] @ twist + noise * rng.normal(size=(7, 2))
-        found.append(association(str(k), offsets, jacobians[k], np.ones(7), 7.0))
+        found.append(sensor(str(k), offsets, jacobians[k], np.ones(7), 7.0))
     return found
 
 
 def test_sensors_that_see_the_body_at_two_poses_contradict_each_other(jacobians: Floats) -> None:
-    apart = judged_of(*seen(jacobians, [0.2, -0.2]))
-    assert contradict(apart, QUIET, True, RULES, MODEL)
-    assert not contradict(judged_of(*seen(jacobians, [0.0, 0.0])), QUIET, True, RULES, MODEL)
+    assert is_contradiction(seen(jacobians, [0.2, -0.2]))
+    assert not is_contradiction(seen(jacobians, [0.0, 0.0]))
 
 
 def test_one_feature_that_is_far_off_makes_no_contradiction(jacobians: Floats) -> None:
     one, other = seen(jacobians, [0.0, 0.0])
-    one.offsets[2] = [1.0, -1.0]  # as where it runs into another one
-    assert not contradict(judged_of(one, other), QUIET, True, RULES, MODEL)
+    offsets = np.array(one.offsets)
+    offsets[2] = [1.0, -1.0]  # as where it runs into another one
+    assert not is_contradiction([replace(one, offsets=offsets), other])
 
 
 def test_of_three_sensors_the_majority_tells(jacobians: Floats) -> None:
-    three = judged_of(*seen(jacobians, [0.2, -0.2, 0.0]))
-    assert not contradict(three, QUIET, True, RULES, MODEL)
+    assert not is_contradiction(seen(jacobians, [0.2, -0.2, 0.0]))
 
 
 def test_a_sensor_that_never_met_the_body_but_sees_as_much_contradicts(jacobians: Floats) -> None:
     one, _ = seen(jacobians, [0.0, 0.0])
-    blind = association("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
-    blind = association("1", blind.offsets, blind.J, blind.shares, 5.0)
-    assert contradict(judged_of(one, blind), Noise(), False, RULES, MODEL)
-    empty = association("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 1.0)
-    assert not contradict(judged_of(one, empty), Noise(), False, RULES, MODEL)
+    blind = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
+    assert is_contradiction([one, blind], Noise(), False)
+    empty = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 1.0)
+    assert not is_contradiction([one, empty], Noise(), False)
     # once they agreed, what is seen elsewhere may be anything
-    assert not contradict(judged_of(one, empty), QUIET, True, RULES, MODEL)
+    assert not is_contradiction([one, empty])
 
 
 def test_stretches_are_told_with_the_longest_first_in_the_order_of_the_run() -> None:

@@ -9,8 +9,7 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import AssociationRules
-from mixpose.judgement import Case, associate, expected_covariance, judge, judge_together
+from mixpose.judgement import Case, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
 from mixpose.sensors import PinholeCamera
 
@@ -58,11 +57,9 @@ def test_bodies_judged_at_once_are_worth_what_each_is_alone(
         alone = judge(case, ALL_FREE)
         assert together.log_evidence == pytest.approx(alone.log_evidence, rel=1e-9)
         np.testing.assert_allclose(together.covariance, alone.covariance, rtol=1e-6, atol=1e-12)
-        for name, noise in alone.residuals.noise.items():
-            found = together.residuals.noise[name]
-            assert found.squares == pytest.approx(noise.squares, rel=1e-12)
-            assert found.degrees == pytest.approx(noise.degrees, rel=1e-12)
-        for a, b in zip(together.residuals.lasting, alone.residuals.lasting, strict=True):
+        assert together.noise.names == alone.noise.names
+        np.testing.assert_allclose(together.noise.sums, alone.noise.sums, rtol=1e-12)
+        for a, b in zip(together.noise.biases, alone.noise.biases, strict=True):
             np.testing.assert_allclose(a.information, b.information, rtol=1e-6, atol=1e-9)
 
 
@@ -96,9 +93,10 @@ def test_a_sensor_that_is_left_out_may_see_what_no_other_sees(
     features = (PointFeature(p, np.eye(3)) for p in [*EIGHT.means, far])
     body = Body("long", tuple(features))
     views = detect(pinhole_cameras, body, TRUTH, noise=0.2)
-    found, _ = associate(matched_objective(views, body, [1.5, 1.5]), TRUTH, AssociationRules())
-    assert [int(one.features.max()) for one in found] == [7, 8]
-    alone = Case(matched_objective(views[:1], body, [1.5]), TRUTH)
-    missed = judge(replace(alone, unmet=found[1:]), ALL_FREE).log_evidence
+    both = Case(matched_objective(views, body, [1.5, 1.5]), TRUTH, left_out={"1": "bumped"})
+    judged = judge(both, ALL_FREE)
+    assert [np.flatnonzero(one).max() for one in judged.matches.weights] == [7, 8]
+    alone = judge(Case(matched_objective(views[:1], body, [1.5]), TRUTH), ALL_FREE)
     # what one sensor misses counts as 5 nats at most, and its detections are more to choose from
-    assert 5.0 - 1e-9 <= judge(alone, ALL_FREE).log_evidence - missed < 10.0
+    assert 5.0 - 1e-9 <= alone.log_evidence - judged.log_evidence < 10.0
+    np.testing.assert_allclose(judged.covariance, alone.covariance, rtol=1e-9)

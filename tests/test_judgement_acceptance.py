@@ -7,45 +7,56 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect
+from matches import Seen, matches_of, scored
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import AssociationRules
 from mixpose.judgement import (
     AcceptanceRules,
-    Association,
-    Judged,
-    Residuals,
-    associate,
+    ScoredPose,
     beliefs,
     convinces,
     decide,
     insert,
     nearest_alike,
 )
-from mixpose.objective import matched_objective
+from mixpose.matching import AssociationRules, ErrorRules, Matches, associate
+from mixpose.objective import View, matched_objective
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import PinholeCamera, RangeSensor
 
 Floats = NDArray[np.float64]
 
 RULES = AcceptanceRules()
-SURE = Judged(
-    T_world_object=TRUTH,
-    sensors={},
-    score=1.0,
-    coverage=1.0,
-    measurements=32.0,
-    covariance=1e-6 * np.eye(6),
-    log_evidence=50.0,
-    residuals=Residuals(),
-)
+
+
+def sensor(name: str, met: float, expected: float = 8.0, unseen: float = 0.0) -> Seen:
+    """A camera that meets all of eight features by the same share."""
+    shares = np.full(8, met / 8)
+    return Seen(
+        np.zeros((8, 2, 6)), name, shares=shares, sigma=1.5, expected=expected, unseen=unseen
+    )
+
+
+def scored_with(coverage: float = 1.0, measurements: float = 32.0) -> ScoredPose:
+    """By two cameras, out of whose views is what they do not cover."""
+    met = measurements / 4
+    seen = [sensor(name, met, met, met / coverage - met) for name in "01"]
+    return scored(TRUTH, *seen)
+
+
+def matched_to(*sensors: Seen) -> ScoredPose:
+    """A pose with all else as `SURE` has it."""
+    return scored(TRUTH, *sensors)
+
+
+SURE = scored_with()
 ELSEWHERE = perturb(TRUTH, np.repeat([90.0, 0.8], 3))
 CORNERS = ((50.0, 50.0, 0.0), (-50.0, 50.0, 0.0), (-50.0, -50.0, 0.0), (50.0, -50.0, 0.0))
 SQUARE = Body("square", tuple(PointFeature(np.array(corner)) for corner in CORNERS))
 
 
-def status(*ranked: Judged) -> str:
+def status(*ranked: ScoredPose) -> str:
     return decide(ranked, ALL_FREE, RULES).status
 
 
@@ -61,7 +72,7 @@ def test_a_rival_of_more_than_one_in_a_hundred_makes_a_frame_ambiguous(
 
 def test_a_rival_that_is_not_possible_by_itself_still_casts_doubt() -> None:
     # too few coordinates to fix a pose
-    rival = replace(SURE, T_world_object=ELSEWHERE, measurements=4.0)
+    rival = replace(scored_with(measurements=4.0), T_world_object=ELSEWHERE)
     verdict = decide([SURE, rival], ALL_FREE, RULES)
     assert verdict.status == "ambiguous"
     assert [one for one, _ in verdict.kept] == [SURE]
@@ -81,7 +92,7 @@ def test_a_pose_is_sure_from_odds_of_a_thousand(log_evidence: float, expected: s
 def test_less_than_even_odds_are_told_where_most_of_the_body_is_met(
     coverage: float, log_evidence: float, expected: str
 ) -> None:
-    assert status(replace(SURE, coverage=coverage, log_evidence=log_evidence)) == expected
+    assert status(replace(scored_with(coverage), log_evidence=log_evidence)) == expected
 
 
 @pytest.mark.parametrize(("lead", "expected"), [(1.6, "ambiguous"), (1.4, "lost")])
@@ -97,7 +108,7 @@ def test_a_pose_about_as_good_as_others_is_one_of_many_that_meet_by_chance(
 @pytest.mark.parametrize(("met", "expected"), [(5, "ambiguous"), (4, "lost")])
 def test_one_feature_more_than_fixes_a_pose_is_met_by_chance(met: int, expected: str) -> None:
     # three features of two coordinates each fix the six of a pose
-    assert status(replace(SURE, log_evidence=-1.0, measurements=2.0 * met)) == expected
+    assert status(replace(scored_with(measurements=2.0 * met), log_evidence=-1.0)) == expected
 
 
 @pytest.mark.parametrize(
@@ -107,26 +118,21 @@ def test_one_feature_more_than_fixes_a_pose_is_met_by_chance(met: int, expected:
 def test_three_markers_of_eight_are_not_sure_whatever_was_expected(
     met: int, in_view: int, expected: str
 ) -> None:
-    one = replace(
-        association("0", 8.0),
-        features=np.arange(in_view),
-        shares=np.where(np.arange(in_view) < met, 1.0, 0.0),
-    )
-    assert status(replace(SURE, associations=(one,))) == expected
+    shares = np.where(np.arange(in_view) < met, 1.0, 0.0)
+    assert status(matched_to(Seen(np.zeros((in_view, 2, 6)), shares=shares))) == expected
 
 
 def test_markers_met_by_different_cameras_count_together() -> None:
     shares = np.array([1.0, 1, 0, 0, 0, 0, 0, 0])
-    found = (
-        replace(association("0", 8.0), shares=shares),
-        replace(association("1", 8.0), shares=np.roll(shares, 2)),
-    )
-    assert status(replace(SURE, associations=found)) == "ok"
-    assert status(replace(SURE, associations=found[:1])) == "ambiguous"
+    left = replace(sensor("0", 8.0), shares=shares)
+    right = replace(sensor("1", 8.0), shares=np.roll(shares, 2))
+    assert status(matched_to(left, right)) == "ok"
+    # two of eight, whatever the number of cameras that meet them
+    assert status(matched_to(left, replace(left, name="1"))) == "ambiguous"
 
 
 def test_coordinates_too_few_to_fix_a_pose_are_lost() -> None:
-    assert status(replace(SURE, measurements=5.9)) == "lost"
+    assert status(scored_with(measurements=5.9)) == "lost"
 
 
 def test_a_turn_of_which_nothing_is_known_is_not_sure() -> None:
@@ -143,49 +149,36 @@ def test_ranges_that_leave_a_wide_sector_of_turns_are_not_sure(
     assert status(replace(SURE, spread=spread)) == expected
 
 
-def association(name: str, met: float, expected: float = 8.0, unseen: float = 0.0) -> Association:
-    return Association(
-        name=name,
-        explained=1.0,
-        features=np.arange(8),
-        shares=np.full(8, met / 8),
-        places=np.zeros((8, 2)),
-        offsets=np.zeros((8, 2)),
-        J=np.zeros((8, 2, 6)),
-        expected=expected,
-        unseen=unseen,
-        sigma=1.5,
-        finest=0.05,
-        crowd=1e-5,
-        count=8.0,
-    )
-
-
 def test_a_prediction_that_meets_too_little_of_the_body_does_not_convince() -> None:
     # a grid of 7 by 5 that slipped by a step meets 28 of 35 in one direction, 30 in the other; a
     # body of 8 with more than two missed may have slipped
     for met, expected in ((5.9, False), (6.1, True)):
-        judged = replace(SURE, coverage=met / 8, associations=(association("0", met),))
-        assert convinces(judged, ALL_FREE, RULES) is expected
+        assert convinces(matched_to(sensor("0", met)), ALL_FREE, RULES) is expected
 
 
 def test_a_covered_camera_does_not_take_away_what_two_others_agree_on() -> None:
-    found = (association("0", 8.0), association("1", 7.0), association("2", 1.0))
-    judged = replace(SURE, coverage=16 / 24, associations=found)
+    judged = matched_to(sensor("0", 8.0), sensor("1", 7.0), sensor("2", 1.0))
+    assert judged.coverage == pytest.approx(16 / 24)
     assert convinces(judged, ALL_FREE, RULES)
 
 
 def test_features_that_face_a_camera_out_of_its_view_are_not_covered() -> None:
-    assert association("0", 4.0, expected=4.0, unseen=4.0).coverage == pytest.approx(0.5)
-    assert association("0", 4.0).measurements == pytest.approx(8.0)
+    seen = matches_of(sensor("0", 4.0, expected=4.0, unseen=4.0))
+    assert seen.coverage == pytest.approx([0.5])
+    assert seen.measurements == pytest.approx([8.0])
+
+
+def matched(views: list[View]) -> Matches:
+    """The body at its true pose."""
+    objective = matched_objective(views, EIGHT, [view.observation.sigma for view in views])
+    return associate(objective, TRUTH[None], AssociationRules(), ErrorRules().narrowest).at(0)
 
 
 def test_ranges_give_one_coordinate_each(range_sensors: list[RangeSensor]) -> None:
     views = detect(range_sensors, EIGHT, TRUTH, sigma=0.5)
-    objective = matched_objective(views, EIGHT, [0.5] * len(views))
-    found, _ = associate(objective, TRUTH, AssociationRules())
-    for one in found:
-        assert one.measurements == pytest.approx(one.met)
+    found = matched(views)
+    assert found.met.min() > 0
+    assert found.measurements == pytest.approx(found.met)
 
 
 def test_poses_that_look_the_same_are_one_and_the_more_evident_is_kept() -> None:
@@ -218,9 +211,7 @@ def test_two_cameras_of_which_one_sees_half_of_the_body_cover_three_quarters(
     y, _ = pinhole_cameras[1].project(transform(TRUTH, EIGHT.means))
     narrow = replace(pinhole_cameras[1], resolution=(int(np.median(y[:, 0])), 1024))
     views = [views[0], *detect([narrow], EIGHT, TRUTH)]
-    objective = matched_objective(views, EIGHT, [1.5, 1.5])
-    found, _ = associate(objective, TRUTH, AssociationRules())
-    assert [one.coverage for one in found] == pytest.approx([1.0, 0.5])
+    assert matched(views).coverage == pytest.approx([1.0, 0.5])
 
 
 @pytest.mark.parametrize(("behind", "kept"), [(6.0, "fine"), (8.0, "bent")])
@@ -228,10 +219,12 @@ def test_of_one_pose_residuals_as_before_are_likelier_than_larger_ones(
     behind: float, kept: str
 ) -> None:
     # in either order, as a pose of another place never is
-    bent = replace(SURE, surplus=20.0, proposer="bent")
-    fine = replace(SURE, surplus=0.5, log_evidence=SURE.log_evidence - behind, proposer="fine")
+    bent = replace(SURE, residual_ratio=20.0, proposer="bent")
+    fine = replace(
+        SURE, residual_ratio=0.5, log_evidence=SURE.log_evidence - behind, proposer="fine"
+    )
     for pair in ((bent, fine), (fine, bent)):
-        ranked: list[Judged] = []
+        ranked: list[ScoredPose] = []
         for one in pair:
             insert(ranked, one, SQUARE, ALL_FREE, RULES)
         assert [one.proposer for one in ranked] == [kept]

@@ -7,11 +7,13 @@ from math import lgamma, log, pi
 
 import numpy as np
 import pytest
+from matches import Seen, matches_of
 from numpy.typing import NDArray
 
-from mixpose.judgement import Association, DetectionModel, Matches, Prior
+from mixpose.judgement import DetectionModel, Prior
 from mixpose.judgement.evidence import log_evidence
 from mixpose.judgement.noise import information_of
+from mixpose.matching import Matches
 
 Floats = NDArray[np.float64]
 
@@ -21,25 +23,11 @@ S2 = 0.04  # of the noise, in σ²
 KNOWN = 1e4 * np.eye(6)
 """An information that a prior of unit width adds nothing to, but for 1e-4."""
 
-SIX = Association(
-    name="0",
-    explained=1.0,
-    features=np.arange(6),
-    shares=np.ones(6),
-    places=np.zeros((6, 2)),
-    offsets=np.zeros((6, 2)),
-    J=np.random.default_rng(0).normal(0, 1, (6, 2, 6)),
-    expected=6.0,
-    unseen=0.0,
-    sigma=2.0,
-    finest=0.05,
-    crowd=1e-5,
-    count=6.0,
-)
+SIX = Seen(np.random.default_rng(0).normal(0, 1, (6, 2, 6)), sigma=2.0)
 
 
 def odds_at(
-    found: list[Association],
+    found: list[Seen],
     information: Floats,
     prior: Prior,
     size: float,
@@ -48,14 +36,14 @@ def odds_at(
 ) -> float:
     """Of one pose."""
     variances, sizes = np.full((1, len(found)), S2), np.array([size])
-    matches = Matches.of([found])
+    matches = Matches.stacked([matches_of(*found)])
     at_S2 = information[None] / S2
     odds = log_evidence(matches, variances, FREE, [prior], sizes, model, at_S2, spreads)
     return float(odds[0])
 
 
 def evidence(
-    one: Association,
+    one: Seen,
     *,
     log_density: float = -10.0,
     information: Floats = KNOWN,
@@ -77,8 +65,7 @@ def test_a_feature_that_is_missed_costs_as_much_as_its_chance() -> None:
 
 
 def test_a_feature_that_no_camera_sees_is_covered_and_counts_as_missed_twice() -> None:
-    six = replace(SIX, features=np.arange(7), shares=np.append(np.ones(6), 0.0), expected=7.0)
-    six = replace(six, places=np.zeros((7, 2)), offsets=np.zeros((7, 2)), J=np.zeros((7, 2, 6)))
+    six = replace(SIX, J=np.zeros((7, 2, 6)), shares=np.append(np.ones(6), 0.0), count=6.0)
     for cameras, misses in ((1, 1), (2, 2), (4, 2)):
         seen = [replace(six, name=str(k)) for k in range(cameras)]
         all_met = [replace(one, shares=np.ones(7)) for one in seen]
@@ -121,7 +108,7 @@ def test_by_count_features_that_fix_the_pose_earn_nothing_and_choices_cost() -> 
     assert by_count == pytest.approx(6 * met * (1 - 6 / 12) - ways)
 
 
-def two_cameras_at_right_angles() -> list[Association]:
+def two_cameras_at_right_angles() -> list[Seen]:
     """Both see a px per length unit across; six features, each met exactly by both."""
     J = np.zeros((2, 6, 2, 6))
     J[0, :, 0, 0] = J[0, :, 1, 2] = 1.0
@@ -130,7 +117,7 @@ def two_cameras_at_right_angles() -> list[Association]:
 
 
 def odds_by_volume(
-    found: list[Association], *, in_space: bool = True, spreads: Floats | None = None
+    found: list[Seen], *, in_space: bool = True, spreads: Floats | None = None
 ) -> float:
     detection = DetectionModel(by_count=False, in_space=in_space)
     prior = Prior(0.0, np.ones(6))
@@ -197,7 +184,7 @@ def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
 
 
 def test_features_that_may_be_off_tell_less_of_the_pose() -> None:
-    both = Matches.of([two_cameras_at_right_angles()])
+    both = Matches.stacked([matches_of(*two_cameras_at_right_angles())])
     variances, spreads = np.full((1, 2), S2), np.zeros((1, 6, 3, 3))
     exact = information_of(both, variances)
     np.testing.assert_allclose(information_of(both, variances, spreads), exact)
@@ -212,7 +199,5 @@ def test_features_that_may_be_off_tell_less_of_the_pose() -> None:
 def test_information_is_that_of_least_squares() -> None:
     shares = np.array([1.0, 1.0, 0.5, 1.0, 0.0, 1.0])
     expected = sum(s * J.T @ J / 2.0**2 for s, J in zip(shares, SIX.J, strict=True))
-    np.testing.assert_allclose(
-        information_of(Matches.of([[replace(SIX, shares=shares)]]), np.array([[S2]]))[0],
-        expected / S2,
-    )
+    met = Matches.stacked([matches_of(replace(SIX, shares=shares))])
+    np.testing.assert_allclose(information_of(met, np.array([[S2]]))[0], expected / S2)

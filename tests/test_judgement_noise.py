@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matches import Seen, matches_of
 from numpy.typing import NDArray
 
-from mixpose.density import Noise
-from mixpose.judgement import Association, Matches, NoiseModel, Residuals
+from mixpose.judgement import NoiseModel, RememberedNoise
 from mixpose.judgement.noise import FrameNoise, noises_of
+from mixpose.matching import Matches, Noise
 
 Floats = NDArray[np.float64]
 
@@ -22,40 +23,33 @@ ALONE = replace(MODEL, confidence=0.0, lasting=0.0)
 
 
 def noise_of(
-    associations: Sequence[Association],
+    sensors: Sequence[Seen],
     free: NDArray[np.bool_],
-    before: Residuals,
+    before: RememberedNoise,
     model: NoiseModel,
 ) -> FrameNoise:
     """The noise of one frame."""
-    return noises_of(Matches.of([associations]), free, [before], model)[0]
+    return noises_of(Matches.stacked([matches_of(*sensors)]), free, [before], model)[0]
 
 
-def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Association:
+def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Seen:
     """A sensor of sigma 2 px that meets n features at any places."""
     n = len(offsets)
-    return Association(
-        name=name,
-        explained=1.0,
-        features=np.arange(n),
-        shares=np.ones(n),
-        places=rng.uniform(0, 100, (n, 2)),
-        offsets=offsets,
-        J=rng.normal(0, 1, (n, 2, 6)),
-        expected=float(n),
-        unseen=0.0,
-        sigma=2.0,
-        finest=0.05,
-        crowd=1e-5,
-        count=float(n),
-    )
+    places = rng.uniform(0, 100, (n, 2))
+    J = rng.normal(0, 1, (n, 2, 6))
+    return Seen(J, name, offsets, places=places, sigma=2.0)
 
 
-def known(squares: float, degrees: float) -> Residuals:
-    return Residuals({"0": Noise(squares, degrees)})
+def known(squares: float, degrees: float) -> RememberedNoise:
+    return RememberedNoise(("0",), np.array([[squares], [degrees]]))
 
 
-def fitted(found: list[Association], errors: list[Floats]) -> tuple[list[Association], Floats]:
+def of_first(noise: FrameNoise) -> Noise:
+    """What is remembered of the sensor "0"."""
+    return Noise(*noise.remembered.of(["0"])[:, 0].tolist())
+
+
+def fitted(found: list[Seen], errors: list[Floats]) -> tuple[list[Seen], Floats]:
     """What least squares leaves of errors, and by how much the pose is off."""
     J = np.concatenate([one.J.reshape(-1, 6) for one in found])
     e = np.concatenate([error.ravel() for error in errors])
@@ -74,25 +68,25 @@ def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:
 
 def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
     one = sensor("0", np.random.default_rng(0), np.full((6, 2), 0.1))  # 0.05 σ along each axis
-    noise = noise_of([one], FREE, Residuals(), MODEL).remembered.noise["0"]
+    noise = of_first(noise_of([one], FREE, RememberedNoise(), MODEL))
     # twelve coordinates, six are used up; equal offsets weigh a little more than normal ones
     assert noise.squares == pytest.approx(12 * 0.05**2, rel=0.1)
     assert noise.degrees == pytest.approx(6.0, rel=0.05)
     three = replace(one, shares=np.array([1.0, 1, 1, 0, 0, 0]))
-    assert noise_of([three], FREE, Residuals(), MODEL).remembered.noise["0"] == Noise(0.0, 0.0)
+    assert of_first(noise_of([three], FREE, RememberedNoise(), MODEL)) == Noise(0.0, 0.0)
 
 
 def test_where_no_residuals_say_otherwise_detections_err_by_a_fifth_of_sigma() -> None:
     three = sensor("0", np.random.default_rng(0), np.zeros((3, 2)))
-    covariance = noise_of([three], FREE, Residuals(), ALONE).covariance
+    covariance = noise_of([three], FREE, RememberedNoise(), ALONE).covariance
     J = three.J.reshape(-1, 6) / 2.0
     np.testing.assert_allclose(covariance, 0.04 * np.linalg.inv(J.T @ J), rtol=1e-6)
 
 
 def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:
     one = sensor("0", np.random.default_rng(0), np.full((8, 2), 0.2))
-    alone = noise_of([one], FREE, Residuals(), MODEL).remembered.noise["0"]
-    joined = noise_of([one], FREE, known(40 * 0.01, 40.0), MODEL).remembered.noise["0"]
+    alone = of_first(noise_of([one], FREE, RememberedNoise(), MODEL))
+    joined = of_first(noise_of([one], FREE, known(40 * 0.01, 40.0), MODEL))
     # the blur at which offsets are weighted is another with what is remembered
     assert joined.squares == pytest.approx(0.95 * 0.4 + alone.squares, rel=0.02)
     assert joined.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
@@ -103,10 +97,10 @@ def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
     one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))  # 0.1 σ; ten degrees of freedom
     before = known(40 * 0.02**2, 40.0)
     found = noise_of([one], FREE, before, ALONE)
-    own = noise_of([one], FREE, Residuals(), ALONE)
+    own = noise_of([one], FREE, RememberedNoise(), ALONE)
     np.testing.assert_allclose(found.covariance, own.covariance)
     # remembered as the largest that chance makes: F of 10 and 40 degrees is 3.87 at 99.9 %
-    kept, alone = found.remembered.noise["0"], own.remembered.noise["0"]
+    kept, alone = of_first(found), of_first(own)
     assert kept.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
     limit = 3.87 * 0.02**2 * alone.degrees
     assert kept.squares == pytest.approx(0.95 * 40 * 0.02**2 + limit, rel=0.02)
@@ -115,9 +109,11 @@ def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
 def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:
     rng = np.random.default_rng(2)
     offsets = rng.normal(0, 0.1, (12, 2))
-    whole = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, Residuals(), ALONE)
+    whole = noise_of(
+        [sensor("0", np.random.default_rng(3), offsets)], FREE, RememberedNoise(), ALONE
+    )
     offsets[4] = [1.5, -1.0]
-    cut = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, Residuals(), ALONE)
+    cut = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, RememberedNoise(), ALONE)
     # one of twelve tells nothing: the other eleven fix the pose, two degrees of freedom fewer
     ratio = np.diag(cut.covariance) / np.diag(whole.covariance)
     assert ratio.max() < 2.5
@@ -125,7 +121,7 @@ def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:
 
 def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance() -> None:
     rng = np.random.default_rng(5)
-    residuals, errors, plain = Residuals(), [], []
+    residuals, errors, plain = RememberedNoise(), [], []
     for _ in range(200):
         found = []
         for name in "01234":
@@ -139,7 +135,7 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
         residuals = noise.remembered
         errors.append(off @ np.linalg.solve(noise.covariance, off) / 6)
         J = np.concatenate([one.J.reshape(-1, 6) for one in left])
-        r = np.concatenate([one.offsets.ravel() for one in left])
+        r = np.concatenate([np.ravel(one.offsets) for one in left])
         plain.append(off @ (J.T @ J) @ off / (r @ r / (len(r) - 6)) / 6)
     # least squares takes errors for independent and is far too sure; 1 would be right, and of 80
     # degrees of freedom, spread unevenly over frames, the variance is known to a quarter
@@ -148,11 +144,11 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
 
 
 def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> None:
-    blind = replace(ALONE, fields=replace(ALONE.fields, deviation=0.0))
+    blind = replace(ALONE, bias=replace(ALONE.bias, deviation=0.0))
     made = {name: np.array(shift) for name, shift in (("0", [0.8, -0.5]), ("1", [-0.6, 0.7]))}
     errors: dict[NoiseModel, list[float]] = {ALONE: [], blind: []}
     for model, found in errors.items():
-        rng, residuals = np.random.default_rng(9), Residuals()
+        rng, residuals = np.random.default_rng(9), RememberedNoise()
         for _ in range(60):
             sensors = []
             for name in made:
@@ -170,18 +166,18 @@ def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> N
 
 
 def test_sensors_that_were_seen_together_before_are_remembered_apart() -> None:
-    rng, residuals = np.random.default_rng(4), Residuals()
+    rng, residuals = np.random.default_rng(4), RememberedNoise()
     for names in ("01", "0", "01", "1", "01"):
         found = [sensor(name, rng, rng.normal(0, 0.1, (8, 2))) for name in names]
         residuals = noise_of(found, FREE, residuals, MODEL).remembered
-    kept = {one.names: len(one.vector) for one in residuals.lasting}
+    kept = {one.names: len(one.vector) for one in residuals.biases}
     # an offset and a slant of each: 2 + 4 sizes
     assert kept == {("0", "1"): 12, ("0",): 6, ("1",): 6}
 
 
 def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
     rng = np.random.default_rng(6)
-    residuals, errors, plain = Residuals(), [], []
+    residuals, errors, plain = RememberedNoise(), [], []
     for _ in range(100):
         off = rng.normal(0, 0.3, (12, 3))
         found = [sensor(name, rng, np.zeros((12, 2))) for name in "01234"]
@@ -193,7 +189,7 @@ def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
         residuals = noise.remembered
         errors.append(error @ np.linalg.solve(noise.covariance, error) / 6)
         J = np.concatenate([one.J.reshape(-1, 6) for one in left])
-        r = np.concatenate([one.offsets.ravel() for one in left])
+        r = np.concatenate([np.ravel(one.offsets) for one in left])
         plain.append(error @ (J.T @ J) @ error / (r @ r / (len(r) - 6)) / 6)
     # five sensors see the same errors: least squares takes them for independent; that markers are
     # where they are said to be is believed as surely as one frame of twenty tells

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import ErrorRules, Observation
+from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, fit_near
-from mixpose.judgement import Case, Judged, judge
+from mixpose.judgement import Case, ScoredPose, judge
+from mixpose.matching import ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
@@ -46,7 +47,7 @@ def view_of(points: Floats) -> View:
     return View("camera", CAMERA, Observation(PointPattern(points, np.ones(len(points))), SIGMA))
 
 
-def judged_at(T_world_object: Floats, views: list[View]) -> Judged:
+def judged_at(T_world_object: Floats, views: list[View]) -> ScoredPose:
     objective = matched_objective(views, BODY, [SIGMA] * len(views))
     return judge(Case(objective, T_world_object), np.ones(6, dtype=np.bool_))
 
@@ -74,17 +75,17 @@ def test_a_pair_counts_as_one_feature_and_its_middle_is_met() -> None:
     T = in_line(1, 2, 3.0)
     y = seen(T)
     merged = np.vstack([np.delete(y, [1, 2], axis=0), y[1:3].mean(axis=0)])
-    (association,) = judged_at(T, [view_of(merged)]).associations
-    assert association.merged == 1
-    assert association.met == pytest.approx(5.0)
-    assert association.squared.max() < 1e-6
+    matches = judged_at(T, [view_of(merged)]).matches
+    assert matches.merged.tolist() == [1]
+    assert matches.met == pytest.approx([5.0])
+    assert matches.squared.max() < 1e-6
 
 
 def test_a_hidden_feature_beside_a_seen_one_is_no_pair() -> None:
     T = in_line(1, 2, 3.0)
-    (association,) = judged_at(T, [view_of(np.delete(seen(T), 1, axis=0))]).associations
-    assert association.merged == 0
-    assert association.met == pytest.approx(5.0)
+    matches = judged_at(T, [view_of(np.delete(seen(T), 1, axis=0))]).matches
+    assert matches.merged.tolist() == [0]
+    assert matches.met == pytest.approx([5.0])
 
 
 def test_a_false_detection_beside_a_hidden_feature_does_not_pull(

@@ -213,7 +213,7 @@ def test_a_detection_taken_for_one_of_two_features_may_be_both_of_them() -> None
     data = tracker.data(tracker.begin(), 1, None, views)
     likelihood, here = likelihood_of(data), Start(bent)
     judged = likelihood.judge(likelihood.fit(here), here)
-    assert judged.associations[0].shares[2] == 0.0
+    assert judged.matches.shares[0, 2] == 0.0
     rivals = [start.T_world_object for start in merged_pair(data, likelihood, judged)]
     assert min(float(rotation_angle_deg(rival, T)) for rival in rivals) < 0.02
     assert rotation_angle_deg(bent, T) > 0.1
@@ -283,5 +283,5 @@ def test_narrow_blurs_do_not_choose_among_sensors_that_disagree(
     data = tracker.data(track, 6, 6 / 30, views)
     likelihood, start = likelihood_of(data), Start(TRUTH, tracker.start_uncertainty)
     judged = likelihood.judge(likelihood.fit(start), start)
-    assert judged.surplus > 1
+    assert judged.residual_ratio > 1
     assert list(narrowed(data, likelihood, judged)) == []

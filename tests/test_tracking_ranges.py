@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import Noise, Observation
+from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import JudgementRules, NoiseModel
+from mixpose.matching import Noise
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (

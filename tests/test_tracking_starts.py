@@ -10,20 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 from detections import EIGHT, TRUTH, detect, view_of
+from matches import Seen, matches_of, scored
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import (
     AcceptanceRules,
-    Association,
     DetectionModel,
-    Judged,
     NoiseModel,
-    Residuals,
+    ScoredPose,
 )
 from mixpose.objective import View
-from mixpose.records import SensorReport
 from mixpose.rigid import (
     from_rotation_vector,
     perturb,
@@ -48,29 +46,10 @@ RULES, MODEL = AcceptanceRules(), NoiseModel()
 ELSEWHERE = perturb(TRUTH, np.repeat([50.0, 0.5], 3))
 
 
-def association(name: str, met: float, off: float = 0.1, surplus: float = 0.0) -> Association:
+def sensor(name: str, met: float, off: float = 0.1, unmatched: float = 0.0) -> Seen:
     """A sensor that meets some of 8 features, each off by some of σ_ε along either axis."""
-    return Association(
-        name=name,
-        explained=1.0,
-        features=np.arange(8),
-        shares=np.full(8, met / 8),
-        places=np.zeros((8, 2)),
-        offsets=np.full((8, 2), 1.5 * off),
-        J=np.zeros((8, 2, 6)),
-        expected=8.0,
-        unseen=0.0,
-        sigma=1.5,
-        finest=0.05,
-        crowd=1e-5,
-        count=8.0,
-        surplus=surplus,
-    )
-
-
-def judged_at(T: Floats, *associations: Association) -> Judged:
-    coverage = sum(one.coverage for one in associations) / max(len(associations), 1)
-    return Judged(T, {}, 1.0, coverage, 32.0, 1e-6 * np.eye(6), 50.0, Residuals(), associations)
+    shares = np.full(8, met / 8)
+    return Seen(np.zeros((8, 2, 6)), name, 1.5 * off, shares, sigma=1.5, unmatched_nearby=unmatched)
 
 
 def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> FrameData:
@@ -98,7 +77,7 @@ def shifted(T: Floats, step: Floats) -> Floats:
     return np.asarray(T @ T_object_aside)
 
 
-def judged_here(data: FrameData, T: Floats) -> Judged:
+def judged_here(data: FrameData, T: Floats) -> ScoredPose:
     likelihood, start = likelihood_of(data), Start(T)
     return likelihood.judge(likelihood.fit(start), start)
 
@@ -227,8 +206,8 @@ def test_several_starts_that_lead_to_nothing_are_not_fitted(
 def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
     data = data_of(Tracker.create(EIGHT, EstimatorOptions(), TRUTH), [])
     assert is_doubtful(data, [])
-    assert is_doubtful(data, [judged_at(TRUTH, association("0", 5.0))])
-    assert not is_doubtful(data, [judged_at(TRUTH, association("0", 8.0))])
+    assert is_doubtful(data, [scored(TRUTH, sensor("0", 5.0))])
+    assert not is_doubtful(data, [scored(TRUTH, sensor("0", 8.0))])
 
 
 def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() -> None:
@@ -236,11 +215,9 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     track = replace(tracker.begin(), tallies={"0": SensorTally(5, 8)}, believed=3, frame=0)
 
     def doubted(track: Track, met: int, log_evidence: float = 20.0) -> bool:
-        seen = replace(association("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
-        judged = replace(judged_at(TRUTH, seen), sensors={"0": SensorReport(True)})
-        return is_doubtful(
-            data_of(tracker, [], track), [replace(judged, log_evidence=log_evidence)]
-        )
+        seen = replace(sensor("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
+        judged = replace(scored(TRUTH, seen), log_evidence=log_evidence)
+        return is_doubtful(data_of(tracker, [], track), [judged])
 
     assert not doubted(track, 5)
     # as much of it, and yet not sure: a thing that shines alike came near
@@ -258,18 +235,21 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
 
 
 def test_of_three_sensors_the_one_whose_residuals_are_far_larger_disagrees() -> None:
-    found = [association("0", 8.0), association("1", 8.0, off=0.6), association("2", 8.0)]
+    found = [sensor("0", 8.0), sensor("1", 8.0, off=0.6), sensor("2", 8.0)]
     # six times the others' deviation, 36 times their variance
-    assert disagreeing(found, RULES, MODEL) == ["1"]
-    found[1] = association("1", 8.0, off=0.4)
-    assert disagreeing(found, RULES, MODEL) == []
-    assert disagreeing([association("0", 8.0), association("1", 8.0, off=0.9)], RULES, MODEL) == []
+    assert disagreeing(matches_of(*found), RULES, MODEL) == ["1"]
+    found[1] = sensor("1", 8.0, off=0.4)
+    assert disagreeing(matches_of(*found), RULES, MODEL) == []
+    two = [sensor("0", 8.0), sensor("1", 8.0, off=0.9)]
+    assert disagreeing(matches_of(*two), RULES, MODEL) == []
 
 
 def test_a_sensor_that_sees_the_body_elsewhere_disagrees_and_a_covered_one_does_not() -> None:
-    agreeing = [association("0", 8.0), association("1", 7.0)]
-    assert disagreeing([*agreeing, association("2", 1.0, surplus=7.0)], RULES, MODEL) == ["2"]
-    assert disagreeing([*agreeing, association("2", 1.0, surplus=1.0)], RULES, MODEL) == []
+    agreeing = sensor("0", 8.0), sensor("1", 7.0)
+    elsewhere = matches_of(*agreeing, sensor("2", 1.0, unmatched=7.0))
+    assert disagreeing(elsewhere, RULES, MODEL) == ["2"]
+    covered = matches_of(*agreeing, sensor("2", 1.0, unmatched=1.0))
+    assert disagreeing(covered, RULES, MODEL) == []
 
 
 def test_a_camera_that_was_bumped_is_left_out_and_named(

@@ -54,7 +54,6 @@ TESTS: dict[str, tuple[str, ...]] = {
     "design": ("test_design.py",),
     "runner": ("test_runner_*.py",),
     "density": (
-        "test_density_met.py",
         "test_density_atlas.py",
         "test_density*.py",
         "test_tracking_outliers.py",
@@ -68,6 +67,11 @@ TESTS: dict[str, tuple[str, ...]] = {
         "test_search_*.py",
     ),
     "fit": ("test_fit_*.py", "test_fit*.py"),
+    "matching": (
+        "test_matching*.py",
+        "test_judgement.py",
+        "test_tracking_outliers.py",
+    ),
     "judgement": (
         "test_judgement*.py",
         "test_tracking_outliers.py",

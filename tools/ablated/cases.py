@@ -12,7 +12,7 @@ from benchmarks.search_cases import Row, absent, trial
 from numpy.typing import NDArray
 
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import Judged
+from mixpose.judgement import ScoredPose
 from mixpose.objective import View
 from mixpose.poses.consistency import normalised_error_squared
 from mixpose.records import Estimate
@@ -97,7 +97,7 @@ class RememberedSearch:
         self.unspent_s = 0.0
         self._found: dict[tuple[object, ...], tuple[float, list[Candidate], object]] = {}
 
-    def __call__(self, data: FrameData, ranked: list[Judged]) -> Iterable[Start]:
+    def __call__(self, data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
         """Starts, as `searched` gives them."""
         return starts_at(data, self._candidates(data)) if is_doubtful(data, ranked) else []
 

@@ -36,7 +36,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-no-sensor-left-out",
         "tracking/proposers/without_sensor.py",
-        "return apart if len(left) >= 2 else []",
+        "return names if np.count_nonzero(agreeing & ~apart) >= 2 else []",
         "return []",
         "a camera that was bumped bends the pose",
         (_STARTS,),
@@ -44,8 +44,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-another-sensor-left-out",
         "tracking/proposers/without_sensor.py",
-        "            apart.append(one.name)",
-        "            apart.append(others[0].name)",
+        "names = [seen.names[k] for k in np.flatnonzero(apart)]",
+        "names = [seen.names[k - 1] for k in np.flatnonzero(apart)]",
         "of three cameras a sound one is left out",
         (_STARTS,),
     ),
@@ -90,14 +90,6 @@ _PROPOSALS = (
         (_BESIDE,),
     ),
     Mutant(
-        "tracking-left-out-for-free",
-        "tracking/likelihood.py",
-        "data.track.residuals, prior, others)",
-        "data.track.residuals, prior, ())",
-        "leaving a sensor out makes a pose better",
-        (_STARTS,),
-    ),
-    Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers/merged_pair.py",
         "return [] if at is judged else",
@@ -116,8 +108,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers/narrowed.py",
-        "> len(each) / 2 for",
-        "> len(each) for",
+        "> np.count_nonzero(met, axis=1) / 2",
+        "> np.count_nonzero(met, axis=1)",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),
     ),

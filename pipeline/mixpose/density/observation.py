@@ -110,16 +110,6 @@ class Observation:
             return self
         return replace(self, pattern=PointPattern(pattern.points[near], pattern.weights[near]))
 
-    def narrowest(self, share: float, y: Floats) -> float:
-        """Narrowest blur in σ_ε: a share for detections, as far as an atlas reaches.
-
-        `y` (n, m) are predicted features, about which it is drawn.
-        """
-        if self.cell is not None or not len(y):
-            return 1.0
-        extent = float((y.max(axis=0) - y.min(axis=0)).max())
-        return min(max(share, extent / (MOST_SIGMAS * self.sigma)), 1.0)
-
     def density(
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False
     ) -> Density:

@@ -53,6 +53,7 @@ SHARP = NewtonOptions(
     iterations=40, tolerance=1e-6, value_error=value_error(STEPS_PER_SIGMA), remaining=5e-7
 )
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
+_STEPS = 2  # of least squares: 0.80 of the way, of 70 features 0.89; after one 0.62 and 0.77
 
 
 @dataclass(frozen=True)
@@ -264,11 +265,13 @@ def _to_the_noise(
     likeliest, best = -np.inf, None
     while True:
         matches = associate(finest, ascent.state, association, errors.narrowest)
+        fit, wide = replace(Fit.of(ascent), matches=matches), matches
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
-            matches = replace(matches, finest=least)
-        noise = errors_seen(matches, count, known, errors)
-        fit = replace(Fit.of(ascent), matches=matches, noise=noise)
+            wide = replace(matches, finest=least)
+        noise = errors_seen(wide, count, known, errors)
+        if not beside:
+            fit = replace(fit, noise=noise)
         # offsets of a bent pose hide how small the noise is
         variances = np.minimum(noise.variances, (noise.before / errors.blur) ** 2)
         end = np.minimum(np.minimum(noise.blurs, noise.before), blurs)
@@ -279,7 +282,7 @@ def _to_the_noise(
             return fit
         # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
         alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-        moved = _moved(matches, free, blurs, end, variances) if best is None and alike else np.inf
+        moved = _moved(matches, free, end, variances) if best is None and alike else np.inf
         if moved < rules.moved**2:
             return fit
         likelihood = log_likelihood(noise.blurs, matches, count, errors)
@@ -303,13 +306,18 @@ def _narrowed(
     return matched_objective(near, finest.projection.body, sigmas)
 
 
-def _moved(
-    matches: Matches, free: NDArray[np.bool_], blurs: Floats, narrower: Floats, variances: Floats
-) -> float:
-    """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
-    weights = matches.shares / variances[:, None]
-    now, then = (np.exp(-0.25 * matches.squared / one[:, None] ** 2) for one in (blurs, narrower))
+def _moved(matches: Matches, free: NDArray[np.bool_], narrower: Floats, variances: Floats) -> float:
+    """About how far narrower blurs (L,) move the pose, in squared standard deviations.
+
+    By iterated least squares, at the end of an ascent at wider ones.
+    """
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
-    gradient = (weights * (then - now)).repeat(2) * matches.offsets.ravel() @ J
-    rows = (weights * then).repeat(2)[:, None] * J
-    return float(gradient @ np.linalg.lstsq(rows.T @ J, gradient)[0])
+    offsets, twist = matches.offsets, np.zeros(J.shape[1])
+    for _ in range(_STEPS):
+        squared = (offsets * offsets).sum(axis=2)
+        weights = matches.shares * np.exp(-0.25 * squared / narrower[:, None] ** 2)
+        rows = (weights / variances[:, None]).repeat(2)[:, None] * J
+        information = rows.T @ J
+        twist += np.linalg.lstsq(information, rows.T @ offsets.ravel())[0]
+        offsets = matches.offsets - (J @ twist).reshape(offsets.shape)
+    return float(twist @ information @ twist)

@@ -67,7 +67,7 @@ class NoiseModel:
         return np.asarray(directions * tail / chdtri(directions, 1 - self.confidence))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RememberedNoise:
     """What is remembered of residuals, for the next frame.
 

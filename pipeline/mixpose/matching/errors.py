@@ -70,10 +70,6 @@ class Noise:
         """Mean of the squares."""
         return self.squares / max(self.degrees, 1e-12)
 
-    def faded(self, memory: float) -> Noise:
-        """What is remembered of it."""
-        return Noise(memory * self.squares, memory * self.degrees)
-
     def joined(self, other: Noise) -> Noise:
         """Together with another one."""
         return Noise(self.squares + other.squares, self.degrees + other.degrees)

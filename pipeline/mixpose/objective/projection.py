@@ -75,10 +75,10 @@ def project_body(sensors: tuple[Sensor, ...], body: Body) -> BodyProjection:
 def in_image(spreads: Floats, J: Floats) -> Floats:
     """How far features are off in a sensor's coordinates, mean variance along one (..., n).
 
-    For covariances (n, 3, 3) in the world, and J (..., n, m, 6) in the sensor's own m coordinates.
+    For covariances (..., n, 3, 3) in the world, and J (..., n, m, 6) in a sensor's m coordinates.
     """
     by_world = J[..., :3]
-    total = np.einsum("...nmi,nij,...nmj->...n", by_world, spreads, by_world)
+    total = np.einsum("...nmi,...nij,...nmj->...n", by_world, spreads, by_world)
     return np.asarray(total / J.shape[-2])
 
 

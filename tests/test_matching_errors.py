@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from matches import Seen, matches_of
 from numpy.typing import NDArray
 
-from mixpose.density import ErrorRules, Offsets, errors_seen, log_likelihood
+from mixpose.matching import ErrorRules, Matches, errors_seen, log_likelihood
 
 Floats = NDArray[np.float64]
 
@@ -14,9 +15,11 @@ RULES = ErrorRules()
 NOTHING = np.zeros((2, 1))
 
 
-def offsets_of(away: Floats, finest: float = 0.01) -> Offsets:
-    squared = (away * away).sum(axis=1)[None]
-    return Offsets(squared, np.ones_like(squared), np.array([away.shape[1]]), np.array([finest]))
+def offsets_of(*sensors: Floats, finest: float = 0.01) -> Matches:
+    """Features (n, m) that are off by so much, in σ_ε, and all met."""
+    return matches_of(
+        *(Seen(np.zeros((*away.shape, 6)), offsets=away, finest=finest) for away in sensors)
+    )
 
 
 @pytest.mark.parametrize("coordinates", [1, 2])
@@ -74,9 +77,7 @@ def test_half_of_offsets_far_off_are_no_noise_where_the_rest_is_as_small_as_befo
 def test_sensors_are_weighed_half_by_what_all_of_them_err_by() -> None:
     rng = np.random.default_rng(4)
     away = rng.normal(0, np.repeat([[0.05], [0.2]], 2000, axis=0), (4000, 2))
-    squared = (away**2).sum(axis=1).reshape(2, 2000)
-    both = Offsets(squared, np.ones_like(squared), np.array([2, 2]), np.full(2, 0.01))
-    seen = errors_seen(both, 0, np.zeros((2, 2)), RULES)
+    seen = errors_seen(offsets_of(away[:2000], away[2000:]), 0, np.zeros((2, 2)), RULES)
     mean = (0.05**2 + 0.2**2) / 2
     for blur, s in zip(seen.blurs, (0.05, 0.2), strict=True):
         assert blur == pytest.approx(1.5 * np.sqrt((s**2 + mean) / 2), rel=0.06)

@@ -1,0 +1,115 @@
+"""Which detections predicted features meet, and what is seen beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+from detections import view_of
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.density import peak
+from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, crowding
+from mixpose.matching.associate import _residuals
+from mixpose.objective import matched_objective
+from mixpose.rigid import from_parts
+from mixpose.sensors import PinholeCamera
+
+Floats = NDArray[np.float64]
+
+RULES = AssociationRules()
+VARIANCE = 4.5  # 2 σ² of σ_ε = 1.5: features are met within 3.3
+SIGMA = 1.5
+K = np.array([[1000.0, 0, 500], [0, 1000.0, 500], [0, 0, 1]])
+CAMERA = PinholeCamera(K, np.zeros(4), (1000, 1000), np.eye(4))
+AT = from_parts(np.eye(3), np.array([0.0, 0.0, 1000.0]))
+"""Where a body looks in the image as from above: a length unit is a pixel."""
+
+
+def met(
+    detections: list[tuple[float, float]], *places: tuple[float, float], off: float = 0.0
+) -> Matches:
+    """A flat body, seen from above; its features may be off, all places are from the middle."""
+    spread = off**2 * np.eye(3)
+    body = Body("flat", tuple(PointFeature(np.array([*place, 0.0]), spread) for place in places))
+    view = view_of("camera", CAMERA, np.array(detections) + 500.0, SIGMA)
+    objective = matched_objective([view], body, [SIGMA])
+    return associate(objective, AT[None], RULES, ErrorRules().narrowest).at(0)
+
+
+def test_a_detection_is_that_of_one_feature() -> None:
+    # on the first feature, and within reach of the second, which is hidden
+    found = met([(10.0, 10.0)], (10.0, 10.0), (12.0, 10.0))
+    assert found.shares.tolist() == [[1.0, 0.0]]
+    assert found.detections.tolist() == [[0, -1]]
+    assert found.merged.tolist() == [0]
+
+
+def test_features_side_by_side_meet_the_nearest_detection_each() -> None:
+    found = met([(10.0, 10.0), (12.0, 10.0)], (10.0, 10.1), (12.0, 10.1))
+    assert found.shares.tolist() == [[1.0, 1.0]]
+    assert found.detections.tolist() == [[0, 1]]
+    np.testing.assert_allclose(SIGMA * found.offsets[0], [[0.0, -0.1], [0.0, -0.1]], atol=1e-9)
+
+
+def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
+    spots, place = [(10.0, 10.0)], (14.0, 10.0)
+    # met within 1.55 standard deviations of what the place and the detection may be off
+    assert met(spots, place).shares.tolist() == [[0.0]]
+    wide = (4.0 / 1.55) ** 2 - VARIANCE
+    assert met(spots, place, off=np.sqrt(0.98 * wide)).shares.tolist() == [[0.0]]
+    assert met(spots, place, off=np.sqrt(1.02 * wide)).shares.tolist() == [[1.0]]
+
+
+def test_two_features_that_share_a_detection_count_as_one_and_a_third_is_missed() -> None:
+    # the detection is nearer to the middle of the first two than to either; the middle of the
+    # second and the third would be met as well, had the second not its partner already
+    found = met([(0.7, 0.3)], (0.0, 0.0), (1.0, 0.0), (1.4, 0.6))
+    assert found.shares.tolist() == [[0.5, 0.5, 0.0]]
+    assert found.detections.tolist() == [[0, 0, -1]]
+    assert found.merged.tolist() == [1]
+    np.testing.assert_allclose(SIGMA * found.offsets[0, :2], [[0.2, 0.3]] * 2, atol=1e-9)
+    # it moves as their middle does
+    np.testing.assert_allclose(found.J[0, 0], found.J[0, 1], atol=1e-12)
+
+
+def mixture(centres: Floats, y: Floats) -> Floats:
+    """Gaussians and their gradients (n, 3) in closed form."""
+    away = centres - y[:, None]
+    bells = np.exp(-0.5 * (away**2).sum(axis=2) / VARIANCE) * peak(VARIANCE, 2)
+    gradient = (bells[..., None] * away).sum(axis=1) / VARIANCE
+    return np.column_stack([bells.sum(axis=1), gradient])
+
+
+def test_features_of_grey_values_that_overlap_are_met_where_they_are() -> None:
+    y = np.array([[10.0, 10.0], [13.0, 10.0], [40.0, 40.0]])
+
+    def seen(centres: Floats) -> tuple[Floats, Floats]:
+        return _residuals(y, np.ones(3), VARIANCE, 0.2 * mixture(centres, y), 0.2, RULES, True)
+
+    shares, offsets = seen(y)
+    np.testing.assert_allclose(shares, 1.0, atol=1e-9)
+    np.testing.assert_allclose(offsets, 0.0, atol=1e-9)
+    # one is 0.1 off: the others stay where they are, but for what is second order, 0.1²
+    off = y + np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0]])
+    np.testing.assert_allclose(seen(off)[1], off - y, atol=0.01)
+
+
+def test_clutter_is_as_dense_as_detections_around_the_body_where_they_are_denser() -> None:
+    around = [(100.0, 100.0), (200.0, 100.0), (200.0, 200.0), (150.0, 150.0), (120.0, 180.0)]
+    points = np.array([*around, (0.0, 0.0), (1000.0, 1000.0)])
+    lower = np.array([[100.0, 100.0], [600.0, 100.0]])
+    found = crowding(points, lower, lower + 100.0, 30.0)
+    np.testing.assert_allclose(found, [5 / 100**2, 7 / 1000**2])
+
+
+def test_detections_beside_the_body_that_belong_to_none_are_unmatched() -> None:
+    corners = (100.0, 100.0), (200.0, 200.0)
+    beside = [(220.0, 150.0), (230.0, 150.0)]
+    # two are met; one lies within, one beyond a quarter of the body's size around it
+    missed = met([*corners, *beside], *corners, (150.0, 150.0))
+    assert missed.met.tolist() == [2.0]
+    assert missed.unmatched_nearby.tolist() == [1.0]
+    # where nothing is missed, what else is there is no sign of another place
+    assert met([*corners, *beside], *corners).unmatched_nearby.tolist() == [0.0]
+    assert met([(226.0, 150.0)], *corners).unmatched_nearby.tolist() == [0.0]
+    assert met([(224.0, 150.0)], *corners).unmatched_nearby.tolist() == [1.0]

@@ -1,0 +1,172 @@
+"""Mutants of `matching`."""
+
+from __future__ import annotations
+
+from mutation.mutant import Mutant
+
+_ERRORS = (
+    Mutant(
+        "matching-errors-cut-by-the-blur",
+        "matching/errors.py",
+        "factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))",
+        "factor = 1.0",
+        "the noise seems smaller than it is",
+    ),
+    Mutant(
+        "matching-errors-of-all-detections-alike",
+        "matching/errors.py",
+        "weights = shares * np.exp(-0.25 * squared / (blurs * blurs)[:, None])",
+        "weights = shares",
+        "a cut spot is noise of all others",
+    ),
+    Mutant(
+        "matching-errors-of-a-frame-forgotten",
+        "matching/errors.py",
+        "np.maximum(variances, pooled(own, rules, 0.0))",
+        "variances.copy()",
+        "a frame that is not like those before it is looked at too narrowly",
+    ),
+    Mutant(
+        "matching-errors-from-above-only",
+        "matching/errors.py",
+        "return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, matches, free, rules))",
+        "return seen",
+        "where half of the spots are merged all offsets are noise",
+    ),
+    Mutant(
+        "matching-errors-each-sensor-for-itself",
+        "matching/errors.py",
+        "wide += rules.shared *",
+        "wide += 0.0 *",
+        "sensors weigh by their own noise alone",
+    ),
+)
+
+_MET = (
+    Mutant(
+        "matching-detection-met-twice",
+        "matching/associate.py",
+        "if feature not in met and detection not in taken:",
+        "if feature not in met:",
+        "one detection is taken for several features, hidden ones count as seen",
+    ),
+    Mutant(
+        "matching-farthest-detection-met",
+        "matching/associate.py",
+        'np.argsort(squared, kind="stable")',
+        'np.argsort(-squared, kind="stable")',
+        "features take the detection of their neighbour",
+    ),
+    Mutant(
+        "matching-hidden-beside-seen-is-a-pair",
+        "matching/associate.py",
+        "if not near[k] or closer[k] >= 0:",
+        "if not near[k]:",
+        "a hidden feature beside a seen one counts as merged with it",
+    ),
+    Mutant(
+        "matching-merged-detection-counts-twice",
+        "matching/associate.py",
+        "shares[pair] = weights[pair] / 2",
+        "shares[pair] = weights[pair]",
+        "two features that share a detection count as two measurements",
+    ),
+    Mutant(
+        "matching-merged-detection-shared-by-three",
+        "matching/associate.py",
+        "single[pair[1]] = False",
+        "single[pair[1]] = True",
+        "a third feature takes a detection that two share already",
+    ),
+    Mutant(
+        "matching-neighbours-pull-taken-for-misfit",
+        "matching/associate.py",
+        "pull = sampled[:, 1:] - predicted_gradient",
+        "pull = sampled[:, 1:]",
+        "features of grey values that overlap seem to be off where they fit",
+    ),
+    Mutant(
+        "matching-crowd-of-the-whole-image",
+        "matching/associate.py",
+        "np.maximum(overall, inside / sides.prod(axis=1))",
+        "np.full(len(sides), overall)",
+        "a crowd of false detections around the body counts as rare",
+    ),
+    Mutant(
+        "matching-crowd-constant",
+        "matching/associate.py",
+        "np.maximum(overall, inside / sides.prod(axis=1))",
+        "np.full(len(sides), 1e-6)",
+        "clutter does not make a pose less sure",
+    ),
+    Mutant(
+        "matching-unmatched-within-the-body-only",
+        "matching/associate.py",
+        "half = size / 2 + rules.slip * size.max(axis=2, keepdims=True)",
+        "half = size / 2",
+        "detections beside a slipped grid go unnoticed",
+    ),
+    Mutant(
+        "matching-unmatched-with-those-met",
+        "matching/associate.py",
+        "np.maximum(inside - met, 0.0)",
+        "np.maximum(inside, 0.0)",
+        "every frame with a missed feature looks like a slip",
+    ),
+)
+
+_RECORD = (
+    Mutant(
+        "matching-jacobian-in-the-sensors-unit",
+        "matching/associate.py",
+        "J = at.J / sigmas[..., None, None, None]",
+        "J = at.J / 1.0",
+        "covariances depend on the unit of a sensor",
+    ),
+    Mutant(
+        "matching-merged-features-move-as-one",
+        "matching/associate.py",
+        "if (partner >= 0).any():",
+        "if (partner >= 99).any():",
+        "the middle of two features moves as if it were one of them",
+        ("test_tracking_outliers.py",),
+    ),
+    Mutant(
+        "matching-spread-of-a-body-is-no-reach",
+        "matching/associate.py",
+        "if body.spread:",
+        "if False:",
+        "features of a body that gives way are missed where they have moved",
+    ),
+    Mutant(
+        "matching-calibration-of-the-first-sensor",
+        "matching/associate.py",
+        "own[:, k, :, : shifts.shape[2]] = shifts",
+        "own[:, 0, :, : shifts.shape[2]] = shifts",
+        "a calibration in doubt makes another sensor unsure",
+    ),
+    Mutant(
+        "matching-out-of-view-is-covered",
+        "matching/matches.py",
+        "np.maximum(self.expected + self.unseen, 1e-12)",
+        "np.maximum(self.expected, 1e-12)",
+        "a body half out of the picture convinces",
+        ("test_judgement_acceptance.py",),
+    ),
+    Mutant(
+        "matching-ranges-have-two-coordinates",
+        "matching/matches.py",
+        "return self.met * self.dimensions",
+        "return self.met * 2",
+        "ranges seem to fix poses that they leave open",
+    ),
+    Mutant(
+        "matching-filled-up-with-the-first-detection",
+        "matching/matches.py",
+        '-1 if name == "detections" else 0',
+        "0",
+        "bodies of fewer features own a detection that is another's",
+    ),
+)
+
+MUTANTS = (*_ERRORS, *_MET, *_RECORD)
