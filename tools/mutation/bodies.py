@@ -78,9 +78,16 @@ _BODY = (
     Mutant(
         "body-gravity-of-any-length",
         "body/model.py",
-        "unit = direction / np.linalg.norm(direction)",
-        "unit = direction",
+        "np.asarray(direction / np.linalg.norm(direction))",
+        "np.asarray(direction)",
         "the length of the direction scales the displacement",
+    ),
+    Mutant(
+        "body-gravity-widens-nothing",
+        "body/model.py",
+        "spreads = spreads + self.gravity.covariance",
+        "spreads = spreads + 0 * self.gravity.covariance",
+        "a body that sags is judged as if it were rigid",
     ),
     Mutant(
         "body-gravity-by-the-place-along-a-line",
