@@ -42,6 +42,18 @@ def test_gravity_displaces_along_the_world_whatever_the_pose() -> None:
     assert offsets[:, 2].std() == pytest.approx(1.5, rel=0.02)
 
 
+def test_gravity_widens_features_along_the_world_beside_their_own_spread() -> None:
+    features = (PointFeature(np.zeros(3), np.diag([9.0, 0, 0])), PointFeature(np.ones(3)))
+    body = Body("b", features, gravity=Gravity(np.array([0.0, 0.0, -2.0]), 4.0))
+    lying = np.eye(4)
+    lying[:3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # the body's x stands upright
+    np.testing.assert_allclose(
+        body.node_spreads(lying), [np.diag([0, 0, 25.0]), np.diag([0, 0, 16.0])], atol=1e-12
+    )
+    assert body.spread == pytest.approx(5.0)  # √(3² + 4²): no pose has more
+    assert len(body.symmetries) == len(Body("b", features).symmetries)
+
+
 def test_all_features_take_the_same_offsets_unless_told_otherwise() -> None:
     features = tuple(PointFeature(np.array([x, 0, 0.0]), COVARIANCE) for x in (0.0, 5.0))
     body = Body("b", features)

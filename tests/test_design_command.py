@@ -55,6 +55,37 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     assert (tmp_path / "d.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("name", ["study.png", "study.svg", "study.pdf", "study.json"])
+def test_nothing_is_overwritten_but_what_mixpose_wrote(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    option = "--json" if path.suffix == ".json" else "--plot"
+    arguments = ["design", str(TWO_CAMERAS), "--count", "2", option, str(path)]
+    path.write_bytes(b"holiday")
+    with pytest.raises(SystemExit) as leaving:
+        main(arguments)
+    assert leaving.value.code == 2
+    assert "holds something that mixpose did not write" in capsys.readouterr().err
+    assert path.read_bytes() == b"holiday"
+    path.unlink()
+    for _ in range(2):  # its own file, the second time
+        with pytest.raises(SystemExit) as leaving:
+            main(arguments)
+        assert leaving.value.code == 0
+    assert path.stat().st_size > 1000
+
+
+def test_an_input_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    session = tmp_path / "session.toml"
+    session.write_bytes(TWO_CAMERAS.read_bytes())
+    with pytest.raises(SystemExit) as leaving:
+        main(["design", str(session), "--count", "2", "--json", str(session)])
+    assert leaving.value.code == 2
+    assert "--json" in capsys.readouterr().err
+    assert session.read_bytes() == TWO_CAMERAS.read_bytes()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -65,6 +96,8 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
         (["--noise", "x:left=1"], "--noise: found no system 'x'"),
         (["--turn", "200"], "--turn: found 200"),
         (["--plot", "a.gif"], "--plot a.gif: found '.gif'"),
+        (["--plot", "none/a.png"], "--plot none/a.png: there is no folder none"),
+        (["--json", "none/a.json"], "--json none/a.json: there is no folder none"),
         (["--poses", "none.jsonl"], "none.jsonl"),
     ],
 )

@@ -38,7 +38,11 @@ def test_a_fault_makes_no_pose_wrong_and_is_named(name: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     ("name", "right"),
-    [("bumped by 0.5° from frame 20", 20), ("frozen for 5 frames", 10), ("torn for 5 frames", 10)],
+    [
+        ("bumped by 0.5° about y from frame 20", 20),
+        ("frozen for 5 frames", 10),
+        ("torn for 5 frames", 10),
+    ],
 )
 def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and_is_named(
     name: str, right: int, tmp_path: Path
@@ -57,7 +61,7 @@ def test_a_camera_that_begins_to_disagree_with_the_other_makes_no_pose_wrong_and
         ("frozen for 20 frames", 24, 10),
         ("saturated for 5 frames", 16, 16),
         ("black all along", 6, 6),
-        ("bumped by 3° from frame 20", 25, 20),
+        ("bumped by 3° about y from frame 20", 25, 20),
         ("marker falls off", 31, 31),
         ("marker measured 20 mm wrong", 12, 12),
         ("another camera's calibration", 4, 0),

@@ -49,7 +49,7 @@ def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascen
 
 
 def matched(objective: MatchedObjective, T: Floats) -> Matches:
-    return associate(objective, T[None], AssociationRules(), ErrorRules().narrowest).at(0)
+    return associate(objective, T, AssociationRules(), ErrorRules().narrowest)
 
 
 def bent(views: list[View], by_px: float) -> list[View]:

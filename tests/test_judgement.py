@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, Gravity, PointFeature
 from mixpose.judgement import Case, expected_covariance, judge, judge_together
 from mixpose.objective import matched_objective
 from mixpose.sensors import PinholeCamera
@@ -83,6 +83,25 @@ def test_a_body_that_gives_way_is_as_evident_bent_as_its_spread_lets_it_be(
     # what both cameras see alike is no noise of either
     bent = giving_way(0.0, off=1.0)
     assert evidence(giving_way(1.0), bent) > evidence(giving_way(0.0), bent) + 1
+
+
+def test_a_body_that_sags_is_evident_where_it_hangs_and_not_where_it_would_lean(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # each feature hangs as far below its place in the world as chance has it, up to 2 mm or so
+    down, across = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
+    sags = 1.5 * np.random.default_rng(3).normal(0, 1, (8, 1)) * down @ TRUTH[:3, :3]
+    sagging = Body("sags", tuple(PointFeature(p) for p in EIGHT.means + sags))
+
+    def evidence(gravity: Gravity | None) -> float:
+        body = replace(EIGHT, gravity=gravity)
+        views = detect(pinhole_cameras, sagging, TRUTH, noise=0.2, seed=4)
+        case = Case(matched_objective(views, body, [1.5, 1.5]), TRUTH)
+        return judge(case, ALL_FREE).log_evidence
+
+    rigid, hanging = evidence(None), evidence(Gravity(down, 1.5))
+    assert hanging > rigid + 1
+    assert hanging > evidence(Gravity(across, 1.5)) + 1
 
 
 def test_a_sensor_that_is_left_out_may_see_what_no_other_sees(

@@ -171,7 +171,7 @@ def test_features_that_face_a_camera_out_of_its_view_are_not_covered() -> None:
 def matched(views: list[View]) -> Matches:
     """The body at its true pose."""
     objective = matched_objective(views, EIGHT, [view.observation.sigma for view in views])
-    return associate(objective, TRUTH[None], AssociationRules(), ErrorRules().narrowest).at(0)
+    return associate(objective, TRUTH, AssociationRules(), ErrorRules().narrowest)
 
 
 def test_ranges_give_one_coordinate_each(range_sensors: list[RangeSensor]) -> None:

@@ -33,7 +33,7 @@ def met(
     body = Body("flat", tuple(PointFeature(np.array([*place, 0.0]), spread) for place in places))
     view = view_of("camera", CAMERA, np.array(detections) + 500.0, SIGMA)
     objective = matched_objective([view], body, [SIGMA])
-    return associate(objective, AT[None], RULES, ErrorRules().narrowest).at(0)
+    return associate(objective, AT, RULES, ErrorRules().narrowest)
 
 
 def test_a_detection_is_that_of_one_feature() -> None:

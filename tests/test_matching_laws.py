@@ -28,7 +28,8 @@ def matched(
 ) -> Matches:
     objective = matched_objective(views, body, [view.observation.sigma for view in views])
     rules = replace(RULES, merged=merged)
-    return associate(objective, poses, rules, ErrorRules().narrowest)
+    narrowest = ErrorRules().narrowest
+    return Matches.stacked([associate(objective, T, rules, narrowest) for T in poses])
 
 
 def assert_same(a: Matches, b: Matches) -> None:

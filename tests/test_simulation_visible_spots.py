@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mixpose.body import Body, PointFeature, SegmentFeature
+from mixpose.body import Body, Gravity, PointFeature, SegmentFeature
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.simulation.options import SimulationOptions
@@ -122,7 +122,8 @@ def test_detections_of_a_line_weigh_as_much_as_a_point() -> None:
 def test_deformed_features_scatter_by_the_spread_that_the_body_states() -> None:
     covariance = np.array([[9.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0, 0.0, 0.0]])
     body = Body("soft", (PointFeature(np.zeros(3), covariance), PointFeature(np.ones(3))))
-    offsets = np.array([displacements(body, np.random.default_rng(i)) for i in range(4000)])
+    drawn = [displacements(body, T, np.random.default_rng(i)) for i in range(4000)]
+    offsets = np.array(drawn)
     np.testing.assert_allclose(np.cov(offsets[:, 0].T), covariance, atol=0.5)
     assert not offsets[:, 1].any()
     seen = look(
@@ -131,3 +132,16 @@ def test_deformed_features_scatter_by_the_spread_that_the_body_states() -> None:
     )  # fmt: skip
     expected, _ = CAMERA.project(transform(T, body.means + offsets[0]))
     np.testing.assert_allclose(seen.points, expected, atol=1e-9)
+
+
+def test_features_that_sag_are_displaced_along_gravity_however_the_body_is_turned() -> None:
+    gravity = Gravity(np.array([0.0, 0.0, -3.0]), 2.0)
+    body = Body("soft", (PointFeature(np.zeros(3)), PointFeature(np.ones(3))), gravity=gravity)
+    turned = from_rotation_vector([0.4, -0.9, 0.3], [5.0, 6.0, 7.0])
+    drawn = [displacements(body, turned, np.random.default_rng(i)) for i in range(4000)]
+    in_world = np.array(drawn) @ turned[:3, :3].T
+    np.testing.assert_allclose(in_world[..., :2], 0.0, atol=1e-12)
+    # of 4000 draws a standard deviation is known to 1.1 %
+    np.testing.assert_allclose(in_world[..., 2].std(axis=0), 2.0, rtol=0.05)
+    # each feature by itself: by chance the correlation is 0.016
+    assert abs((in_world[:, 0, 2] * in_world[:, 1, 2]).mean() / 2.0**2) < 0.06

@@ -91,13 +91,19 @@ def torn(side: str, frames: range) -> Change:
     return change
 
 
-def bumped(side: str, frames: range, degrees: float) -> Change:
-    """A camera that has turned about its own y axis: its images, seen through a homography."""
+def turn(axis: str, degrees: float) -> Floats:
+    """A turn about x (across, to the right), y (down) or z (the line of sight) of a camera."""
+    angles = np.radians(degrees) * np.eye(3)["xyz".index(axis)]
+    return np.asarray(from_rotation_vector(angles, [0, 0, 0]))
+
+
+def bumped(side: str, frames: range, degrees: float, axis: str) -> Change:
+    """A camera that has turned about an axis of its own: its images, seen through a homography."""
 
     def change(folder: Path) -> None:
         setup = next(s for s in load_session(folder / "session.toml").sensors if s.name == side)
         K = setup.sensor.camera_matrix  # type: ignore[attr-defined]
-        R = from_rotation_vector([0.0, np.radians(degrees), 0.0], [0, 0, 0])[:3, :3]
+        R = turn(axis, degrees)[:3, :3]
         H = K @ R @ np.linalg.inv(K)
         size = setup.resolution
         assert size is not None
@@ -214,12 +220,13 @@ FAULTS: dict[str, Fault] = {
     "one frame late": Fault(
         instead("right", range(1, 40), lambda k: k - 1), "'right' is a frame late"
     ),
-    "bumped by 0.5° from frame 20": Fault(
-        bumped("right", range(20, 40), 0.5), "from frame 20 on.*bumped"
-    ),
-    "bumped by 3° from frame 20": Fault(
-        bumped("right", range(20, 40), 3.0), "from frame 20 on.*bumped"
-    ),
+    **{
+        f"bumped by {degrees}° about {axis} from frame 20": Fault(
+            bumped("right", range(20, 40), degrees, axis), "from frame 20 on.*bumped"
+        )
+        for axis in "xyz"
+        for degrees in (0.5, 3)
+    },
     "mirrored image": Fault(redrawn("right", FRAMES, lambda a: a[:, ::-1]), "'right'|mirror"),
     "another camera's calibration": Fault(
         rewritten(

@@ -29,7 +29,7 @@ _BODY = (
     Mutant(
         "body-symmetry-without-spread",
         "body/model.py",
-        "symmetries(points, max(default_tolerance(points), self.spread))",
+        "symmetries(points, max(default_tolerance(points), self._widest))",
         "symmetries(points, default_tolerance(points))",
         "poses that the spread of the features hides are not known as alike",
     ),
@@ -78,9 +78,16 @@ _BODY = (
     Mutant(
         "body-gravity-of-any-length",
         "body/model.py",
-        "unit = direction / np.linalg.norm(direction)",
-        "unit = direction",
+        "np.asarray(direction / np.linalg.norm(direction))",
+        "np.asarray(direction)",
         "the length of the direction scales the displacement",
+    ),
+    Mutant(
+        "body-gravity-widens-nothing",
+        "body/model.py",
+        "spreads = spreads + self.gravity.covariance",
+        "spreads = spreads + 0 * self.gravity.covariance",
+        "a body that sags is judged as if it were rigid",
     ),
     Mutant(
         "body-gravity-by-the-place-along-a-line",

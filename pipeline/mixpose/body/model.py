@@ -43,18 +43,29 @@ class Nodes:
 
 @dataclass(frozen=True)
 class Gravity:
-    """Displacement of all features along a direction of the world, however the body is turned.
+    """Displacements of features along a direction of the world, however the body is turned.
 
     Attributes
     ----------
     direction : (3,) float64
         In the world, of any length.
     sigma : float
-        Standard deviation of the displacement along it, length units.
+        Standard deviation of the displacement of a feature along it, length units.
     """
 
     direction: Floats
     sigma: float
+
+    @property
+    def unit(self) -> Floats:
+        """The direction (3,), of length 1."""
+        direction = np.asarray(self.direction, dtype=np.float64)
+        return np.asarray(direction / np.linalg.norm(direction))
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the displacement of a feature in the world (3, 3)."""
+        return np.asarray(self.sigma**2 * np.outer(self.unit, self.unit))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +151,28 @@ class Body:
 
     @cached_property
     def spread(self) -> float:
-        """Largest standard deviation of any feature in any direction."""
+        """Largest standard deviation of any feature in any direction, at any pose."""
+        sag = self.gravity.sigma if self.gravity is not None else 0.0
+        return float(np.hypot(self._widest, sag))
+
+    @cached_property
+    def _widest(self) -> float:
+        """The same of what turns with the body."""
         return float(np.sqrt(max(np.linalg.eigvalsh(self.covariances).max(), 0.0)))
 
     def node_spreads(self, T_world_object: Floats) -> Floats:
         """Spreads Σ_i of the nodes (Q, 3, 3) in the world, of the body at a pose (4, 4)."""
         R = T_world_object[:3, :3]
-        return np.asarray((R @ self.covariances @ R.T)[self.nodes.feature])
+        spreads = R @ self.covariances @ R.T
+        if self.gravity is not None:
+            spreads = spreads + self.gravity.covariance
+        return np.asarray(spreads[self.nodes.feature])
 
     @cached_property
     def symmetries(self) -> Floats:
         """Motions T_object_object (G, 4, 4) that map features and normals onto themselves."""
         points = self.nodes.points
-        found = symmetries(points, max(default_tolerance(points), self.spread))
+        found = symmetries(points, max(default_tolerance(points), self._widest))
         if self.node_normals is None:
             return found
         return found[[keeps_normals(T, points, self.node_normals) for T in found]]
@@ -166,7 +186,7 @@ class Body:
     @cached_property
     def grid_steps(self) -> Floats:
         """Shifts (S, 3) that map most of the features onto others, as the steps of a chessboard."""
-        tolerance = max(default_tolerance(self.means), self.spread)
+        tolerance = max(default_tolerance(self.means), self._widest)
         return grid_steps(self.means, tolerance, RECURRENT)
 
     def sample(
@@ -215,6 +235,4 @@ class Body:
         if self.gravity is None:
             return np.zeros((1 if self.is_exact else 2 * (count // 2), 3))
         drawn = uniforms(count, antithetic=antithetic, seed=seed)[:, 4]
-        direction = np.asarray(self.gravity.direction, dtype=np.float64)
-        unit = direction / np.linalg.norm(direction)
-        return np.asarray(self.gravity.sigma * ndtri(drawn)[:, None] * unit)
+        return np.asarray(self.gravity.sigma * ndtri(drawn)[:, None] * self.gravity.unit)

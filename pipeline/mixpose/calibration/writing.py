@@ -95,7 +95,7 @@ def _put_body(table: Any, found: Calibration, session: Session) -> None:
     if table.pop("file", None) is not None:
         if session.body.normals is not None:
             table["normals"] = _plain(session.body.normals)
-        if session.body.spread:
+        if session.body.covariances.any():
             table["sigma"] = [_plain(covariance) for covariance in session.body.covariances]
     table["points"] = _plain(found.after.points)
 

@@ -84,9 +84,12 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
     if (output is None) is not request.check:
         raise SessionError("calibrate: found no -o; allowed: -o CALIBRATED.toml, or --check alone")
     inputs = [path] if request.poses is None else [path, request.poses]
-    for written, mark in ((output, MARK), (request.report, REPORT_MARK)):
+    for written, mark, option in (
+        (output, MARK, "-o"),
+        (request.report, REPORT_MARK, "--report"),
+    ):
         if written is not None:
-            refuse_to_overwrite_but(written, inputs, mark)
+            refuse_to_overwrite_but(written, inputs, mark, option)
     with _calibrated(session, request, inputs) as found:
         if output is not None:
             _write(output, calibrated_text(session, found, output, __version__), "-o")

@@ -13,10 +13,12 @@ import numpy as np
 
 from mixpose.checking import with_image_sizes
 from mixpose.cli.notices import say
+from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.design import Request, spread_poses, study
-from mixpose.design.texts import study_json, study_text
+from mixpose.design.texts import JSON_MARK, study_json, study_text
 from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_processes, on_cluster
+from mixpose.pictures.signature import refuse_foreign, sign_figure
 from mixpose.poses.jsonl import read_poses
 from mixpose.rigid import Floats
 from mixpose.session import Session, load_session
@@ -58,10 +60,7 @@ def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
                 f"{path}: unit: found {session.unit!r}; allowed: {sessions[0].unit!r}, as of "
                 f"{paths[0]}, to compare them"
             )
-    if asked.plot is not None:
-        from mixpose.design.plot import require_plots  # noqa: PLC0415
-
-        require_plots(asked.plot)
+    _require_room(asked, paths)
     names = _names(paths)
     request = Request(
         poses=_poses(sessions[0], asked),
@@ -83,6 +82,21 @@ def design_sessions(paths: Sequence[Path], asked: DesignRequest) -> None:
 
         with appearing_whole(asked.plot) as draft:
             draw_study(found, draft)
+            sign_figure(draft)
+
+
+def _require_room(asked: DesignRequest, sessions: Sequence[Path]) -> None:
+    """See that what will be written is in nothing's way, before anything is computed."""
+    if asked.json is not None:
+        inputs = [*sessions] if asked.poses is None else [*sessions, asked.poses]
+        refuse_to_overwrite_but(asked.json, inputs, JSON_MARK, "--json")
+    if asked.plot is not None:
+        from mixpose.design.plot import require_plots  # noqa: PLC0415
+
+        require_plots(asked.plot)
+        if not asked.plot.parent.is_dir():
+            raise SessionError(f"--plot {asked.plot}: there is no folder {asked.plot.parent}")
+        refuse_foreign(asked.plot, "--plot")
 
 
 def _simulating(asked: DesignRequest) -> AbstractContextManager[Executor | None]:

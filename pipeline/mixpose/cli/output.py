@@ -181,7 +181,9 @@ def refuse_to_overwrite(path: Path, inputs: Iterable[Path]) -> None:
         raise SessionError(f"-o {path}: holds poses of another origin; name another file")
 
 
-def refuse_to_overwrite_but(path: Path, inputs: Iterable[Path], mark: str) -> None:
+def refuse_to_overwrite_but(
+    path: Path, inputs: Iterable[Path], mark: str, option: str = "-o"
+) -> None:
     """Make sure that a file about to be written is new, empty, or begins with a mark in it.
 
     Parameters
@@ -191,33 +193,37 @@ def refuse_to_overwrite_but(path: Path, inputs: Iterable[Path], mark: str) -> No
         Files that must stay.
     mark : str
         Words by which mixpose knows its own files of this kind.
+    option : str
+        By which the file was named.
 
     Raises
     ------
     SessionError
         If it is one of the inputs, or holds something else.
     """
-    beginning = _beginning(path, inputs)
+    beginning = _beginning(path, inputs, option)
     if beginning and mark not in beginning:
-        raise _foreign(path)
+        raise _foreign(path, option)
 
 
-def _beginning(path: Path, inputs: Iterable[Path]) -> str:
+def _beginning(path: Path, inputs: Iterable[Path], option: str = "-o") -> str:
     """The first characters of a file that may be in the way; none where no file is."""
     if not path.parent.is_dir():
-        raise SessionError(f"-o {path}: there is no folder {path.parent}")
+        raise SessionError(f"{option} {path}: there is no folder {path.parent}")
     if path.is_dir():
-        raise SessionError(f"-o {path}: is a folder; name a file")
+        raise SessionError(f"{option} {path}: is a folder; name a file")
     if not path.is_file():
         return ""
     if any(each.exists() and path.samefile(each) for each in inputs):
-        raise SessionError(f"-o {path}: is an input of this run; name another file")
+        raise SessionError(f"{option} {path}: is an input of this run; name another file")
     with path.open("rb") as stream:
         return stream.read(4096).decode("utf-8", errors="replace")
 
 
-def _foreign(path: Path) -> SessionError:
-    return SessionError(f"-o {path}: holds something that mixpose did not write; name another file")
+def _foreign(path: Path, option: str = "-o") -> SessionError:
+    return SessionError(
+        f"{option} {path}: holds something that mixpose did not write; name another file"
+    )
 
 
 def _is_number(word: str) -> bool:

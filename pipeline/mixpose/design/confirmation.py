@@ -126,7 +126,7 @@ def _errors_at(place: _Place) -> tuple[list[Floats], Counter[str]]:
         amplitude_rotation_deg=0.0,
         pixel_noise=least[2],
         range_noise=least[1],
-        deform=bool(plan.body.spread or plan.body.gravity),
+        deform=bool(plan.body.spread),
     )
     alike = T @ plan.body.symmetries
     errors: list[Floats] = []

@@ -151,9 +151,7 @@ def _marker_covariances(body: Body, rotations: Floats) -> Floats:
     """Spreads of features in world axes (P, N, 3, 3)."""
     turned = rotations[:, None] @ body.covariances @ rotations[:, None].swapaxes(-1, -2)
     if body.gravity is not None:
-        direction = np.asarray(body.gravity.direction, dtype=np.float64)
-        unit = direction / np.linalg.norm(direction)
-        turned = turned + body.gravity.sigma**2 * np.outer(unit, unit)
+        turned = turned + body.gravity.covariance
     return np.asarray(turned)
 
 

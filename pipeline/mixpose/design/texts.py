@@ -222,9 +222,14 @@ def _vector(values: Floats) -> str:
     return f"({', '.join(f'{v:g}' for v in shown)})"
 
 
+JSON_MARK = '"type": "design"'
+"""What the numbers of a study begin with, by which mixpose knows its own files."""
+
+
 def study_json(study: Study) -> dict[str, Any]:
     """The same as JSON; what is not determined is null."""
     return {
+        "type": "design",
         "unit": study.unit,
         "tip": None if study.request.tip is None else study.request.tip.tolist(),
         "poses": study.request.poses.tolist(),

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +84,9 @@ class Matches:
         """At one of K poses."""
         return self._part(pose)
 
-    def of_sensors(self, chosen: Sequence[int]) -> Matches:
-        """Some of the sensors, at one pose."""
-        numbers = list(chosen)
+    def of_sensors(self, chosen: Sequence[int] | Mask | Indices) -> Matches:
+        """Some of the sensors, by numbers or a mask, at one pose."""
+        numbers = np.arange(len(self.names))[np.asarray(chosen)].tolist()
         names = tuple([self.names[k] for k in numbers])
         per_sensor = self.dimensions[numbers], self.sigmas[numbers]
         some = self._part(numbers)

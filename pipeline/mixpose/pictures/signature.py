@@ -40,13 +40,27 @@ def write_signed(path: Path, png: bytes) -> None:
     SessionError
         If they cannot be written.
     """
-    body = b"tEXt" + b"Software\0" + SIGNATURE
-    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
     try:
         with appearing_whole(path) as part:
-            part.write_bytes(png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:])
+            part.write_bytes(_signed(png))
     except OSError as error:
         raise SessionError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def sign_figure(path: Path) -> None:
+    """Put the signature into a PNG, or in a comment after the end of an SVG or a PDF."""
+    content, suffix = path.read_bytes(), path.suffix.casefold()
+    if suffix == ".png":
+        path.write_bytes(_signed(content))
+    else:
+        comment = {".svg": b"<!-- " + SIGNATURE + b" -->\n", ".pdf": b"% " + SIGNATURE + b"\n"}
+        path.write_bytes(content + comment[suffix])
+
+
+def _signed(png: bytes) -> bytes:
+    body = b"tEXt" + b"Software\0" + SIGNATURE
+    chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+    return png[:_PNG_HEAD] + chunk + png[_PNG_HEAD:]
 
 
 def sign_video(path: Path) -> None:

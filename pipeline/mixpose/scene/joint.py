@@ -53,8 +53,6 @@ class Joint:
         By member: the frame as it is left for it.
     ranked : dict of int to list of ScoredPose
         Its poses, most evident first.
-    close_calls : set of int
-        Members that won or lost their detections by little.
     """
 
     def __init__(
@@ -69,7 +67,6 @@ class Joint:
         self.members, self.tracks = members, tracks
         self.data: dict[int, FrameData] = {}
         self.ranked: dict[int, list[ScoredPose]] = {}
-        self.close_calls: set[int] = set()
         self._frame, self._time_s, self._rules = frame, time_s, rules
         self._views = [view for view in views if not view.observation.is_empty]
         self._left: dict[int, Left] = {}
@@ -260,9 +257,6 @@ class Joint:
             if overlap(self._own_claims(first), self._own_claims(other)) < self._rules.rival:
                 continue
             gain = self.together(first, other) - self.together(other, first)
-            rules = self.members[first].tracker.rules.acceptance
-            if abs(gain) < -np.log(rules.rival):
-                self.close_calls |= {first, other}
             if gain < 0:
                 first = other
         return first

@@ -31,7 +31,10 @@ def as_list(value: Any) -> Any:
 
 
 class GravityTable(Table):
-    """Displacement of all features along one direction of the world, however the body is turned."""
+    """Features sag, each by itself, along one direction of the world, however the body is turned.
+    It counts as `sigma` does: in what a pose is worth and how far off features may be met. The
+    sampled objectives (`"paper"`, `"independent"`) integrate over it.
+    """
 
     direction: Annotated[Floats, ArrayOf((3,), "a direction [x, y, z] in the world")]
     """Where gravity points in the world; its length does not matter.
@@ -39,7 +42,7 @@ class GravityTable(Table):
     Example: `direction = [0, 0, -1]`
     """
     sigma: Annotated[Positive, Field(description="a length greater than 0")]
-    """Standard deviation of the displacement along it, in `unit`.
+    """Standard deviation of a feature's displacement along it, in `unit`.
 
     Example: `sigma = 2.0`
     """

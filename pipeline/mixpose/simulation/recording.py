@@ -265,7 +265,8 @@ def _record_frame(
     after = options.away_from
     is_away = after is not None and number - plan.numbers[0] >= after
     if options.deform:
-        offsets = displacements(body, generator(options.seed, Purpose.DEFORMATION, number))
+        rng = generator(options.seed, Purpose.DEFORMATION, number)
+        offsets = displacements(body, T_world_object, rng)
     recorded = False
     for i, (channel, writer) in enumerate(zip(plan.channels, writers)):
         chance = generator(options.seed, Purpose.MISSING, number, i).random()

@@ -260,11 +260,18 @@ def brightness_levels(count: int, spread: float, rng: np.random.Generator) -> Fl
     return np.maximum(1.0 + spread * rng.standard_normal(count), _DIMMEST)
 
 
-def displacements(body: Body, rng: np.random.Generator) -> Floats:
-    """Displacements (N, 3) of the features, drawn from the spread that the body states."""
+def displacements(body: Body, T_world_object: Floats, rng: np.random.Generator) -> Floats:
+    """Displacements (N, 3) of the features, drawn from the spread that the body states.
+
+    They are in the body's axes; gravity's turn against it with the pose (4, 4).
+    """
     draws = rng.uniform(np.finfo(np.float64).eps, 1.0, (len(body), 1, 4))
     pairs = zip(draws, body.features, strict=True)
-    return np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
+    drawn = np.array([offsets(u, f.covariance, f.spread)[0] for u, f in pairs])
+    if body.gravity is None:
+        return drawn
+    along = body.gravity.sigma * rng.standard_normal((len(body), 1)) * body.gravity.unit
+    return np.asarray(drawn + along @ T_world_object[:3, :3])
 
 
 def _hidden(count: int, options: SimulationOptions, rng: np.random.Generator) -> Mask:

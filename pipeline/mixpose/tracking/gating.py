@@ -51,8 +51,7 @@ class Expectation:
         """How far a feature's image reaches: less than half way to that of its neighbour."""
         points = self.body.nodes.points
         apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
-        gravity = self.body.gravity.sigma if self.body.gravity is not None else 0.0
-        return float(apart / 2 + self.rules.reach * np.hypot(self.body.spread, gravity))
+        return float(apart / 2 + self.rules.reach * self.body.spread)
 
     def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
         """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
