@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import LONGEST_S, wait_until
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
@@ -47,6 +48,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
 
     frames = 20
     period_s = 0.03
+    sent = 0
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -56,6 +58,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
             return
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
         self.end_headers()
+        Camera.sent = 0
         for number in range(self.frames):
             data = numbered(number)
             head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
@@ -63,6 +66,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
                 self.wfile.write(head.encode() + data + b"\r\n")
             except ConnectionError:  # the reader has seen enough
                 return
+            Camera.sent = number + 1
             time.sleep(self.period_s)
 
     def log_message(self, *_: object) -> None:
@@ -154,7 +158,7 @@ def test_pipe_whose_writer_falls_silent_is_told_after_the_frames_that_came(tmp_p
     def write(stream: Any) -> None:
         stream.write(CLIP.read_bytes()[:200_000])
         stream.flush()
-        enough.wait(20)
+        enough.wait(LONGEST_S)
 
     with piped(tmp_path / "left", write) as pipe:
         found: list[RawFrame] = []
@@ -189,7 +193,10 @@ def test_slow_consumer_of_a_live_stream_gets_the_newest_frame(server: str) -> No
     numbers = []
     for frame in opened(f"{server}/live").frames():
         numbers.append(frame.number)
-        time.sleep(10 * Camera.period_s)
+        # ten frames come meanwhile, however slowly they do, or the last
+        enough = min(Camera.sent + 10, Camera.frames)
+        wait_until(lambda enough=enough: Camera.sent >= enough)  # type: ignore[misc]
+        time.sleep(10 * Camera.period_s)  # and arrive
     assert numbers[-1] == Camera.frames - 1
     assert len(numbers) <= 10  # of 20; three or four where the machine is not busy
 
@@ -225,7 +232,7 @@ def test_live_source_that_does_not_open_is_told_in_time(source: str) -> None:
     began = time.monotonic()
     with pytest.raises(RecordingError, match=f"^{source}: does not open$"):
         next(opened(source).frames())
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 20  # OpenCV left to itself waits for 30 s
 
 
 class Stalling(Camera):
