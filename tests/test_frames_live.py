@@ -85,7 +85,8 @@ def server() -> Iterator[str]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture, "PATIENCE_S", 1.0)
+    # a busy machine holds up frames for a good part of a second
+    monkeypatch.setattr(capture, "PATIENCE_S", 3.0)
 
 
 @contextmanager
@@ -146,7 +147,7 @@ def test_descriptors_of_pipes_are_given_back(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("impatient")
 def test_pipe_that_nobody_writes_to_is_told(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left")
-    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 1 s"):
+    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 3 s"):
         next(opened(tmp_path / "left").frames())
 
 
@@ -162,7 +163,7 @@ def test_pipe_whose_writer_falls_silent_is_told_after_the_frames_that_came(tmp_p
 
     with piped(tmp_path / "left", write) as pipe:
         found: list[RawFrame] = []
-        with pytest.raises(RecordingError, match=r"left: no frame came for 1 s"):
+        with pytest.raises(RecordingError, match=r"left: no frame came for 3 s"):
             found.extend(opened(pipe).frames())
         enough.set()
     assert 15 < len(found) < 40  # 200 of 470 kB hold about 25 of the 60 frames
@@ -263,7 +264,7 @@ class Stalling(Camera):
             Stalling.sent += 1
             time.sleep(self.period_s)
         if Stalling.sent < 3 * self.frames:
-            self.over.wait(20)
+            self.over.wait(LONGEST_S)
 
 
 @pytest.fixture
@@ -293,9 +294,9 @@ def test_stream_that_stalls_is_opened_again_and_its_frames_count_on(stalling: st
 def test_stream_that_stays_away_ends_the_reading_with_its_reason(
     stalling: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "RETURN_S", 1.0)
+    monkeypatch.setattr(live, "RETURN_S", 3.0)
     found: list[RawFrame] = []
-    with pytest.raises(RecordingError, match=r"/gone: (does not open|no frame came for 1 s)$"):
+    with pytest.raises(RecordingError, match=r"/gone: (does not open|no frame came for 3 s)$"):
         found.extend(opened(f"{stalling}/gone").frames())
     assert found
 
