@@ -103,9 +103,9 @@ def test_directions_that_are_held_cannot_look_alike() -> None:
 def test_a_hundred_features_take_less_than_a_second() -> None:
     rng = np.random.default_rng(0)
     body = body_of(rng.uniform(-60, 60, (100, 3)))
-    began = time.perf_counter()
+    began = time.process_time()
     assert look_alikes([camera()], body, facing_camera(500.0), ALL) == []
-    assert time.perf_counter() - began < 1.0  # what check may take for it; measured: 0.3 s
+    assert time.process_time() - began < 1.0  # what check may take for it; measured: 0.05 s
 
 
 def test_typical_poses_are_in_view_at_the_distance_asked_for() -> None:

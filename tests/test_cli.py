@@ -9,13 +9,21 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, lines_of, mixpose
+from command_line import (
+    LONGEST_S,
+    assert_one_line,
+    has_written,
+    lines_of,
+    mixpose,
+    started,
+    wait_until,
+)
+from long_recordings import RANGE_FRAMES, long_ranges
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -199,34 +207,17 @@ def test_debug_names_the_proposer_of_poses_that_were_not_predicted(recording: Pa
     assert "searched" not in result.stdout
 
 
-def test_an_interrupt_leaves_whole_lines_and_status_130(recording: Path) -> None:
-    poses = recording / "poses.jsonl"
-    command = [
-        sys.executable, "-m", "mixpose", "run", str(recording.parent / "long.toml"),
-        "-o", str(poses),
-    ]  # fmt: skip
-    # long enough not to be done before the interrupt comes
-    text = (SYNTHETIC / "range_profiles" / "session.toml").read_text(encoding="utf-8")
-    for name in ("front", "side", "top"):
-        table = recording.parent / f"{name}.csv"
-        table.write_text(
-            "frame,range\n" + "".join(f"{k},950\n{k},1010\n{k},1080\n" for k in range(5000)),
-            encoding="utf-8",
-        )
-        text = text.replace(f"{name}.npy", f"{name}.csv")
-    text = "\n".join(
-        line for line in text.splitlines() if not line.startswith(("range_min", "bin_size"))
-    )
-    (recording.parent / "long.toml").write_text(text, encoding="utf-8")
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and not (poses.exists() and poses.stat().st_size > 3000):
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+def test_an_interrupt_leaves_whole_lines_and_status_130(tmp_path: Path) -> None:
+    (session,) = long_ranges(tmp_path, "a")
+    poses = tmp_path / "poses.jsonl"
+    command = [sys.executable, "-m", "mixpose", "run", str(session), "-o", str(poses)]
+    with started(command, stderr=subprocess.PIPE) as process:
+        wait_until(lambda: has_written(poses), by=process)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 130
     assert stderr == "mixpose: interrupted; everything so far is written\n"
-    assert len(lines_of(poses.read_text(encoding="utf-8"))) > 1
+    assert 1 < len(lines_of(poses.read_text(encoding="utf-8"))) <= RANGE_FRAMES
 
 
 @pytest.mark.skipif(os.name == "nt", reason="pipes to head are a POSIX habit")

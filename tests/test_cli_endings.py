@@ -7,10 +7,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
+from command_line import LONGEST_S, has_written, started, wait_until
+from long_recordings import CAMERA_FRAMES, long_cameras
 
 from mixpose.cli import main
 
@@ -35,19 +36,17 @@ def test_a_request_to_end_finishes_the_video_as_an_interrupt_does(
         pytest.skip("run under nohup, which makes all that is started ignore a hang-up")
 
     poses, video = tmp_path / "poses.jsonl", tmp_path / "seen.mp4"
-    command = [sys.executable, "-m", "mixpose", "run", str(SESSION), "-o", str(poses)]
-    process = subprocess.Popen(
-        [*command, "--overlay", str(video)], stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and not (poses.exists() and poses.stat().st_size > 3000):
-        time.sleep(0.02)
-    process.send_signal(request_to_end)
-    _, stderr = process.communicate(timeout=30)
+    session = long_cameras(tmp_path)
+    command = [sys.executable, "-m", "mixpose", "run", str(session), "-o", str(poses)]
+    command += ["--overlay", str(video)]
+    with started(command, stderr=subprocess.PIPE) as process:
+        wait_until(lambda: has_written(poses), by=process)
+        process.send_signal(request_to_end)
+        _, stderr = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 130
     assert stderr == "mixpose: interrupted; everything so far is written\n"
     count = len(poses.read_text(encoding="utf-8").splitlines()) - 1
-    assert 0 < count < 40  # of 40: it was interrupted
+    assert 0 < count < CAMERA_FRAMES  # it was interrupted
     # an MP4 that is not finished has no frame; the frame being written may be in one of the two
     assert abs(cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FRAME_COUNT) - count) <= 1
 
@@ -56,12 +55,10 @@ def test_a_request_to_end_finishes_the_video_as_an_interrupt_does(
 def test_a_run_that_ignores_hangups_goes_on_after_one(tmp_path: Path) -> None:
     poses = tmp_path / "poses.jsonl"
     command = f"trap '' HUP; exec {MIXPOSE} run {SESSION} -o {poses}"
-    process = subprocess.Popen(["sh", "-c", command], stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 30
-    while time.monotonic() < deadline and not poses.exists():
-        time.sleep(0.02)
-    process.send_signal(signal.SIGHUP)
-    process.communicate(timeout=30)
+    with started(["sh", "-c", command], stderr=subprocess.PIPE) as process:
+        wait_until(lambda: poses.exists() or process.poll() is not None)
+        process.send_signal(signal.SIGHUP)
+        process.communicate(timeout=LONGEST_S)
     assert process.returncode == 0
 
 

@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from command_line import LONGEST_S
 
 from mixpose.cli import main
 from mixpose.errors import SessionError
@@ -37,7 +38,7 @@ def test_poses_of_a_pipe_appear_while_it_is_written_and_its_end_ends_the_run(
         with pipe.open("wb") as stream:
             stream.write(data[:250_000])
             stream.flush()
-            seen.wait(60)
+            seen.wait(LONGEST_S)
             stream.write(data[250_000:])
 
     writer = threading.Thread(target=write, daemon=True)

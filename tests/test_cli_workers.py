@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import LONGEST_S, has_written, started, wait_until
+from long_recordings import long_ranges
 
 from mixpose.cli.lines import LineFile
 from mixpose.cli.recording_job import Job, finished, run_job
@@ -50,41 +52,14 @@ def refusal(*sessions: Path, output: Path | None, sources: tuple[str, ...] = ())
     return str(caught.value)
 
 
-def long_sessions(folder: Path, names: str) -> list[Path]:
-    """Sessions with a recording that takes a while."""
-    text = "\n".join(
-        line
-        for line in RANGES.read_text(encoding="utf-8").replace(".npy", ".csv").splitlines()
-        if not line.startswith(("range_min", "bin_size"))
-    )
-    rows = "".join(f"{k},950\n{k},1010\n{k},1080\n" for k in range(5000))
-    for name in ("front", "side", "top"):
-        (folder / f"{name}.csv").write_text("frame,range\n" + rows, encoding="utf-8")
-    sessions = [folder / f"{name}.toml" for name in names]
-    for session in sessions:
-        session.write_text(text, encoding="utf-8")
-    return sessions
-
-
-def wait_until(condition: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.02)
-    return False
-
-
 def killed_parent(
     sessions: list[Path], folder: Path, begin: Callable[[Iterable[bool]], bool] = all
 ) -> list[Path]:
     """What two sessions write, where the run is killed when both or any of them have begun."""
     command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
-    process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.DEVNULL)
     begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in names_of(sessions)]
-    assert wait_until(lambda: begin(p.exists() and p.stat().st_size > 3000 for p in begun))
-    process.kill()
-    process.wait()
+    with started([*command, "--workers", "2"], stderr=subprocess.DEVNULL) as process:
+        wait_until(lambda: begin(has_written(path) for path in begun), by=process)
     return begun
 
 
@@ -192,8 +167,11 @@ def test_a_worker_that_does_not_see_the_folder_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes end otherwise there")
-def test_the_children_of_a_killed_parent_end(tmp_path: Path) -> None:
-    begun = killed_parent(long_sessions(tmp_path, "ab"), tmp_path / "poses")
+def test_the_children_of_a_killed_parent_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mixpose.cli.lines.PATIENCE_S", LONGEST_S)
+    begun = killed_parent(long_ranges(tmp_path, "ab"), tmp_path / "poses")
     # whoever still writes holds the lock; when nobody does, the files stay as they are
     for path in begun:
         LineFile(path, afresh=False).close()
@@ -210,7 +188,7 @@ def test_the_children_of_a_killed_parent_end(tmp_path: Path) -> None:
 def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_once(
     tmp_path: Path,
 ) -> None:
-    sessions, folder = make_recordings(tmp_path, 2, 100), tmp_path / "poses"
+    sessions, folder = make_recordings(tmp_path, 2, 200), tmp_path / "poses"
     begun = killed_parent(sessions, folder, any)
     assert any(path.exists() for path in begun)  # it was killed midway
     again = mixpose("run", *sessions, "-o", folder, "--workers", "2")
@@ -219,7 +197,7 @@ def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_onc
     for session in sessions:
         assert mixpose("run", session, "-o", alone).returncode == 0
         poses = folder / session.parent.name / "poses.jsonl"
-        assert len(poses_of(poses)) == 101  # with the header
+        assert len(poses_of(poses)) == 201  # with the header
         assert without_latency(poses) == without_latency(alone)
 
 
@@ -247,14 +225,14 @@ def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:
 def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
     tmp_path: Path, request_to_end: signal.Signals
 ) -> None:
-    sessions = long_sessions(tmp_path, "abc")  # the third one waits its turn
+    sessions = long_ranges(tmp_path, "abc")  # the third one waits its turn
     folder = tmp_path / "poses"
     command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
-    process = subprocess.Popen([*command, "--workers", "2"], stderr=subprocess.PIPE, text=True)
     begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in "ab"]
-    assert wait_until(lambda: all(p.exists() and p.stat().st_size > 3000 for p in begun))
-    process.send_signal(request_to_end)
-    _, stderr = process.communicate(timeout=30)
+    with started([*command, "--workers", "2"], stderr=subprocess.PIPE) as process:
+        wait_until(lambda: all(map(has_written, begun)), by=process)
+        process.send_signal(request_to_end)
+        _, stderr = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 130
     assert stderr.splitlines()[-1] == "mixpose: interrupted; everything so far is written"
     for path in begun:

@@ -125,4 +125,4 @@ def test_scikit_image_is_imported_by_the_rules_that_need_it_only() -> None:
         "extract(image, ExtractOptions(threshold='li'))\n"
         "assert 'skimage' in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -15,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from command_line import LONGEST_S, wait_until
 from numpy.typing import NDArray
 
 from mixpose.errors import RecordingError, SessionError
@@ -47,6 +48,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
 
     frames = 20
     period_s = 0.03
+    sent = 0
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -56,6 +58,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
             return
         self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
         self.end_headers()
+        Camera.sent = 0
         for number in range(self.frames):
             data = numbered(number)
             head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
@@ -63,6 +66,7 @@ class Camera(http.server.BaseHTTPRequestHandler):
                 self.wfile.write(head.encode() + data + b"\r\n")
             except ConnectionError:  # the reader has seen enough
                 return
+            Camera.sent = number + 1
             time.sleep(self.period_s)
 
     def log_message(self, *_: object) -> None:
@@ -81,7 +85,8 @@ def server() -> Iterator[str]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture, "PATIENCE_S", 1.0)
+    # a busy machine holds up frames for a good part of a second
+    monkeypatch.setattr(capture, "PATIENCE_S", 3.0)
 
 
 @contextmanager
@@ -142,7 +147,7 @@ def test_descriptors_of_pipes_are_given_back(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("impatient")
 def test_pipe_that_nobody_writes_to_is_told(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left")
-    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 1 s"):
+    with pytest.raises(RecordingError, match=r"left: nothing was written to this pipe for 3 s"):
         next(opened(tmp_path / "left").frames())
 
 
@@ -154,11 +159,11 @@ def test_pipe_whose_writer_falls_silent_is_told_after_the_frames_that_came(tmp_p
     def write(stream: Any) -> None:
         stream.write(CLIP.read_bytes()[:200_000])
         stream.flush()
-        enough.wait(20)
+        enough.wait(LONGEST_S)
 
     with piped(tmp_path / "left", write) as pipe:
         found: list[RawFrame] = []
-        with pytest.raises(RecordingError, match=r"left: no frame came for 1 s"):
+        with pytest.raises(RecordingError, match=r"left: no frame came for 3 s"):
             found.extend(opened(pipe).frames())
         enough.set()
     assert 15 < len(found) < 40  # 200 of 470 kB hold about 25 of the 60 frames
@@ -189,7 +194,10 @@ def test_slow_consumer_of_a_live_stream_gets_the_newest_frame(server: str) -> No
     numbers = []
     for frame in opened(f"{server}/live").frames():
         numbers.append(frame.number)
-        time.sleep(10 * Camera.period_s)
+        # ten frames come meanwhile, however slowly they do, or the last
+        enough = min(Camera.sent + 10, Camera.frames)
+        wait_until(lambda enough=enough: Camera.sent >= enough)  # type: ignore[misc]
+        time.sleep(10 * Camera.period_s)  # and arrive
     assert numbers[-1] == Camera.frames - 1
     assert len(numbers) <= 10  # of 20; three or four where the machine is not busy
 
@@ -225,7 +233,7 @@ def test_live_source_that_does_not_open_is_told_in_time(source: str) -> None:
     began = time.monotonic()
     with pytest.raises(RecordingError, match=f"^{source}: does not open$"):
         next(opened(source).frames())
-    assert time.monotonic() - began < 5
+    assert time.monotonic() - began < 20  # OpenCV left to itself waits for 30 s
 
 
 class Stalling(Camera):
@@ -256,7 +264,7 @@ class Stalling(Camera):
             Stalling.sent += 1
             time.sleep(self.period_s)
         if Stalling.sent < 3 * self.frames:
-            self.over.wait(20)
+            self.over.wait(LONGEST_S)
 
 
 @pytest.fixture
@@ -286,9 +294,9 @@ def test_stream_that_stalls_is_opened_again_and_its_frames_count_on(stalling: st
 def test_stream_that_stays_away_ends_the_reading_with_its_reason(
     stalling: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "RETURN_S", 1.0)
+    monkeypatch.setattr(live, "RETURN_S", 3.0)
     found: list[RawFrame] = []
-    with pytest.raises(RecordingError, match=r"/gone: (does not open|no frame came for 1 s)$"):
+    with pytest.raises(RecordingError, match=r"/gone: (does not open|no frame came for 3 s)$"):
         found.extend(opened(f"{stalling}/gone").frames())
     assert found
 

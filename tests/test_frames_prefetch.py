@@ -5,23 +5,16 @@ from __future__ import annotations
 import gc
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 
 import pytest
+from command_line import wait_until
 
 from mixpose.frames import prefetch
 
 
 def workers() -> int:
     return sum(thread.name == "mixpose-prefetch" for thread in threading.enumerate())
-
-
-def wait_for(condition: Callable[[], bool]) -> bool:
-    for _ in range(1000):
-        if condition():
-            return True
-        time.sleep(0.005)
-    return False
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +55,7 @@ def test_no_more_than_the_depth_is_read_ahead() -> None:
     stream = prefetch(counting(50, log), depth=3)
     assert next(stream) == 0
     # One is taken, three wait, one is on its way into the queue.
-    assert wait_for(lambda: len(log) == 5)
+    wait_until(lambda: len(log) == 5)
     time.sleep(0.02)
     assert len(log) == 5
     stream.close()
@@ -107,5 +100,5 @@ def test_source_works_while_the_consumer_does() -> None:
     log: list[str] = []
     stream = prefetch(counting(10, log))
     assert next(stream) == 0
-    assert wait_for(lambda: "made 1" in log)
+    wait_until(lambda: "made 1" in log)
     stream.close()

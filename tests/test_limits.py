@@ -25,7 +25,8 @@ from mixpose.poses.jsonl import read_poses, read_unfinished_poses
 from mixpose.runner import run
 from mixpose.session import load_session
 
-GENEROUS_S = 5.0  # on a busy machine; without the limits these take minutes, or all memory
+# of a processor that others keep busy; without the limits these take minutes, or all memory
+GENEROUS_S = 30.0
 
 
 @pytest.fixture(autouse=True)

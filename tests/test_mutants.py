@@ -80,6 +80,23 @@ def test_a_mutant_dies_of_the_test_that_notices_it_and_another_survives(tree: Pa
     assert (tree / tool.PACKAGE / "rigid.py").read_text(encoding="utf-8") == DOUBLE
 
 
+def test_a_mutant_whose_tests_run_out_of_time_is_no_killed_one(
+    tree: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    endless = mutant("return 2 * x", "while True: x", name="rigid-endless")
+    monkeypatch.setattr(tool, "TIME_LIMIT_S", 5.0)
+    outcome = tool.trial(tree, tree.parent / "copy", endless)
+    assert (outcome.killed_by, outcome.out_of_time, outcome.verdict) == (None, True, "OUT OF TIME")
+    assert not (tree.parent / "copy").exists()
+    monkeypatch.setattr(tool, "tried", lambda *_, **__: [outcome])
+    assert tool.main([]) == 1
+    assert "1 mutants, 0 survived, 1 ran out of time" in capsys.readouterr().out
+    # the same tests without a mutant
+    monkeypatch.setattr(tool, "TIME_LIMIT_S", 0.01)
+    with pytest.raises(MutationError, match=r"without any mutant, the tests are not done after"):
+        tool.check_sound(tree, [endless])
+
+
 def test_a_mutant_that_cannot_be_imported_is_an_error_and_no_verdict(tree: Path) -> None:
     broken = mutant("def twice", "def thrice", name="rigid-broken")
     with pytest.raises(MutationError, match="rigid-broken: the tests do not run"):

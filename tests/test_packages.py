@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -22,6 +26,72 @@ def built(source: Path, kind: str, folder: Path) -> Path:
     subprocess.run(command, cwd=source, check=True, capture_output=True)
     (package,) = folder.iterdir()
     return package
+
+
+# distributions whose modules have other names
+NAMES = {"cv2": "opencv-python-headless", "yaml": "pyyaml", "skimage": "scikit-image",
+         "rerun": "rerun-sdk", "dask": "distributed"}  # fmt: skip
+
+
+def required(words: Iterable[str]) -> set[str]:
+    """Distributions of requirements, as `pydantic-core` of `pydantic_core>=2`."""
+    found = (re.match(r"[\w.-]+", word) for word in words)
+    return {name[0].lower().replace("_", "-") for name in found if name}
+
+
+def imported(path: Path) -> Iterator[tuple[str, bool]]:
+    """Distributions that a module imports, and whether it does so whenever it is imported."""
+    waiting: list[tuple[ast.AST, bool]] = [(ast.parse(path.read_text(encoding="utf-8")), True)]
+    while waiting:
+        node, at_once = waiting.pop()
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names = [node.module or ""]
+        for name in names:
+            top = name.partition(".")[0]
+            if top not in sys.stdlib_module_names and top != "mixpose":
+                yield NAMES.get(top, top.replace("_", "-")), at_once
+        typing = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        later = typing or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        waiting += [(child, at_once and not later) for child in ast.iter_child_nodes(node)]
+
+
+def test_whatever_is_imported_is_declared_and_what_is_extra_only_where_it_is_needed() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    always = required(project["dependencies"])
+    extras = project["optional-dependencies"]
+    extra = required(word for name in extras if name != "dev" for word in extras[name])
+    seen: set[str] = set()
+    for path in (ROOT / "pipeline" / "mixpose").rglob("*.py"):
+        for name, at_once in imported(path):
+            assert name in always | (set() if at_once else extra), f"{path}: {name}"
+            seen.add(name)
+    assert seen == (always | extra) - {"mixpose"}  # and nothing is declared that nobody imports
+
+
+def test_the_source_distribution_has_what_is_under_version_control_and_nothing_else(
+    tmp_path: Path,
+) -> None:
+    root = tmp_path / "root"
+    kept = ["pyproject.toml", ".gitignore", "README.md", "LICENSE", "CHANGELOG.md",
+            "CONTRIBUTING.md", ".pre-commit-config.yaml", ".ci/run", "data/a.png", "docs/index.md",
+            "pipeline/mixpose/__init__.py", "tests/test_a.py", "tools/a.py"]  # fmt: skip
+    left = [".hypothesis/examples/a", ".mypy_cache/a", "notes.txt", "out/poses.jsonl",
+            "poses.jsonl", "tests/__pycache__/a.pyc", "tests/.hypothesis/a"]  # fmt: skip
+    for name in [*kept, *left]:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        there = ROOT / name
+        text = there.read_text(encoding="utf-8") if name in kept and there.is_file() else "a = 1\n"
+        (root / name).write_text(text, encoding="utf-8")
+    with tarfile.open(built(root, "sdist", tmp_path / "sdist")) as archive:
+        found = {name.partition("/")[2] for name in archive.getnames()}
+    assert found == {*kept, "PKG-INFO"}
+    # each folder and file at the top of the checkout is named
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    top = {name.partition("/")[0] for name in listed.stdout.splitlines()}
+    assert top <= {name.partition("/")[0] for name in kept}
 
 
 def test_a_wheel_made_from_the_source_distribution_runs_by_itself(tmp_path: Path) -> None:

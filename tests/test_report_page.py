@@ -14,6 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
+from command_line import LONGEST_S
 from report_runs import RECORDING, SYNTHETIC, estimate, write, write_run
 
 from mixpose.cli.report import write_report
@@ -186,7 +187,7 @@ def browse(page: Path, tmp_path: Path, width: int) -> dict[str, Any]:
         "--disable-sync", f"--user-data-dir={tmp_path / 'browser'}", "--window-size=1700,1000",
         "--virtual-time-budget=5000", "--dump-dom", around.as_uri(),
     ]  # fmt: skip
-    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=LONGEST_S)
     found = re.search(r'data-answers="([^"]*)"', result.stdout)
     assert found is not None, result.stderr
     answers: dict[str, Any] = json.loads(unquote(found.group(1)))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
+from rounding import rounding
 from scipy.stats import t as student
 
 from mixpose.body import Body, PointFeature
@@ -67,7 +68,9 @@ def test_a_velocity_is_believed_for_five_frames_without_a_pose(misses: int, fram
     track = Track((branch(velocity=VELOCITY / 100),), frame=7, misses=misses)
     (prediction,) = predict(track, EIGHT, 13, None)
     expected = frames * VELOCITY / 100
-    assert twist_between(TRUTH, prediction.T_world_object) == pytest.approx(expected, abs=1e-12)
+    assert twist_between(TRUTH, prediction.T_world_object) == pytest.approx(
+        expected, abs=rounding(TRUTH)
+    )
 
 
 @pytest.mark.parametrize(("misses", "wider"), [(0, 1.0), (2, 2.25), (20, 12.0)])

@@ -112,13 +112,11 @@ def _content(
             replace(poses, poses=tuple(line for line in poses.poses if line.label == label))
             for label in labels
         ]
-    from markupsafe import Markup  # noqa: PLC0415
-
     template = environment.get_template(_BODY_TEMPLATE)
     parts, contents = [], [_body_content(each, truth, cut, origin) for each in files]
     for k, content in enumerate(contents):
         at = f"-{k + 1}" if len(files) > 1 else ""
-        parts.append(Markup(template.render(at=at, truth=truth, **content)))
+        parts.append(template.render(at=at, truth=truth, **content))
     counts = [[count for _, count in content["counts"]] for content in contents]
     return {
         "name": _name(poses),
