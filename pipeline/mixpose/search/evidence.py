@@ -7,14 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.density import AssociationRules, ErrorRules, crowding
-from mixpose.judgement import DetectionModel, Matches, odds_of, paid_by_count
+from mixpose.density import crowding
+from mixpose.judgement import Matches, odds_of, paid_by_count
 from mixpose.objective import Projected, project_body
 from mixpose.records import Floats
 from mixpose.search.detections import SensorDetections
 from mixpose.search.problem import SearchProblem
-
-_DETECTION, _ERRORS, _ASSOCIATION = DetectionModel(), ErrorRules(), AssociationRules()
 
 
 def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
@@ -22,24 +20,26 @@ def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
 
     Sensors without detections (range profiles) do not take part.
     """
-    body, free = problem.body, problem.free
+    body, free, rules = problem.body, problem.free, problem.rules
     seen = [one for one in problem.detections if len(one.points)]
     at = project_body(tuple(one.view.sensor for one in seen), body).project(poses)
-    found = _matches_of(seen, at, problem.budget.gate)
+    found = _matches_of(problem, seen, at)
     met = found.shares.sum(axis=2)
     coordinates = (met @ found.dimensions)[:, None]
     # of each sensor: what one that is covered meets by chance tells nothing of the others
     spare = met * found.dimensions * np.maximum(1 - free.sum() / np.maximum(coordinates, 1.0), 0.0)
     squares = np.where(spare > 0, (found.offsets**2).sum(axis=(2, 3)), 0.0)
-    degrees = _ERRORS.typical_degrees
-    variances = (degrees * _ERRORS.typical**2 + squares) / (degrees + spare)
-    odds = odds_of(found, variances, np.full(len(poses), 2 * body.radius), _DETECTION)
+    errors = rules.noise.errors
+    degrees = errors.typical_degrees
+    variances = (degrees * errors.typical**2 + squares) / (degrees + spare)
+    odds = odds_of(found, variances, np.full(len(poses), 2 * body.radius), rules.detection)
     shares = met / np.maximum(found.weights.sum(axis=2), 1.0)
     return paid_by_count(odds, found, free), shares.mean(axis=1)
 
 
-def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) -> Matches:
+def _matches_of(problem: SearchProblem, seen: Sequence[SensorDetections], at: Projected) -> Matches:
     """What sensors have at the places where they are predicted to see the body."""
+    association = problem.rules.association
     sigmas = np.array([one.sigma for one in seen])[:, None, None, None]
     shares, offsets = np.zeros(at.seen.shape), np.zeros(at.y.shape)
     crowd = []
@@ -47,7 +47,7 @@ def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) ->
         points, m = one.points, one.points.shape[1]
         y, visible = at.y[k, ..., :m], at.seen[k]
         pose, feature = np.nonzero(visible)
-        reach = gate * one.sigma
+        reach = problem.reach(one)
         away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=reach)
         # a detection is met by the nearest of the features to which it is the nearest
         near = np.flatnonzero(np.isfinite(away))
@@ -61,7 +61,9 @@ def _matches_of(seen: Sequence[SensorDetections], at: Projected, gate: float) ->
         lower = np.where(visible[..., None], y, np.inf).min(axis=1)
         upper = np.where(visible[..., None], y, -np.inf).max(axis=1)
         lower[empty], upper[empty] = 0.0, 0.0
-        smallest = _ASSOCIATION.min_region * one.sigma
+        if not association.crowded:
+            lower[:], upper[:] = points.min(axis=0), points.max(axis=0)
+        smallest = association.min_region * one.sigma
         crowd.append(crowding(points, lower, upper, smallest) * one.sigma**m)
     return Matches(
         dimensions=np.array([one.points.shape[1] for one in seen]),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
+from mixpose.judgement import JudgementRules
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.search.budget import THOROUGH, SearchBudget
@@ -27,6 +28,7 @@ class SearchProblem:
     body: Body
     free: NDArray[np.bool_]  # (6,) which directions may differ from the reference
     T_reference: Floats  # (4, 4), looked at only where a direction is not free
+    rules: JudgementRules = JudgementRules()
     budget: SearchBudget = THOROUGH
     seed: int = 0  # of the order in which guesses are tried, where not all can be
 

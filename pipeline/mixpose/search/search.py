@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
+from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
@@ -41,6 +42,7 @@ def search_frame(
     *,
     free: NDArray[np.bool_],
     T_reference: Floats | None,
+    rules: JudgementRules = JudgementRules(),
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
     state: SearchState = SearchState(),
@@ -56,6 +58,8 @@ def search_frame(
         World directions to search, order of `mixpose.rigid`.
     T_reference : (4, 4) array or None
         Where the directions that are not free stay; may be None when all are free.
+    rules : JudgementRules
+        By which poses are ranked, as they are judged in the end.
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
@@ -77,7 +81,7 @@ def search_frame(
     if not detections:
         return SearchResult([])
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
-    run = _Run(SearchProblem(detections, body, free, reference, budget, seed))
+    run = _Run(SearchProblem(detections, body, free, reference, rules, budget, seed))
     after = run.find(state)
     return SearchResult(run.candidates(), SearchReport(**run.cost), after)
 

@@ -31,6 +31,7 @@ def candidates_of(data: FrameData) -> list[Candidate]:
         body=data.body,
         free=data.free,
         T_reference=data.T_reference,
+        rules=data.rules.judgement,
         seed=data.options.seed,
     )
     found: list[Candidate] = []
