@@ -14,7 +14,7 @@ from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
-from mixpose.search.search import from_slips, kinds_of_guesses
+from mixpose.search.search import from_slips, generators_of
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import PinholeCamera
 
@@ -84,15 +84,15 @@ def test_triangles_are_brought_onto_their_images_by_the_motion_between_them() ->
 def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    def kinds(false: int) -> list[str]:
+    def names(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT, SearchBudget())
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
-        return [one.name for one in kinds_of_guesses(problem)]
+        return [generator.name for generator in generators_of(problem)]
 
     triples, point, rays = "point triples", "point and rays", "three rays"
-    assert kinds(8) == [triples, point, rays, rays]
-    assert kinds(9) == [triples, rays, rays, point]  # more than two detections for a feature
+    assert names(8) == [triples, point, rays, rays]
+    assert names(9) == [triples, rays, rays, point]  # more than two detections for a feature
 
 
 def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
@@ -105,9 +105,9 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     far = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = camera.rays(np.concatenate([y, far]))
     assert rays is not None
-    budget = SearchBudget(max_problems=4 * THOROUGH.chunk)
-    kind = from_three_rays(SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget), rays)
-    chunks = list(kind.batches)
+    budget = SearchBudget(max_problems=4 * THOROUGH.batch)
+    problem = SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget=budget)
+    chunks = list(from_three_rays(problem, 4.5, rays).batches)
     own = [float((triples < 8).all(axis=0).mean()) for triples, _ in chunks]
     assert len(chunks) == 4  # one for each crowd and one for all
     assert own[0] == pytest.approx(1 / 7, rel=0.1)

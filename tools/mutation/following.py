@@ -299,7 +299,7 @@ _STATIC = (
     Mutant(
         "tracking-static-clutter-is-searched-first",
         "tracking/static_clutter.py",
-        "if not alone.all():",
+        "if not moves.all():",
         "if False:",
         "a room full of lamps hides what comes into it",
         ("test_tracking_static.py",),
@@ -307,8 +307,8 @@ _STATIC = (
     Mutant(
         "tracking-static-clutter-for-ever",
         "tracking/static_clutter.py",
-        "np.where(met, 1, -1)",
-        "np.where(met, 1, 0)",
+        "np.where(is_met, 1, -1)",
+        "np.where(is_met, 1, 0)",
         "a lamp that was moved is left out for ever",
         ("test_tracking_static.py",),
     ),

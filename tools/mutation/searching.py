@@ -34,6 +34,14 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
+        "tracking-search-ranks-by-default-rules",
+        "tracking/proposers/searched.py",
+        "rules=data.rules.judgement,",
+        "",
+        "poses are searched for by other rules than they are judged by",
+        ("test_search_evidence.py",),
+    ),
+    Mutant(
         "tracking-no-sensor-left-out",
         "tracking/proposers/without_sensor.py",
         "return apart if len(left) >= 2 else []",
@@ -282,7 +290,7 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-errors-count-alike",
         "search/evidence.py",
-        "variances = (degrees * _ERRORS.typical**2 + squares) / (degrees + spare)",
+        "variances = (degrees * errors.typical**2 + squares) / (degrees + spare)",
         "variances = np.full(spare.shape, 0.04)",
         "a pose met to a tenth of a pixel is hardly better than one met to a pixel",
         ("test_search_evidence.py",),
@@ -380,7 +388,7 @@ _SEARCH = (
     Mutant(
         "search-crowds-drawn-anywhere",
         "search/from_three_rays.py",
-        "crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]",
+        "crowd = crowds[k % len(crowds)]",
         "crowd = M",
         "among many false detections hardly a triple drawn is the body's",
         ("test_search_guesses.py",),
@@ -396,8 +404,8 @@ _SEARCH = (
     Mutant(
         "search-points-of-a-crowd-first",
         "search/search.py",
-        "kinds.insert(len(kinds) if crowded else 0,",
-        "kinds.insert(0,",
+        "place = len(generators) if crowded else 0",
+        "place = 0",
         "the first frame of web cams takes a third longer",
         ("test_search_guesses.py",),
     ),

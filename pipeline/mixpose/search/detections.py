@@ -79,7 +79,7 @@ def _moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
 def _weighted_places(pattern: GridPattern, budget: SearchBudget) -> tuple[Floats, Floats]:
     """Grid points (K, m) that stand out, and their values (K,)."""
     values = pattern.values.astype(np.float64)
-    rows, columns = np.nonzero(values > budget.grey_floor * values.max())
+    rows, columns = np.nonzero(values > budget.height * values.max())
     places = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
     return pattern.origin + pattern.step * places, values[rows, columns]
 
@@ -97,7 +97,7 @@ def peaks(pattern: GridPattern, sigma: float, budget: SearchBudget) -> Floats:
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
     rows, columns = np.nonzero((blurred >= highest) & (blurred > budget.height * blurred.max()))
-    order = np.argsort(-blurred[rows, columns], kind="stable")[: budget.max_peaks]
+    order = np.argsort(-blurred[rows, columns], kind="stable")[: 8 * budget.sample]
     rows, columns = rows[order], columns[order]
     inner_rows = np.clip(rows, 1, values.shape[0] - 2)
     inner_columns = np.clip(columns, 1, values.shape[1] - 2)

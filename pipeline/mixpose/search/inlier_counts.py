@@ -82,7 +82,7 @@ def _drawn(problem: SearchProblem, seen: SensorDetections, rays: Rays) -> LabelI
         places, radii = np.zeros((1, 2)), np.full(1, radius)
     lower, extent = places.min(axis=0), np.ptp(places, axis=0)
     step = float(np.median(radii)) / options.cells
-    step = max(step, float(np.sqrt(np.prod(extent) / options.max_cells)))
+    step = max(step, float(np.sqrt(np.prod(extent) / (128 * options.cache))))
     margin = radii.max() + 2 * step
     columns, rows = (np.ceil((extent + 2 * margin) / step) + 1).astype(int)
     u, v = (margin - lower) / step
