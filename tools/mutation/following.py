@@ -315,8 +315,8 @@ _STATIC = (
     Mutant(
         "tracking-what-stands-still-is-never-found",
         "tracking/proposers/searched.py",
-        "return found + result.candidates",
-        "return found or result.candidates[:0]",
+        "return among_moving + candidates",
+        "return among_moving or candidates[:0]",
         "a body that stands still is not looked for",
         ("test_tracking_static.py",),
     ),

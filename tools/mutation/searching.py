@@ -180,8 +180,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-live-search-begins-anew",
         "tracking/proposers/searched.py",
-        "state=data.track.search if live else SearchState())",
-        "state=SearchState())",
+        "state = data.track.search if live else SearchState()",
+        "state = SearchState()",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
