@@ -1,4 +1,4 @@
-"""Parts of the search: slips along a grid, directions that are held, faces turned away."""
+"""Parts of the search: directions that are held, faces turned away."""
 
 from __future__ import annotations
 
@@ -7,29 +7,18 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
-from mixpose.search.search import from_slips, generators_of
+from mixpose.search.search import generators_of
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
-
-
-def test_a_slipped_pose_is_put_back_by_the_way_from_a_feature_to_another() -> None:
-    row = Body("row", tuple(PointFeature(np.array([x, 0.0, 0.0])) for x in (0.0, 20.0, 40.0)))
-    poses = from_slips(row, TRUTH)
-    moved = transform(poses, np.zeros((1, 3)))[:, 0] - TRUTH[:3, 3]
-    # one step either way twice, two steps once, along the axes of the body
-    np.testing.assert_allclose(
-        np.sort(moved @ TRUTH[:3, 0]), [-40, -20, -20, 20, 20, 40], atol=1e-9
-    )
-    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(moved @ TRUTH[:3, 0]))
 
 
 def test_directions_that_are_held_stay_where_the_reference_has_them() -> None:

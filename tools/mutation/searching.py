@@ -282,7 +282,7 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "weights=at.seen.swapaxes(0, 1)",
+        "weights=visible.swapaxes(0, 1)",
         "weights=shares.swapaxes(0, 1)",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
@@ -298,8 +298,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-noise-of-one-camera-is-that-of-all",
         "search/evidence.py",
-        "odds_of(found, variances,",
-        "odds_of(found, np.tile(variances.max(axis=1), (len(seen), 1)).T,",
+        "odds_of(matches, variances,",
+        "odds_of(matches, np.tile(variances.max(axis=1), (len(sensors), 1)).T,",
         "a pose of one camera is doubtful where another meets a few features by chance",
         ("test_search_evidence.py",),
     ),
@@ -314,13 +314,6 @@ _SEARCH_EVIDENCE = (
 )
 
 _SEARCH = (
-    Mutant(
-        "search-slips-not-tried",
-        "search/search.py",
-        "from_parts(np.eye(3), body.means[i] - body.means[j])",
-        "from_parts(np.eye(3), 0 * body.means[i])",
-        "a chessboard is found a square off",
-    ),
     Mutant(
         "search-bright-detections-count-more",
         "search/detections.py",

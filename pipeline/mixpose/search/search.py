@@ -14,7 +14,6 @@ from mixpose.errors import SessionError
 from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats
-from mixpose.rigid import from_parts
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
@@ -104,15 +103,6 @@ def generators_of(problem: SearchProblem) -> list[Generator]:
     return [from_point_triples(problem, points), *generators]
 
 
-def from_slips(body: Body, pose: Floats) -> Floats:
-    """A pose with the body shifted by the way from any feature to any other (n (n - 1), 4, 4).
-
-    On a grid of features a pose that is a step off explains most of them.
-    """
-    i, j = np.nonzero(~np.eye(len(body), dtype=np.bool_))
-    return pose @ from_parts(np.eye(3), body.means[i] - body.means[j])
-
-
 class _Search:
     """What stays the same during one search, and its poses so far, the best first."""
 
@@ -142,11 +132,6 @@ class _Search:
         if doubtful and not (self._by_evidence and self.cost["made"]):
             poses, stages = from_spread_orientations(self._problem)
             self._keep(self._descent.refine(poses, stages))
-        # of few features all poses a step off are met; of many, slips are as many as triples
-        few, slips = 2 * self._budget.sample, len(self._body) ** 2
-        slippery = len(self._body) >= few and slips <= self._budget.max_triples
-        if len(self._body.grid_steps) and slippery and len(self._poses) and self._images:
-            self._try([from_slips(self._body, self._poses[0])])
         return after
 
     def _from_rays(self, state: SearchState) -> SearchState:
@@ -175,21 +160,18 @@ class _Search:
                 done += 1
                 yield generator.poses(batch)
 
-        self._try(guesses())
+        self._keep(self._descended(self._shortlist(guesses())))
         return done
-
-    def _try(self, guesses: Iterable[Floats]) -> None:
-        self._keep(self._descended(self._shortlist(guesses)))
 
     def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._first(self._budget.sample), self._ranks
+        kept, ranks = self._distinct(self._budget.sample), self._ranks
         if self._by_evidence and kept:
             least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
-    def _first(self, count: int) -> list[int]:
+    def _distinct(self, count: int) -> list[int]:
         return first_of_each(self._body, self._poses, count, self._budget.alike)
 
     def _keep(self, poses: Floats) -> None:
@@ -227,7 +209,7 @@ class _Search:
         budget, best = self._budget, self._ranks.max(initial=0.0)
         if not self._may_be_sure or best <= 0:
             return False
-        two = self._first(2)
+        two = self._distinct(2)
         lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
         return bool(best > budget.beyond_doubt or lead > budget.outdone)
 
