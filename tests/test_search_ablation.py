@@ -22,8 +22,8 @@ from ablated.cases import (
 from ablated.switches import SWITCHES, Switch
 from benchmarks.search_cases import Row
 
+from mixpose.search import Candidate
 from mixpose.tracking.likelihood import FrameData
-from mixpose.tracking.proposers import searched as module
 from mixpose.tracking.proposers.searched import candidates_of
 from mixpose.tracking.static_clutter import StaticClutter
 
@@ -57,7 +57,7 @@ def test_what_is_remembered_of_a_search_is_no_other_rules(
     """A row that changes what poses are ranked by searches again; one that does not need not."""
     searches: list[FrameData] = []
 
-    def counting(data: FrameData) -> list[module.Candidate]:
+    def counting(data: FrameData) -> list[Candidate]:
         searches.append(data)
         return candidates_of(data)
 
