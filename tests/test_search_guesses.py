@@ -1,4 +1,4 @@
-"""Parts of the search: slips along a grid, directions that are held, faces turned away."""
+"""Parts of the search: directions that are held, faces turned away."""
 
 from __future__ import annotations
 
@@ -7,29 +7,18 @@ import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import SearchProblem
-from mixpose.search.search import from_slips, kinds_of_guesses
+from mixpose.search.search import generators_of
 from mixpose.search.three_points import align_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
-
-
-def test_a_slipped_pose_is_put_back_by_the_way_from_a_feature_to_another() -> None:
-    row = Body("row", tuple(PointFeature(np.array([x, 0.0, 0.0])) for x in (0.0, 20.0, 40.0)))
-    poses = from_slips(row, TRUTH)
-    moved = transform(poses, np.zeros((1, 3)))[:, 0] - TRUTH[:3, 3]
-    # one step either way twice, two steps once, along the axes of the body
-    np.testing.assert_allclose(
-        np.sort(moved @ TRUTH[:3, 0]), [-40, -20, -20, 20, 20, 40], atol=1e-9
-    )
-    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(moved @ TRUTH[:3, 0]))
 
 
 def test_directions_that_are_held_stay_where_the_reference_has_them() -> None:
@@ -84,15 +73,15 @@ def test_triangles_are_brought_onto_their_images_by_the_motion_between_them() ->
 def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    def kinds(false: int) -> list[str]:
+    def names(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT, SearchBudget())
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
-        return [one.name for one in kinds_of_guesses(problem)]
+        return [generator.name for generator in generators_of(problem)]
 
     triples, point, rays = "point triples", "point and rays", "three rays"
-    assert kinds(8) == [triples, point, rays, rays]
-    assert kinds(9) == [triples, rays, rays, point]  # more than two detections for a feature
+    assert names(8) == [triples, point, rays, rays]
+    assert names(9) == [triples, rays, rays, point]  # more than two detections for a feature
 
 
 def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> None:
@@ -105,9 +94,9 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     far = np.stack([u.ravel(), v.ravel()], axis=1)
     rays = camera.rays(np.concatenate([y, far]))
     assert rays is not None
-    budget = SearchBudget(max_problems=4 * THOROUGH.chunk)
-    kind = from_three_rays(SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget), rays)
-    chunks = list(kind.batches)
+    budget = SearchBudget(max_problems=4 * THOROUGH.batch)
+    problem = SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget=budget)
+    chunks = list(from_three_rays(problem, 4.5, rays).batches)
     own = [float((triples < 8).all(axis=0).mean()) for triples, _ in chunks]
     assert len(chunks) == 4  # one for each crowd and one for all
     assert own[0] == pytest.approx(1 / 7, rel=0.1)

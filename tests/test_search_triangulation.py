@@ -63,8 +63,8 @@ def test_three_points_in_space_give_the_pose() -> None:
     rays = [camera.rays(camera.project(world[:4])[0]) for camera in cameras("parallel")]
     found = triangulate([each for each in rays if each is not None], [0.1, 0.1], 0.02)
     body = Body("six", tuple(PointFeature(point) for point in features))
-    kind = from_point_triples(SearchProblem([], body, ALL_FREE, np.eye(4)), found)
-    guesses = np.concatenate([kind.poses(batch) for batch in kind.batches])
+    generator = from_point_triples(SearchProblem([], body, ALL_FREE, np.eye(4)), found)
+    guesses = np.concatenate([generator.poses(batch) for batch in generator.batches])
     error = np.abs(guesses - T).max(axis=(1, 2))
     assert error.min() < 1e-6
 
@@ -93,8 +93,8 @@ def test_points_that_more_cameras_confirm_come_first() -> None:
     body = Body("five", tuple(PointFeature(point) for point in points))
     detections = sensor_detections(views, body, SearchBudget())
     rays = [each.rays for each in detections if each.rays is not None]
-    budget = SearchBudget(max_points=10)
-    problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget)
+    budget = SearchBudget(max_triples=20 * 10)
+    problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget=budget)
     found = by_promise(problem, triangulate(rays, [3.0] * 3, 0.02))
     off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)
     # 40 false detections a view leave a point by chance that three confirm now and then

@@ -23,7 +23,15 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import cv2  # noqa: E402
-from ablated.cases import Case, RememberedSearch, all_on, loose_start_case, outcomes, search_case  # noqa: E402
+from ablated.cases import (  # noqa: E402
+    Case,
+    RememberedSearch,
+    all_on,
+    loose_start_case,
+    outcomes,
+    room_case,
+    search_case,
+)
 from ablated.recordings import real_cases, simulated_cases, synthetic_cases  # noqa: E402
 from ablated.switches import SWITCHES, Switch  # noqa: E402
 from ablated.table import HEADING, RULE, Outcomes, as_json, line  # noqa: E402
@@ -66,6 +74,7 @@ def cases_of(options: argparse.Namespace) -> list[Case]:
     for row in rows_named([]):
         cases.append(search_case(row, max(options.trials // SLOW.get(row.name, 1), 2)))
     cases.append(loose_start_case(options.trials))
+    cases.append(room_case(options.trials))
     cases += synthetic_cases()
     with tempfile.TemporaryDirectory() as folder:
         cases += simulated_cases(Path(folder))

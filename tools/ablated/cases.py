@@ -8,25 +8,28 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from benchmarks.search_cases import Row, absent, trial
+from benchmarks.search_cases import NOISE_PX, Row, absent, trial
 from numpy.typing import NDArray
 
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View
 from mixpose.poses.consistency import normalised_error_squared
-from mixpose.records import Estimate
+from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
-from mixpose.search import Candidate
+from mixpose.search import Candidate, SearchState
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import FrameData, Start
 from mixpose.tracking.proposers.predicted import is_doubtful
 from mixpose.tracking.proposers.searched import candidates_of, searched, starts_at
+from mixpose.tracking.static_clutter import StaticRules
 
 Floats: TypeAlias = NDArray[np.float64]
 Change: TypeAlias = Callable[[Tracker], Tracker]
 
 CROWDED = Row("1 pinhole", 8, 1, 60, 0.95)
+ENTERING = Row("1 pinhole", 8, 1, 0, 0.95)
+LAMPS = 10  # of a room that a body comes into
 FRESH = 10_000  # first seed of frames without a body
 
 
@@ -88,7 +91,7 @@ class Outcome:
 class RememberedSearch:
     """The proposer `searched`, which looks into what was searched already.
 
-    The search knows no rule but its budget: its candidates are the same whatever is switched off.
+    Candidates are the same whatever is switched off, but for the rules that they are ranked by.
     """
 
     __name__ = searched.__name__
@@ -102,8 +105,12 @@ class RememberedSearch:
         return starts_at(data, self._candidates(data)) if is_doubtful(data, ranked) else []
 
     def _candidates(self, data: FrameData) -> list[Candidate]:
+        if data.track.clutter.places or data.track.search != SearchState():
+            return candidates_of(data)  # depends on the frames before
         T = None if data.T_reference is None else data.T_reference.tobytes()
-        key = (*((id(v.observation), id(v.sensor)) for v in data.views), T)
+        judgement = data.rules.judgement
+        rules = judgement.detection, judgement.noise.errors, judgement.association
+        key = (*((id(v.observation), id(v.sensor)) for v in data.views), T, rules)
         if key in self._found:
             spent, candidates, _ = self._found[key]
             self.unspent_s += spent
@@ -179,6 +186,30 @@ def loose_start_case(trials: int) -> Case:
         recordings.append(Recording(tracker, [Frame(0, None, one.views, one.T_world_object[None])]))
     limits = one.largest_angle_deg, one.largest_shift * one.distance
     return Case("a loose start, 60 false", recordings, *limits, single_frames=True)
+
+
+def room_case(trials: int) -> Case:
+    """A live search of one camera that has watched lamps for a while when the body comes in."""
+    recordings = []
+    for seed in range(trials):
+        one, rng = trial(ENTERING, seed), np.random.default_rng([seed, 3])
+        (view,) = one.views
+        lamps = rng.uniform(view.sensor.lower, view.sensor.upper, (LAMPS, 2))
+        frames = []
+        for number in range(StaticRules().frames + 2):
+            y = lamps + NOISE_PX * rng.standard_normal(lamps.shape)
+            answers = np.zeros((0, 4, 4))
+            if number > StaticRules().frames:
+                assert isinstance(view.observation.pattern, PointPattern)
+                y = np.concatenate([y, view.observation.pattern.points])
+                answers = one.T_world_object[None]
+            pattern = PointPattern(y, np.ones(len(y)))
+            seen = replace(view, observation=replace(view.observation, pattern=pattern))
+            frames.append(Frame(number, None, [seen], answers))
+        tracker = Tracker.create(one.body, EstimatorOptions(search="live"))
+        recordings.append(Recording(tracker, frames))
+    limits = one.largest_angle_deg, one.largest_shift * one.distance
+    return Case(f"enters among {LAMPS} lamps", recordings, *limits)
 
 
 def all_on(tracker: Tracker) -> Tracker:

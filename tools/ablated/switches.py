@@ -19,6 +19,7 @@ from mixpose.tracking.proposers.without_sensor import without_sensor
 
 FREE = 0.0
 NEVER = float("inf")
+NEVER_STATIC = 1_000_000  # frames
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ SWITCHES = (
     Switch("no stepped_aside", without_proposer(stepped_aside)),
     Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
+    Switch("static clutter searched alike", ruled("static", frames=NEVER_STATIC)),
     Switch("no mirrored", without_proposer(mirrored)),
     Switch("no merged_pair", without_refinement(merged_pair)),
     Switch("no narrowed", without_refinement(narrowed)),

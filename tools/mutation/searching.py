@@ -34,6 +34,14 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
+        "tracking-search-ranks-by-default-rules",
+        "tracking/proposers/searched.py",
+        "rules=data.rules.judgement,",
+        "",
+        "poses are searched for by other rules than they are judged by",
+        ("test_search_evidence.py",),
+    ),
+    Mutant(
         "tracking-no-sensor-left-out",
         "tracking/proposers/without_sensor.py",
         "return names if np.count_nonzero(agreeing & ~apart) >= 2 else []",
@@ -164,8 +172,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-live-search-begins-anew",
         "tracking/proposers/searched.py",
-        "state=data.track.search if live else SearchState())",
-        "state=SearchState())",
+        "state = data.track.search if live else SearchState()",
+        "state = SearchState()",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
@@ -266,7 +274,7 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "weights=at.seen.swapaxes(0, 1)",
+        "weights=visible.swapaxes(0, 1)",
         "weights=shares.swapaxes(0, 1)",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
@@ -274,7 +282,7 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-errors-count-alike",
         "search/evidence.py",
-        "variances = (degrees * _ERRORS.typical**2 + squares) / (degrees + spare)",
+        "variances = (degrees * errors.typical**2 + squares) / (degrees + spare)",
         "variances = np.full(spare.shape, 0.04)",
         "a pose met to a tenth of a pixel is hardly better than one met to a pixel",
         ("test_search_evidence.py",),
@@ -282,8 +290,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-noise-of-one-camera-is-that-of-all",
         "search/evidence.py",
-        "odds_of(found, variances,",
-        "odds_of(found, np.tile(variances.max(axis=1), (len(seen), 1)).T,",
+        "odds_of(matches, variances,",
+        "odds_of(matches, np.tile(variances.max(axis=1), (len(sensors), 1)).T,",
         "a pose of one camera is doubtful where another meets a few features by chance",
         ("test_search_evidence.py",),
     ),
@@ -298,13 +306,6 @@ _SEARCH_EVIDENCE = (
 )
 
 _SEARCH = (
-    Mutant(
-        "search-slips-not-tried",
-        "search/search.py",
-        "from_parts(np.eye(3), body.means[i] - body.means[j])",
-        "from_parts(np.eye(3), 0 * body.means[i])",
-        "a chessboard is found a square off",
-    ),
     Mutant(
         "search-bright-detections-count-more",
         "search/detections.py",
@@ -372,7 +373,7 @@ _SEARCH = (
     Mutant(
         "search-crowds-drawn-anywhere",
         "search/from_three_rays.py",
-        "crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]",
+        "crowd = crowds[k % len(crowds)]",
         "crowd = M",
         "among many false detections hardly a triple drawn is the body's",
         ("test_search_guesses.py",),
@@ -388,8 +389,8 @@ _SEARCH = (
     Mutant(
         "search-points-of-a-crowd-first",
         "search/search.py",
-        "kinds.insert(len(kinds) if crowded else 0,",
-        "kinds.insert(0,",
+        "place = len(generators) if crowded else 0",
+        "place = 0",
         "the first frame of web cams takes a third longer",
         ("test_search_guesses.py",),
     ),

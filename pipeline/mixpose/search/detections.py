@@ -45,7 +45,7 @@ def sensor_detections(
     views: Sequence[View], body: Body, budget: SearchBudget
 ) -> list[SensorDetections]:
     """Detections of all views that saw something."""
-    found = []
+    sensors = []
     for view in views:
         observation = view.observation
         if observation.is_empty:
@@ -59,14 +59,14 @@ def sensor_detections(
         else:
             nothing = np.zeros((0, observation.dimension))
             moments = _moments(*_weighted_places(pattern, budget))
-            found.append(SensorDetections(view, nothing, None, *moments))
+            sensors.append(SensorDetections(view, nothing, None, *moments))
             continue
         if len(points):
             ones, rays = np.ones(len(points)), view.sensor.rays(points)
             alike = Observation(PointPattern(points, ones), observation.sigma)
-            seen = View(view.name, view.sensor, alike, view.delay)
-            found.append(SensorDetections(seen, points, rays, *_moments(points, ones)))
-    return found
+            even = View(view.name, view.sensor, alike, view.delay)
+            sensors.append(SensorDetections(even, points, rays, *_moments(points, ones)))
+    return sensors
 
 
 def _moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
@@ -79,7 +79,7 @@ def _moments(points: Floats, weights: Floats) -> tuple[Floats, float]:
 def _weighted_places(pattern: GridPattern, budget: SearchBudget) -> tuple[Floats, Floats]:
     """Grid points (K, m) that stand out, and their values (K,)."""
     values = pattern.values.astype(np.float64)
-    rows, columns = np.nonzero(values > budget.grey_floor * values.max())
+    rows, columns = np.nonzero(values > budget.height * values.max())
     places = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
     return pattern.origin + pattern.step * places, values[rows, columns]
 
@@ -97,13 +97,13 @@ def peaks(pattern: GridPattern, sigma: float, budget: SearchBudget) -> Floats:
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
     rows, columns = np.nonzero((blurred >= highest) & (blurred > budget.height * blurred.max()))
-    order = np.argsort(-blurred[rows, columns], kind="stable")[: budget.max_peaks]
+    order = np.argsort(-blurred[rows, columns], kind="stable")[: 8 * budget.sample]
     rows, columns = rows[order], columns[order]
     inner_rows = np.clip(rows, 1, values.shape[0] - 2)
     inner_columns = np.clip(columns, 1, values.shape[1] - 2)
-    beside = np.array([[-1], [0], [1]])
-    shift_u = _vertex(blurred[rows, inner_columns + beside])
-    shift_v = _vertex(blurred[inner_rows + beside, columns])
+    offsets = np.array([[-1], [0], [1]])
+    shift_u = _vertex(blurred[rows, inner_columns + offsets])
+    shift_v = _vertex(blurred[inner_rows + offsets, columns])
     places = np.stack([inner_columns + shift_u, inner_rows + shift_v], axis=1)
     return np.asarray(pattern.origin + pattern.step * places)
 

@@ -41,7 +41,7 @@ def _centres(problem: SearchProblem) -> Floats:
         apart = np.linalg.norm(places[k] - places[kept], axis=1)
         if off[k] < off.min() + radius and (apart > budget.different * radius).all():
             kept.append(int(k))
-    return places[kept[: budget.max_places]]
+    return places[kept[: budget.sample // 2]]
 
 
 def _placed(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats:
@@ -49,7 +49,7 @@ def _placed(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats
     body, shifts = problem.body, problem.free[:3]
     translations = centre - rotations @ body.means.mean(axis=0)
     translations = np.where(shifts, translations, problem.T_reference[:3, 3])
-    for _ in range(problem.budget.turn_steps):
+    for _ in range(problem.budget.place_steps // 4):
         points = transform(from_parts(rotations, translations), body.nodes.points)
         translations = translations + _steps(problem, points, limit=body.radius)[0]
     return from_parts(rotations, translations)

@@ -7,12 +7,13 @@ they are on the body.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.problem import Generator, SearchProblem
 from mixpose.search.spread import far_apart
 from mixpose.search.three_points import align_triples
 from mixpose.search.triangulation import Indices, TriangulatedPoints
@@ -27,47 +28,48 @@ class _Places(NamedTuple):
     error: Floats  # length by which a place on the ray may be off
 
 
-def from_point_and_rays(problem: SearchProblem, found: TriangulatedPoints) -> Kind:
+def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
     """Poses with one point in space as each feature, point by point, the most promising first."""
-    budget, means = problem.budget, problem.body.means
-    features = means[far_apart(means, budget.subsample)]
+    most = min(len(points), 2 * problem.budget.sample)
+    return Generator("point and rays", range(most), partial(_poses, problem, points))
+
+
+def _poses(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
+    means, budget = problem.body.means, problem.budget
+    features = means[far_apart(means, budget.sample)]
     distances = np.linalg.norm(features[:, None] - features[None], axis=-1)
-
-    def poses(p: int) -> Floats:
-        body, world = [], []
-        for i, places in enumerate(_places(problem, found, p, distances)):
-            a, b = _agreeing(places, distances, budget.max_pairs)
-            corners = np.stack([np.full(len(a), i), places.feature[a], places.feature[b]])
-            point = np.broadcast_to(found.points[p], (len(a), 3))
-            body.append(features[corners])
-            world.append(np.stack([point, places.points[a], places.points[b]]))
-        triples = [np.concatenate(each, axis=1).transpose(0, 2, 1) for each in (body, world)]
-        return align_triples(*triples)
-
-    return Kind("point and rays", range(min(len(found), budget.max_ray_points)), poses)
+    body, world = [], []
+    for i, places in enumerate(_places(problem, points, p, distances)):
+        a, b = _agreeing(places, distances, budget.batch // len(features))
+        corners = np.stack([np.full(len(a), i), places.feature[a], places.feature[b]])
+        point = np.broadcast_to(points.points[p], (len(a), 3))
+        body.append(features[corners])
+        world.append(np.stack([point, places.points[a], places.points[b]]))
+    triples = (np.concatenate(parts, axis=1).swapaxes(1, 2) for parts in (body, world))
+    return align_triples(*triples)
 
 
 def _places(
-    problem: SearchProblem, found: TriangulatedPoints, p: int, distances: Floats
+    problem: SearchProblem, points: TriangulatedPoints, p: int, distances: Floats
 ) -> list[_Places]:
     """For a point as each feature, where rays cut the spheres on which the others lie.
 
     Of the rays those that pass nearest to the point, without those that made it.
     """
     parts = []
-    for k, (seen, rays) in enumerate(problem.cameras):
-        used = found.rays[p][found.sensors[p] == k]
+    for k, (sensor, rays) in enumerate(problem.cameras):
+        used = points.rays[p][points.sensors[p] == k]
         rest = rays.select(np.setdiff1d(np.arange(len(rays)), used))
-        away = found.points[p] - rest.origins
+        away = points.points[p] - rest.origins
         along = (away * rest.directions).sum(axis=1)
         across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
-        error = problem.reach(seen) * (rest.offset + rest.slope * np.abs(along))
+        error = problem.reach(sensor) * (rest.offset + rest.slope * np.abs(along))
         first = np.full(len(rest), 0.0 if rest.central else -np.inf)
         parts.append((across, rest.origins, rest.directions, along, error, first))
     across, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-    nearest = np.argsort(across, kind="stable")[: problem.budget.max_rays]
+    nearest = np.argsort(across, kind="stable")[: 3 * problem.budget.sample]
     origins, directions, along, error, first = (column[nearest] for column in columns)
-    across, error = across[nearest, None], np.hypot(error, found.tolerance[p])
+    across, error = across[nearest, None], np.hypot(error, points.tolerance[p])
     places = []
     for i, distance in enumerate(distances):
         half2 = distance**2 - across**2
@@ -79,8 +81,8 @@ def _places(
         place = along[ray] + np.concatenate([half, -half])
         ahead = place > first[ray]
         ray, feature, place = ray[ahead], feature[ahead], place[ahead]
-        points = origins[ray] + place[:, None] * directions[ray]
-        places.append(_Places(points, feature, ray, error[ray]))
+        at = origins[ray] + place[:, None] * directions[ray]
+        places.append(_Places(at, feature, ray, error[ray]))
     return places
 
 

@@ -8,7 +8,7 @@ the rays pass each other most closely, are combined first (PROSAC, Chum and Mata
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -18,11 +18,9 @@ from scipy.spatial import cKDTree
 
 from mixpose.body import Body
 from mixpose.records import Floats
-from mixpose.search.problem import Kind, SearchProblem
-from mixpose.search.three_points import SIDES, align_triples
+from mixpose.search.problem import Generator, SearchProblem
+from mixpose.search.three_points import FIRST, SECOND, align_triples, gathered
 from mixpose.search.triangulation import Indices, TriangulatedPoints
-
-_FIRST, _SECOND = np.transpose(SIDES)
 
 
 class FeatureTriangles(NamedTuple):
@@ -33,10 +31,10 @@ class FeatureTriangles(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTriangles:
+def feature_triangles(body: Body, count: int, min_sine: float) -> FeatureTriangles:
     """All ordered triples of a body's features, or `count` at random where they are more.
 
-    Left out are those whose height is a smaller share of the longest side than `min_height`.
+    Left out are those whose height is a smaller share of the longest side than `min_sine`.
     """
     n = len(body)
     if n * (n - 1) * (n - 2) <= count:
@@ -44,75 +42,81 @@ def feature_triangles(body: Body, count: int, min_height: float) -> FeatureTrian
     else:
         corners = np.random.default_rng(0).integers(0, n, (count, 3))
     sides = _sides(body.means, corners)
-    wide = _is_wide(sides, min_height)
+    wide = _is_wide(sides, min_sine)
     return FeatureTriangles(corners[wide], cKDTree(sides[wide].reshape(-1, 3)))
 
 
-def from_point_triples(problem: SearchProblem, found: TriangulatedPoints) -> Kind:
+def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
     """Poses of triples of points, the most promising first."""
-    budget, body = problem.budget, problem.body
-    triangles = feature_triangles(body, budget.max_triangles, budget.min_height)
-    if not len(triangles.corners) or len(found) < 3:
-        return Kind("point triples", [], np.asarray)
-    longest = float(triangles.tree.data.max())
-    bent = budget.gate * np.sqrt(2) * body.spread  # of a side between two features that give way
-
-    def poses(drawn: Indices) -> Floats:
-        sides = _sides(found.points, drawn)
-        slack = 2 * found.tolerance[drawn].max(axis=1) + bent
-        possible = _is_wide(sides, budget.min_height) & (sides.max(axis=1) < longest + slack)
-        triples, sides = drawn[possible], sides[possible]
-        squares = found.tolerance[triples] ** 2
-        allowed = np.sqrt(squares[:, _FIRST] + squares[:, _SECOND] + bent**2)
-        away, index = triangles.tree.query(
-            sides,
-            k=np.arange(1, min(budget.triangles_alike, len(triangles.corners)) + 1),
-            distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
-        )
-        which, rank = np.nonzero(np.isfinite(away))
-        chosen = index[which, rank]
-        off = np.abs(sides[which] - triangles.tree.data[chosen])
-        alike = (off <= allowed[which]).all(axis=1)
-        which, chosen = which[alike], chosen[alike]
-        world = found.points[triples[which]].transpose(1, 2, 0)
-        return align_triples(body.means[triangles.corners[chosen]].transpose(1, 2, 0), world)
-
-    return Kind("point triples", _point_triples(problem, found, longest), poses)
+    budget = problem.budget
+    # the features of each triangle in all six orders
+    triangles = feature_triangles(problem.body, 6 * budget.max_triples, budget.min_sine)
+    if not len(triangles.corners) or len(points) < 3:
+        return Generator("point triples", [], np.asarray)
+    batches = _point_triples(problem, points, float(triangles.tree.data.max()))
+    return Generator("point triples", batches, partial(_poses, problem, points, triangles))
 
 
-def by_promise(problem: SearchProblem, found: TriangulatedPoints) -> TriangulatedPoints:
+def _poses(
+    problem: SearchProblem, points: TriangulatedPoints, triangles: FeatureTriangles, drawn: Indices
+) -> Floats:
+    """Poses that bring triangles of features onto those of triples (K, 3) of points."""
+    budget, body, tree = problem.budget, problem.body, triangles.tree
+    bent = problem.gate * np.sqrt(2) * body.spread  # of a side between two features that give way
+    sides = _sides(points.points, drawn)
+    slack = 2 * points.tolerance[drawn].max(axis=1) + bent
+    possible = _is_wide(sides, budget.min_sine) & (sides.max(axis=1) < tree.data.max() + slack)
+    triples, sides = drawn[possible], sides[possible]
+    squares = points.tolerance[triples] ** 2
+    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bent**2)
+    away, index = tree.query(
+        sides,
+        k=np.arange(1, min(2 * budget.sample, len(triangles.corners)) + 1),
+        distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
+    )
+    which, rank = np.nonzero(np.isfinite(away))
+    chosen = index[which, rank]
+    alike = (np.abs(sides[which] - tree.data[chosen]) <= allowed[which]).all(axis=1)
+    features, world = triangles.corners[chosen[alike]], triples[which[alike]]
+    return align_triples(gathered(body.means, features.T), gathered(points.points, world.T))
+
+
+def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
     """The points that most sensors confirm, the closest first, each place once."""
-    support, error, count = np.zeros(len(found)), np.zeros(len(found)), problem.budget.max_points
+    # each of them is the first of twenty triples
+    count = problem.budget.max_triples // 20
     if len(problem.cameras) == 2:  # every feature once
-        return found.select(np.argsort(found.gap, kind="stable")[:count])
-    for each, _ in problem.cameras:
-        y, seen = each.view.sensor.project(found.points)
-        reach = problem.reach(each)
-        away, _ = cKDTree(each.points).query(y, distance_upper_bound=reach)
+        return points.select(np.argsort(points.gap, kind="stable")[:count])
+    support, error = np.zeros((2, len(points)))
+    for sensor, _ in problem.cameras:
+        y, seen = sensor.view.sensor.project(points.points)
+        reach = problem.reach(sensor)
+        away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
         met = seen & np.isfinite(away)
         support += met
         error += np.where(met, away / reach, 0.0)
     error /= np.maximum(support, 1.0)
     kept: list[int] = []
-    left = np.ones(len(found), dtype=np.bool_)
+    left = np.ones(len(points), dtype=np.bool_)
     for k in np.lexsort((error, -support)):
         if left[k] and len(kept) < count:
             kept.append(int(k))
-            near = np.abs(found.points - found.points[k]).max(axis=1) <= found.tolerance[k]
+            near = np.abs(points.points - points.points[k]).max(axis=1) <= points.tolerance[k]
             left &= ~near
-    return found.select(np.array(kept, dtype=np.intp))
+    return points.select(np.array(kept, dtype=np.intp))
 
 
 def _point_triples(
-    problem: SearchProblem, found: TriangulatedPoints, reach: float
+    problem: SearchProblem, points: TriangulatedPoints, reach: float
 ) -> Iterator[Indices]:
     """Batches of triples (K, 3) of points that share no ray, the most promising first."""
-    size = problem.budget.batch
-    rays = found.sensors * (found.rays.max(initial=0) + 1) + found.rays
-    first = min(len(found), problem.budget.max_prosac_points)
+    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
+    size = problem.budget.batch // 32
+    rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
+    first = min(len(points), problem.budget.promising)
     triples = _combinations(first)
-    if first < len(found):
-        triples = np.concatenate([triples, _near_triples(problem, found.points, reach)])
+    if first < len(points):
+        triples = np.concatenate([triples, _near_triples(problem, points.points, reach)])
     end = 0
     while end < len(triples):
         start, end = end, min(end + max(end, size), end + 8 * size)
@@ -138,7 +142,7 @@ def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indic
     crowded = np.flatnonzero(counts > 1)
     if not len(crowded):
         return np.zeros((0, 3), dtype=np.intp)
-    first = rng.choice(crowded, problem.budget.random_triples)
+    first = rng.choice(crowded, problem.budget.max_triples)
     begin = (np.cumsum(counts) - counts)[first]
     second, third = (
         pairs[begin + (rng.random(len(first)) * counts[first]).astype(np.intp), 1] for _ in range(2)
@@ -147,13 +151,13 @@ def _near_triples(problem: SearchProblem, points: Floats, reach: float) -> Indic
 
 
 def _sides(points: Floats, triples: Indices) -> Floats:
-    sides = points[triples[:, _FIRST]] - points[triples[:, _SECOND]]
+    sides = points[triples[:, FIRST]] - points[triples[:, SECOND]]
     return np.asarray(np.linalg.norm(sides, axis=2))
 
 
-def _is_wide(sides: Floats, min_height: float) -> NDArray[np.bool_]:
+def _is_wide(sides: Floats, min_sine: float) -> NDArray[np.bool_]:
     """Whether triangles with sides (K, 3) have a height, as a share of the longest side."""
     a, b, c = np.sort(sides, axis=1).T
     # Heron's formula; twice the area is height times longest side
     area4 = np.maximum((a + b + c) * (a + b - c) * (a - b + c) * (b + c - a), 0.0)
-    return np.asarray(np.sqrt(area4) / 2 > min_height * c * c)
+    return np.asarray(np.sqrt(area4) / 2 > min_sine * c * c)

@@ -11,25 +11,23 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.search.problem import Kind, SearchProblem
+from mixpose.search.problem import Generator, SearchProblem
 from mixpose.search.spread import far_apart
-from mixpose.search.three_points import SIDES, align_triples, depths
+from mixpose.search.three_points import FIRST, SECOND, align_triples, depths, gathered
 from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
 
-Chunk: TypeAlias = tuple[Indices, Indices]
-
-_FIRST, _SECOND = np.transpose(SIDES)
+Triples: TypeAlias = tuple[Indices, Indices]  # (3, K) detections, and the features they may be
 
 
-def from_three_rays(problem: SearchProblem, rays: Rays) -> Kind:
-    """Poses from triples of one camera's rays."""
+def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Generator:
+    """Poses from triples of one camera's rays, whose detections err by `reach` px at most."""
     solve = _perspective if rays.central else _orthographic
     chunks = _problems(problem, rays) if min(len(rays), len(problem.body)) > 2 else []
-    return Kind("three rays", chunks, partial(solve, problem, rays))
+    return Generator("three rays", chunks, partial(solve, problem.body.means, reach, rays))
 
 
-def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Chunk]:
+def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
     """Chunks of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
@@ -38,29 +36,31 @@ def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Chunk]:
     """
     budget, features = problem.budget, problem.body.means
     rng = np.random.default_rng(problem.seed)
-    n, M, eyes = len(features), len(rays), len(problem.cameras)
-    most = budget.max_shared_problems // eyes if eyes > 1 else budget.max_problems
+    n, M, batch = len(features), len(rays), budget.batch
+    most = budget.problems_for(len(problem.cameras))
     all_tried = comb(M, 3) * perm(n, 3) <= most
     if all_tried or budget.crowded * n >= M:
         detections, corners = np.arange(M), np.arange(n)
         if not all_tried:
             most //= 2
-            detections = far_apart(rays.pixels, int(1.5 * budget.exhaustive))
-            corners = far_apart(features, budget.exhaustive)
+            detections = far_apart(rays.pixels, 3 * budget.sample // 2)
+            corners = far_apart(features, budget.sample)
         by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
         by_feature = np.array(list(permutations(corners, 3)), dtype=np.intp).T
         order = rng.permutation(by_detection.shape[1] * by_feature.shape[1])[:most]
-        for start in range(0, len(order), budget.chunk):
-            a, b = np.divmod(order[start : start + budget.chunk], by_feature.shape[1])
+        for start in range(0, len(order), batch):
+            a, b = np.divmod(order[start : start + batch], by_feature.shape[1])
             yield by_detection[:, a], by_feature[:, b]
     if all_tried:
         return
     near_rays, near_features = _nearest(rays.pixels), _nearest(features)
-    for k in range(most // budget.chunk):
-        crowd = (*budget.crowds, M)[k % (len(budget.crowds) + 1)]
+    # a body is seen in one place, larger or smaller
+    crowds = (*(budget.sample * np.array([1, 2, 4])).tolist(), M)
+    for k in range(most // batch):
+        crowd = crowds[k % len(crowds)]
         yield (
-            _drawn(near_rays, min(crowd, M), budget.chunk, rng),
-            _drawn(near_features, min(max(crowd // 2, 3), n), budget.chunk, rng),
+            _drawn(near_rays, min(crowd, M), batch, rng),
+            _drawn(near_features, min(max(crowd // 2, 3), n), batch, rng),
         )
 
 
@@ -76,32 +76,32 @@ def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -
     return np.stack([first, *nearest[first, chosen]])
 
 
-def _perspective(problem: SearchProblem, rays: Rays, chunk: Chunk) -> Floats:
-    (detections, corners), features = chunk, problem.body.means
+def _perspective(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
+    """Rays that meet in one centre."""
+    detections, corners = triples
     distance2 = ((features[:, None] - features) ** 2).sum(axis=-1)
     between = rays.directions @ rays.directions.T
-    cosines = between[detections[_FIRST], detections[_SECOND]]
-    squared = distance2[corners[_FIRST], corners[_SECOND]]
+    cosines = between[detections[FIRST], detections[SECOND]]
+    squared = distance2[corners[FIRST], corners[SECOND]]
     distances, which = depths(cosines, squared)
-    # smaller than this in the image, nothing is told apart
+    # smaller than the error in the image, nothing is told apart
     largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > problem.budget.min_pixels * rays.slope * distances.min(axis=0)
+    near = largest > reach * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
-    body = np.take(features.T, corners[:, which], axis=1).swapaxes(0, 1)
-    directions = np.take(rays.directions.T, detections[:, which], axis=1).swapaxes(0, 1)
-    return align_triples(body, rays.origins[0][:, None] + directions * distances[:, None])
+    directions = gathered(rays.directions, detections[:, which])
+    world = rays.origins[0][:, None] + directions * distances[:, None]
+    return align_triples(gathered(features, corners[:, which]), world)
 
 
-def _orthographic(problem: SearchProblem, rays: Rays, chunk: Chunk) -> Floats:
+def _orthographic(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
     """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    detections, corners = chunk
-    body = np.take(problem.body.means.T, corners, axis=1).swapaxes(0, 1)
-    seen = np.take(rays.origins.T, detections, axis=1).swapaxes(0, 1)
-    tolerance = 3 * problem.budget.min_pixels * rays.offset
-    length, flat = (np.linalg.norm(each[_SECOND] - each[_FIRST], axis=1) for each in (body, seen))
+    detections, corners = triples
+    body, seen = gathered(features, corners), gathered(rays.origins, detections)
+    tolerance = 2 * reach * rays.offset
+    length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))
     rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
     rise[flat > length + tolerance] = np.nan
     direction = rays.directions[0][:, None]

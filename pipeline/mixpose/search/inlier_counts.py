@@ -24,8 +24,6 @@ from mixpose.sensors import Rays
 
 Integers: TypeAlias = NDArray[np.int32]
 
-_NEARNESS = 256  # a cell holds label * 256 + nearness
-
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
@@ -33,8 +31,8 @@ class LabelImage:
 
     projection: Floats  # (3, 4) from the world to columns and rows of cells, homogeneous
     eye: Floats  # (4,) centre of projection, or the way to it from everywhere, homogeneous
-    # (rows, columns) detection 1 to M times 256, plus nearness: 255 at a detection, 0 at the rim;
-    # most are empty, and take no memory, the outermost are for certain
+    # (rows, columns) detection 1 to M; in the lower eight bits 255 at a detection, 0 at its rim.
+    # Most are empty, and take no memory; the outermost are for certain
     cells: Integers
     count: int  # M
 
@@ -55,11 +53,11 @@ class LabelImage:
 
 def label_images(problem: SearchProblem) -> list[LabelImage]:
     """Label images of all cameras, with disks as large as errors of detections may be."""
-    return [_drawn(problem, seen, rays) for seen, rays in problem.cameras]
+    return [_label_image(problem, sensor, rays) for sensor, rays in problem.cameras]
 
 
-def _drawn(problem: SearchProblem, seen: SensorDetections, rays: Rays) -> LabelImage:
-    options, radius = problem.budget, problem.reach(seen)
+def _label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) -> LabelImage:
+    budget, radius = problem.budget, problem.reach(sensor)
     middle = rays.directions.mean(axis=0)
     middle /= max(float(np.linalg.norm(middle)), 1e-12)
     side = cross(middle, np.eye(3)[np.abs(middle).argmin()])
@@ -73,16 +71,16 @@ def _drawn(problem: SearchProblem, seen: SensorDetections, rays: Rays) -> LabelI
     plane = points @ to_plane[:, :3].T + to_plane[:, 3]
     depth = plane[:, 2:]
     # how many px a unit of the plane is at each detection, whatever the lens
-    _, J, _ = seen.view.sensor.linearise(points)
+    _, J, _ = sensor.view.sensor.linearise(points)
     per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * depth[:, 0] * unit
     radii = radius / np.where(per_unit > 0, per_unit, 1.0)
-    inside = depth[:, 0] > options.min_cosine
+    inside = depth[:, 0] > budget.min_cosine
     places, radii = (plane[:, :2] / unit / depth)[inside], radii[inside]
     if not len(places):
         places, radii = np.zeros((1, 2)), np.full(1, radius)
     lower, extent = places.min(axis=0), np.ptp(places, axis=0)
-    step = float(np.median(radii)) / options.cells
-    step = max(step, float(np.sqrt(np.prod(extent) / options.max_cells)))
+    step = float(np.median(radii)) / budget.cells
+    step = max(step, float(np.sqrt(np.prod(extent) / (128 * budget.cache))))
     margin = radii.max() + 2 * step
     columns, rows = (np.ceil((extent + 2 * margin) / step) + 1).astype(int)
     u, v = (margin - lower) / step
@@ -99,10 +97,10 @@ def _draw(cells: Integers, places: Floats, radii: Floats) -> None:
     du, dv = places[:, :1] - u - 0.5, places[:, 1:] - v - 0.5
     near = 1 - np.sqrt(dv[:, :, None] ** 2 + du[:, None] ** 2) / radii[:, None, None]
     label, iv, iu = np.nonzero(near > 0)
-    value = (near[label, iv, iu] * (_NEARNESS - 1)).astype(np.int32)
+    value = (near[label, iv, iu] * 255).astype(np.int32)
     order = np.argsort(value, kind="stable")  # where disks overlap the nearest is drawn last
-    label, iv, iu, value = (each[order] for each in (label, iv, iu, value))
-    cells[v[label, iv], u[label, iu]] = (label + 1) * _NEARNESS + value
+    label, iv, iu, value = (column[order] for column in (label, iv, iu, value))
+    cells[v[label, iv], u[label, iu]] = ((label + 1) << 8) + value
 
 
 def count_inliers(
@@ -130,5 +128,5 @@ def count_inliers(
             labels = np.sort(met >> 8, axis=1)
             labels[:, 1:] *= labels[:, 1:] != labels[:, :-1]
             counts[k, part] = np.count_nonzero(labels, axis=1)
-            near[part] += (met & 255).sum(axis=1) * (1.0 / _NEARNESS)
+            near[part] += (met & 255).sum(axis=1) / 256
     return counts, near

@@ -1,4 +1,4 @@
-"""What a search is given, the guesses that it may make, and what it finds."""
+"""What a search is given, the guesses that it may make, and its results."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
+from mixpose.judgement import JudgementRules
 from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.search.budget import THOROUGH, SearchBudget
@@ -27,6 +28,7 @@ class SearchProblem:
     body: Body
     free: NDArray[np.bool_]  # (6,) which directions may differ from the reference
     T_reference: Floats  # (4, 4), looked at only where a direction is not free
+    rules: JudgementRules = JudgementRules()
     budget: SearchBudget = THOROUGH
     seed: int = 0  # of the order in which guesses are tried, where not all can be
 
@@ -34,12 +36,19 @@ class SearchProblem:
     def cameras(self) -> list[tuple[SensorDetections, Rays]]:
         """Sensors whose detections have lines of sight, with these."""
         return [
-            (one, one.rays) for one in self.detections if one.rays is not None and len(one.rays)
+            (sensor, sensor.rays)
+            for sensor in self.detections
+            if sensor.rays is not None and len(sensor.rays)
         ]
 
-    def reach(self, seen: SensorDetections) -> float:
+    @property
+    def gate(self) -> float:
+        """Largest error of a detection in σ_ε."""
+        return self.rules.noise.errors.met
+
+    def reach(self, sensor: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""
-        return self.budget.gate * seen.sigma
+        return self.gate * sensor.sigma
 
     def allowed(self, poses: Floats) -> Floats:
         """The poses nearest to poses (H, 4, 4) whose held directions are the reference's."""
@@ -59,8 +68,8 @@ class SearchProblem:
         return from_parts(R, t)
 
 
-class Kind(NamedTuple):
-    """A kind of guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
+class Generator(NamedTuple):
+    """A way to make guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
 
     name: str
     batches: Iterable[Any]
@@ -90,10 +99,10 @@ class SearchReport(NamedTuple):
 class SearchState(NamedTuple):
     """Where a search with a limited budget goes on in the next frame.
 
-    `kind` of guess, after the first, which is tried in every frame, and batches of it tried.
+    `generator` of guesses, after the first, which is tried in every frame, and batches of it tried.
     """
 
-    kind: int = 0
+    generator: int = 0
     batch: int = 0
 
 

@@ -62,7 +62,7 @@ class Descent:
                 # of shares k/n, not of their squares: what counts is how many features are met
                 values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
                 poses = poses[np.argsort(-values, kind="stable")]
-            poses = poses[unlike(self.body, poses, self.budget.same)[: stage.survivors]]
+            poses = poses[unlike(self.body, poses, self.budget.alike / 5)[: stage.survivors]]
         return poses
 
     def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""The first pose from nothing: guesses, a shortlist, descent, and what is left of it."""
+"""The first pose from nothing: guesses, a shortlist, descent, and the candidates left of it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
+from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats
-from mixpose.rigid import from_parts
 from mixpose.search.budget import THOROUGH, SearchBudget
 from mixpose.search.detections import is_pointlike, sensor_detections
 from mixpose.search.evidence import evidence
@@ -24,7 +24,7 @@ from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
 from mixpose.search.problem import (
     Candidate,
-    Kind,
+    Generator,
     SearchProblem,
     SearchReport,
     SearchResult,
@@ -41,6 +41,7 @@ def search_frame(
     *,
     free: NDArray[np.bool_],
     T_reference: Floats | None,
+    rules: JudgementRules = JudgementRules(),
     seed: int = 0,
     budget: SearchBudget = THOROUGH,
     state: SearchState = SearchState(),
@@ -56,6 +57,8 @@ def search_frame(
         World directions to search, order of `mixpose.rigid`.
     T_reference : (4, 4) array or None
         Where the directions that are not free stay; may be None when all are free.
+    rules : JudgementRules
+        By which poses are ranked, as they are judged in the end.
     seed : int
         Of the order in which guesses are tried, where not all can be.
     budget : SearchBudget
@@ -77,110 +80,98 @@ def search_frame(
     if not detections:
         return SearchResult([])
     reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
-    run = _Run(SearchProblem(detections, body, free, reference, budget, seed))
-    after = run.find(state)
-    return SearchResult(run.candidates(), SearchReport(**run.cost), after)
+    search = _Search(SearchProblem(detections, body, free, reference, rules, budget, seed))
+    after = search.run(state)
+    return SearchResult(search.candidates(), SearchReport(**search.cost), after)
 
 
-def kinds_of_guesses(problem: SearchProblem) -> list[Kind]:
-    """Kinds of guesses from rays, the quickest first.
+def generators_of(problem: SearchProblem) -> list[Generator]:
+    """Ways to make guesses from rays, the quickest first.
 
     Points in space; one such point and two rays, in crowds at last; three rays of one camera.
     """
-    budget, rays = problem.budget, [one for _, one in problem.cameras]
-    kinds = [from_three_rays(problem, one) for one in rays]
+    budget, rays = problem.budget, [rays for _, rays in problem.cameras]
+    reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
+    generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
     if len(rays) < 2:
-        return kinds
-    gates = [problem.reach(seen) for seen, _ in problem.cameras]
-    found = by_promise(problem, triangulate(rays, gates, budget.min_sine))
+        return generators
+    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
     crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
     # of the points tried in a crowd, and of the rays near them, few are right
-    kinds.insert(len(kinds) if crowded else 0, from_point_and_rays(problem, found))
-    return [from_point_triples(problem, found), *kinds]
+    place = len(generators) if crowded else 0
+    generators.insert(place, from_point_and_rays(problem, points))
+    return [from_point_triples(problem, points), *generators]
 
 
-def from_slips(body: Body, pose: Floats) -> Floats:
-    """A pose with the body shifted by the way from any feature to any other (n (n - 1), 4, 4).
-
-    On a grid of features a pose that is a step off explains most of them.
-    """
-    i, j = np.nonzero(~np.eye(len(body), dtype=np.bool_))
-    return pose @ from_parts(np.eye(3), body.means[i] - body.means[j])
-
-
-class _Run:
-    """One search: what stays the same during it, and what was found so far."""
+class _Search:
+    """What stays the same during one search, and its poses so far, the best first."""
 
     def __init__(self, problem: SearchProblem) -> None:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         self._images = label_images(problem) if is_pointlike(self._body) else []
         self._explainable = sum(min(image.count, len(self._body)) for image in self._images)
-        cameras = [one for one in problem.detections if one.rays is not None]
-        seen, budget = [one.view for one in problem.detections], self._budget
+        views, budget = [sensor.view for sensor in problem.detections], self._budget
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        self._by_evidence = bool(self._images) and len(cameras) == len(seen)
-        self._may_be_sure = self._by_evidence and len(seen) > 1
-        few = sparse(self._body, budget.descent_features)
-        descents = {one: Descent(seen, one, problem.free, budget) for one in (self._body, few)}
-        self._descent, self._quick_descent = descents[self._body], descents[few]
+        are_cameras = all(sensor.rays is not None for sensor in problem.detections)
+        self._by_evidence = bool(self._images) and are_cameras
+        self._may_be_sure = self._by_evidence and len(views) > 1
+        few = sparse(self._body, 4 * budget.sample)
+        self._descent = Descent(views, self._body, problem.free, budget)
+        self._quick_descent = Descent(views, few, problem.free, budget)
         plan = budget.descent_plan if self._by_evidence else budget.wide_plan
-        self._stages = [Stage((f,) * len(seen), steps, budget.survivors) for f, steps in plan]
+        most = budget.shortlist
+        self._stages = [Stage((blur,) * len(views), steps, most) for blur, steps in plan]
         self._poses = np.zeros((0, 4, 4))
-        self._ranks, self._met = np.zeros(0), np.zeros(0)
+        self._ranks, self._met = np.zeros((2, 0))
         self.cost = Counter(made=0)
 
-    def find(self, state: SearchState) -> SearchState:
-        """Make as many kinds of guesses as are needed and allowed."""
-        budget, after = self._budget, SearchState()
-        if self._images:
-            after = self._sharp(state)
-        if not (self._by_evidence and self.cost["made"]) and self._coverage() < budget.sufficient:
+    def run(self, state: SearchState) -> SearchState:
+        """Make as many guesses as are needed and allowed; where to go on in the next frame."""
+        after = self._from_rays(state) if self._images else SearchState()
+        doubtful = self._coverage() < self._budget.sufficient
+        if doubtful and not (self._by_evidence and self.cost["made"]):
             poses, stages = from_spread_orientations(self._problem)
             self._keep(self._descent.refine(poses, stages))
-        slippery = budget.min_slip_features <= len(self._body) <= budget.max_slip_features
-        if len(self._body.grid_steps) and slippery and len(self._poses) and self._images:
-            slips = from_slips(self._body, self._poses[0])
-            self._keep(self._descended(self._shortlist([slips])))
         return after
 
-    def _sharp(self, state: SearchState) -> SearchState:
-        """Guesses from rays, kind after kind; those after the first from where they stopped."""
-        kinds, most = kinds_of_guesses(self._problem), self._budget.max_guesses
-        if len(kinds) > 1:
-            self._tried(kinds.pop(0), most / 2)
-        for k, kind in enumerate(kinds):
+    def _from_rays(self, state: SearchState) -> SearchState:
+        """Guesses of one generator after the other; after the first, from where they stopped."""
+        generators, most = generators_of(self._problem), self._budget.max_guesses
+        if len(generators) > 1:
+            self._draw(generators.pop(0), most / 2)
+        for k, generator in enumerate(generators):
             if self._is_settled():
                 break
-            if k >= state.kind:
-                done = self._tried(kind, most, state.batch if k == state.kind else 0)
+            if k >= state.generator:
+                done = self._draw(generator, most, state.batch if k == state.generator else 0)
                 if self.cost["made"] >= most:
                     return SearchState(k, done)
         return SearchState()
 
-    def _tried(self, kind: Kind, most: float, skipped: int = 0) -> int:
-        """Keep what comes of a kind until `most` guesses were made; batches of it so far."""
+    def _draw(self, generator: Generator, most: float, skipped: int = 0) -> int:
+        """Try batches until `most` guesses were made; how many batches of it were tried so far."""
         done = skipped
 
         def guesses() -> Iterator[Floats]:
             nonlocal done
-            for batch in islice(kind.batches, skipped, None):
+            for batch in islice(generator.batches, skipped, None):
                 if self.cost["made"] >= most:
                     return
                 done += 1
-                yield kind.poses(batch)
+                yield generator.poses(batch)
 
         self._keep(self._descended(self._shortlist(guesses())))
         return done
 
     def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._first(self._budget.candidates), self._ranks
+        kept, ranks = self._distinct(self._budget.sample), self._ranks
         if self._by_evidence and kept:
             least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
-    def _first(self, count: int) -> list[int]:
+    def _distinct(self, count: int) -> list[int]:
         return first_of_each(self._body, self._poses, count, self._budget.alike)
 
     def _keep(self, poses: Floats) -> None:
@@ -199,7 +190,7 @@ class _Run:
         return shares.sum(axis=0), np.sqrt(shares).mean(axis=0)
 
     def _is_settled(self) -> bool:
-        """Whether no other kind of guess is needed.
+        """Whether no other guesses are needed.
 
         Where the evidence of several cameras is beyond doubt, only a pose that explains most of
         the detections could still be better.
@@ -216,9 +207,9 @@ class _Run:
     def _is_beyond_doubt(self) -> bool:
         """Whether chance would hardly make a pose so evident, by itself or among those found."""
         budget, best = self._budget, self._ranks.max(initial=0.0)
-        if not self._may_be_sure or best < budget.promising:
+        if not self._may_be_sure or best <= 0:
             return False
-        two = self._first(2)
+        two = self._distinct(2)
         lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
         return bool(best > budget.beyond_doubt or lead > budget.outdone)
 
@@ -233,10 +224,8 @@ class _Run:
 
     def _shortlist(self, guesses: Iterable[Floats]) -> Floats:
         """The guesses that explain most distinct detections, and among equals most closely."""
-        budget = self._budget
+        budget, most = self._budget, self._budget.refined(len(self._body))
         poses, ranks, best, checked = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0
-        most = budget.shortlist * budget.exhaustive // max(len(self._body), budget.exhaustive)
-        most = max(most, budget.min_shortlist)
         for batch in guesses:
             more = self._promising(self._problem.allowed(batch))
             rank = self._count(self._body, more)
@@ -244,25 +233,25 @@ class _Run:
             poses = np.concatenate([poses, more[better]])
             ranks = np.append(ranks, rank[better])
             order = np.argsort(-ranks, kind="stable")
-            order = order[unlike(self._body, poses[order], budget.distinct)][:most]
+            order = order[unlike(self._body, poses[order], budget.alike)][:most]
             poses, ranks = poses[order], ranks[order]
             best = float(ranks.max(initial=0.0))
             improved = best > budget.improvement * checked + 1
             checked = best if improved else checked
             if improved and self._is_found(poses[: budget.checked], best):
-                rest = slice(budget.checked, budget.checked + budget.finalists)
-                poses, ranks = poses[rest], ranks[rest]
+                rivals = slice(budget.checked, budget.checked + 2 * budget.sample)
+                poses, ranks = poses[rivals], ranks[rivals]
                 break
         return np.asarray(poses[ranks > best - budget.behind])
 
     def _count(self, body: Body, poses: Floats) -> Floats:
         """Distinct detections explained, and a tenth of how near they are met."""
-        counts, near = count_inliers(self._images, body, poses, self._budget.max_together)
+        counts, near = count_inliers(self._images, body, poses, self._budget.cache)
         return np.asarray(counts.sum(axis=0) + 0.1 * near)
 
     def _promising(self, poses: Floats) -> Floats:
         """The better of many guesses, judged by some features where the body has many."""
-        few, most = sparse(self._body, self._budget.test_features), self._budget.shortlist
+        few, most = sparse(self._body, 2 * self._budget.sample), self._budget.shortlist
         self.cost["made"] += len(poses)
         if few is not self._body and len(poses) > most:
             poses = poses[np.argsort(-self._count(few, poses), kind="stable")[:most]]

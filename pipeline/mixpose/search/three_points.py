@@ -20,12 +20,15 @@ from mixpose.rigid import from_parts
 from mixpose.search.triangulation import Indices
 
 _TINY = np.finfo(np.float64).tiny
-_FLAT = 1e-9  # sine of the angle at a corner, below which a triangle has no plane
-_POLISHING = 2  # Newton steps on the distances
-_ROUNDING = 1e-9  # a discriminant this little below zero is a double root
-_INEXACT = 1e-3  # share of the squared distances that a solution may miss them by
+_ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers
 
 SIDES = ((0, 1), (0, 2), (1, 2))
+FIRST, SECOND = np.transpose(SIDES)
+
+
+def gathered(points: Floats, corners: Indices) -> Floats:
+    """Corners (3, 3, K) of triangles, given as indices (3, K) of points (n, 3)."""
+    return np.take(points.T, corners, axis=1).swapaxes(0, 1)
 
 
 def align_triples(body: Floats, world: Floats) -> Floats:
@@ -66,7 +69,7 @@ def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.co
     across = cross(x, second)
     height = np.sqrt(_dot(across, across))
     third = _dot(x, second) + 1j * height
-    flat = height <= _FLAT * np.abs(third)
+    flat = height <= _ROUNDING * np.abs(third)
     if flat.any():  # three in a row: any plane through them
         across = np.where(flat, cross(x, np.eye(3)[:, np.abs(x).argmin(axis=0)]), across)
         height = np.sqrt(_dot(across, across))
@@ -185,7 +188,7 @@ def _polished(
 ) -> tuple[Floats, Indices]:
     """Newton steps on the three cosine laws, and the solutions that satisfy them in the end."""
     o = np.zeros_like(x[0])
-    for _ in range(_POLISHING):
+    for _ in range(2):  # Newton's method doubles the digits each time
         sides, (a, b, c, d, e, f) = _sides_squared(x, cosines)
         J = np.array([[a, b, o], [c, o, d], [o, e, f]])
         cofactors = _cofactors(J)
@@ -193,7 +196,8 @@ def _polished(
         step /= 2 * (J[0] * cofactors[0]).sum(axis=0)
         x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
     off = np.abs(_sides_squared(x, cosines)[0] - squared)
-    exact = ((off <= _INEXACT * squared.max(axis=0)) & (x > 0)).all(axis=0)
+    # steps from double roots end a thousandth off
+    exact = ((off <= 1e-3 * squared.max(axis=0)) & (x > 0)).all(axis=0)
     return x[:, exact], which[exact]
 
 

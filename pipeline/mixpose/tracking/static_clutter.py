@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.constants import constant
 from mixpose.objective import View
-from mixpose.records import PointPattern
-from mixpose.rigid import Floats
+from mixpose.records import Floats, PointPattern
 
 
 @dataclass(frozen=True)
@@ -26,8 +25,6 @@ class StaticRules:
     frames: int = constant(
         10, "without the body in which a detection must be there: a moving one is for one or two"
     )
-    same: float = constant(1.0, "σ_ε by which a static detection may be off: five times its noise")
-    most: int = constant(2000, "places remembered of a sensor: features of a textured room")
 
 
 @dataclass(frozen=True)
@@ -37,23 +34,23 @@ class StaticClutter:
     places: Mapping[str, tuple[Floats, NDArray[np.intp]]] = field(default_factory=dict)
 
     def learnt(self, views: Sequence[View], rules: StaticRules) -> StaticClutter:
-        """What is remembered after one more frame without the body."""
+        """What is remembered after one more frame without the body.
+
+        A place that was seen as often as not is forgotten.
+        """
         places = dict(self.places)
         for view in views:
             pattern = view.observation.pattern
             if not isinstance(pattern, PointPattern):
                 continue
             old, count = places.get(view.name, (pattern.points[:0], np.zeros(0, dtype=np.intp)))
-            reach = rules.same * view.observation.sigma
-            near = cKDTree(old).query(pattern.points, distance_upper_bound=reach)[1]
-            met = np.isin(np.arange(len(old)), near)
-            count = np.minimum(count + np.where(met, 1, -1), 2 * rules.frames)
-            fresh = pattern.points[near == len(old)]
-            joined = np.concatenate([old, fresh])
-            count = np.concatenate([count, np.ones(len(fresh), dtype=np.intp)])
-            kept = np.argsort(-count, kind="stable")[: rules.most]
-            kept = kept[count[kept] > 0]
-            places[view.name] = joined[kept], count[kept]
+            _, nearest = _nearest(old, view, pattern)
+            is_met = np.isin(np.arange(len(old)), nearest)
+            count = np.minimum(count + np.where(is_met, 1, -1), 2 * rules.frames)
+            new = pattern.points[nearest == len(old)]
+            joined = np.concatenate([old[count > 0], new])
+            count = np.concatenate([count[count > 0], np.ones(len(new), dtype=np.intp)])
+            places[view.name] = joined, count
         return StaticClutter(places)
 
     def without(self, views: Sequence[View], rules: StaticRules) -> list[View]:
@@ -64,11 +61,19 @@ class StaticClutter:
             if not isinstance(pattern, PointPattern) or view.name not in self.places:
                 continue
             places, counts = self.places[view.name]
-            static = places[counts >= rules.frames]
-            reach = rules.same * view.observation.sigma
-            away = cKDTree(static).query(pattern.points, distance_upper_bound=reach)[0]
-            alone = np.isinf(away)
-            if not alone.all():
-                rest = PointPattern(pattern.points[alone], pattern.weights[alone])
+            away, _ = _nearest(places[counts >= rules.frames], view, pattern)
+            moves = np.isinf(away)
+            if not moves.all():
+                rest = PointPattern(pattern.points[moves], pattern.weights[moves])
                 moving[k] = replace(view, observation=replace(view.observation, pattern=rest))
         return moving
+
+
+def _nearest(places: Floats, view: View, pattern: PointPattern) -> tuple[Floats, NDArray[np.intp]]:
+    """Distance and index of the place within σ_ε of each detection; inf and their number for none.
+
+    That is five times what detections err by.
+    """
+    reach = view.observation.sigma
+    away, nearest = cKDTree(places).query(pattern.points, distance_upper_bound=reach)
+    return away, nearest

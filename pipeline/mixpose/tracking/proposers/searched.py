@@ -26,30 +26,30 @@ def candidates_of(data: FrameData) -> list[Candidate]:
     """
     live = data.options.search == "live"
     budget = data.rules.live if live else data.rules.search
+    state = data.track.search if live else SearchState()
     search = partial(
         search_frame,
         body=data.body,
         free=data.free,
         T_reference=data.T_reference,
+        rules=data.rules.judgement,
         seed=data.options.seed,
     )
-    found: list[Candidate] = []
-    spent = SearchReport()
+    among_moving: list[Candidate] = []
+    data.log.report = SearchReport()
     moving = data.track.clutter.without(data.views, data.rules.static)
-    if any(one is not other for one, other in zip(moving, data.views, strict=True)):
+    if any(view is not whole for view, whole in zip(moving, data.views, strict=True)):
         budget = replace(budget, max_guesses=budget.max_guesses / 2)
-        first = search(moving, budget=budget)
-        found, spent = first.candidates, first.report
-        if found and found[0].evidence > budget.beyond_doubt:
-            data.log.report = spent
-            return found
-    result = search(data.views, budget=budget, state=data.track.search if live else SearchState())
-    data.log.state, data.log.report = result.state, SearchReport(*map(add, spent, result.report))
-    return found + result.candidates
+        among_moving, data.log.report, _ = search(moving, budget=budget)
+        if among_moving and among_moving[0].evidence > budget.beyond_doubt:
+            return among_moving
+    candidates, report, data.log.state = search(data.views, budget=budget, state=state)
+    data.log.report = SearchReport(*map(add, data.log.report, report))
+    return among_moving + candidates
 
 
 def starts_at(data: FrameData, candidates: Sequence[Candidate]) -> Iterable[Start]:
     """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
-    for one in candidates:
-        yield Start(one.T_world_object)
-        yield Start(one.T_world_object, data.close)
+    for candidate in candidates:
+        yield Start(candidate.T_world_object)
+        yield Start(candidate.T_world_object, data.close)
