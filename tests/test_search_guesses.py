@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import comb
+
 import numpy as np
 import pytest
 from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
@@ -9,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
-from mixpose.search.budget import THOROUGH, SearchBudget
+from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
 from mixpose.search.detections import sensor_detections
 from mixpose.search.from_three_rays import from_three_rays
 from mixpose.search.inlier_counts import count_inliers, label_images
@@ -101,3 +103,12 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     assert len(chunks) == 4  # one for each crowd and one for all
     assert own[0] == pytest.approx(1 / 7, rel=0.1)
     assert own[3] == pytest.approx(8 * 7 * 6 / (56 * 55 * 54), rel=0.7)
+
+
+def test_sizes_of_a_search_follow_from_its_numbers() -> None:
+    points = THOROUGH.promising
+    assert comb(points, 3) <= THOROUGH.max_triples < comb(points + 1, 3)
+    # a search of 2,000 guesses is not spent on one batch
+    assert (THOROUGH.batch, LIVE.batch) == (4096, 1000)
+    # 1,200 features refined, and of any body a quarter of the guesses
+    assert [THOROUGH.refined(n) for n in (5, 8, 16, 100)] == [150, 150, 75, 37]

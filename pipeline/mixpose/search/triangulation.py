@@ -41,7 +41,7 @@ def triangulate(
 
     That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
     """
-    found = []
+    meetings = []
     for first, second in combinations(range(len(rays)), 2):
         a, b = rays[first], rays[second]
         apart = b.origins[None] - a.origins[:, None]
@@ -61,7 +61,7 @@ def triangulate(
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
         i, j = np.nonzero(good)
-        found.append(
+        meetings.append(
             (
                 0.5 * (on_a[i, j] + on_b[i, j]),
                 tolerance[i, j] / np.sqrt(sine2[i, j]),
@@ -70,4 +70,4 @@ def triangulate(
                 np.stack([i, j], axis=1),
             )
         )
-    return TriangulatedPoints(*map(np.concatenate, zip(*found, strict=True)))
+    return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
