@@ -9,7 +9,7 @@ same pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias
@@ -38,7 +38,7 @@ from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
 Floats: TypeAlias = NDArray[np.float64]
-
+Blurs: TypeAlias = list[float]
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
 # what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
@@ -80,11 +80,13 @@ class Fit:
     iterations: int  # evaluations at the finest blur
     freed: bool = False  # whether the body did not fit, and the pose was fitted to freed features
     motion: Motion | None = None  # of the body, where sensors see it at moments of their own
+    blurs: tuple[Mapping[str, float], ...] = ()  # by view, of each objective that was climbed
 
     @classmethod
-    def of(cls, ascent: Ascent[Floats]) -> Fit:
-        """Where an ascent ended."""
-        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations)
+    def of(cls, ascent: Ascent[Floats], views: Sequence[View], levels: Sequence[Blurs]) -> Fit:
+        """Where an ascent through blurs of the views ended."""
+        blurs = tuple(dict(zip([view.name for view in views], one)) for one in levels)
+        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations, blurs=blurs)
 
 
 @dataclass(frozen=True)
@@ -148,24 +150,28 @@ def fit_near(
     rules : FitRules
     """
     free = free_mask(options)
-    descend = partial(_through_blurs, views, body, T_start, uncertainty, options, samples, rules)
+    levels: list[Blurs] = []  # blurs by view of each objective that is climbed
+    start = views, body, T_start, uncertainty, options, samples, rules, levels
+    descend = partial(_through_blurs, *start)
+    sigmas = [blur * view.observation.sigma for view in views]
     if options.objective != "matched":
-        return Fit.of(descend(None, FINE))
+        return Fit.of(descend(None, FINE), views, [*levels, sigmas])
     if finest is None or blur != 1:
-        sigmas = [blur * view.observation.sigma for view in views]
         finest = matched_objective(views, body, sigmas)
     if has_likelihood(views):
         ascent = descend(finest, FINE)
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
-        return replace(Fit.of(ascent), T_world_object=T, freed=is_freed)
+        return replace(Fit.of(ascent, views, [*levels, sigmas]), T_world_object=T, freed=is_freed)
     ascent = begun or _at_once(finest, T_start, free, blur, rules) or descend(finest, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
     for one in climbed:
         if one.begins_at(ascent, rules):
             return one.fit
     known = noise or [Noise()] * len(views)
-    fit = Fit.of(_to_the_noise(ascent, finest, free, known, beside, errors, rules, blur))
+    levels.append(sigmas)
+    end = _to_the_noise(ascent, finest, free, known, beside, errors, rules, levels, blur)
+    fit = Fit.of(end, views, levels)
     climbed.append(Climbed(ascent, fit))
     return fit
 
@@ -221,6 +227,7 @@ def _through_blurs(
     options: EstimatorOptions,
     samples: Floats,
     rules: FitRules,
+    levels: list[Blurs],
     finest: MatchedObjective | None,
     last: NewtonOptions,
 ) -> Ascent[Floats]:
@@ -230,6 +237,7 @@ def _through_blurs(
     *wider, narrowest = blur_schedule(views, body, T_start, spread, rules.schedule)
     build = partial(build_objective, options.objective, views, body, samples)
     T = T_start
+    levels += wider
     for sigmas in wider:
         T = ascend(build(sigmas, T).linearise, perturb, T, free, COARSE).state
     objective = finest or build(narrowest, T)
@@ -244,6 +252,7 @@ def _to_the_noise(
     beside: float,
     errors: ErrorRules,
     rules: FitRules,
+    levels: list[Blurs],
     blur: float = 1.0,
 ) -> Ascent[Floats]:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
@@ -276,7 +285,8 @@ def _to_the_noise(
             replace(view, observation=view.observation.around(places, errors.reach))
             for view, places in zip(objective.views, met.places, strict=True)
         ]
-        objective = matched_objective(near, objective.projection.body, (blurs * sigmas).tolist())
+        levels.append((blurs * sigmas).tolist())
+        objective = matched_objective(near, objective.projection.body, levels[-1])
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,6 +43,7 @@ class Judged:
     associations: tuple[Association, ...] = ()  # the pose against each sensor that saw something
     spread: Floats | None = None  # (6,) standard deviations where they are as large as its motion
     proposer: str = ""  # where the pose came from
+    blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted
     value: float = 0.0  # of what was climbed, at the pose
     # (6, 6) of the covariance, what lasts from frame to frame
     lasting: Floats = field(default_factory=lambda: np.zeros((6, 6)))
