@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose.density import Atlas, observation
 from mixpose.objective import View, project_body
-from mixpose.pictures.stages import densities_picture
+from mixpose.pictures.densities import densities_picture
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import run
 from mixpose.selection import Selection
@@ -118,7 +118,7 @@ def test_pictures_of_densities_show_what_the_estimate_looked_up(name: str, spy: 
         y = predicted(views, session.body, T)
         spy.forget()
         sigma = view.observation.sigma
-        densities_picture(view, session.body, T, [sigma], (400, 300), 1)
+        densities_picture(view, session.body, T, [sigma], session.estimator, (400, 300))
         (shown,) = spy.drawn
         assert isinstance(shown, Atlas)
         assert spy.places_in(shown), "what is shown is looked up, too"

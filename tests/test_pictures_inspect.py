@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,14 +15,17 @@ import pytest
 from numpy.typing import NDArray
 
 import mixpose
-from mixpose.body import Body
+from mixpose.body import Body, PointFeature
 from mixpose.cli import main
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.frames import pair
-from mixpose.objective import View
+from mixpose.objective import ObjectiveName, View
 from mixpose.pictures.advice import describe
+from mixpose.pictures.densities import densities_picture, panels_of
 from mixpose.pictures.finding import Finding, find
+from mixpose.pictures.overlay import Part
+from mixpose.pictures.sheet import fitted_blurs
 from mixpose.pictures.signature import write_png
 from mixpose.pictures.slices import objective_around
 from mixpose.records import Estimate, PointPattern, Status
@@ -312,6 +317,62 @@ def test_the_objective_peaks_at_the_pose_in_every_slice_and_map(
         row, column = np.unravel_index(surface.values.argmax(), surface.values.shape)
         assert abs(row - 20) <= 1  # of 41, half a blur apart at most
         assert abs(column - 20) <= 1
+
+
+@pytest.mark.parametrize("objective", ["matched", "paper"])
+def test_densities_are_those_of_the_blurs_that_the_pose_was_fitted_by(
+    objective: ObjectiveName,
+) -> None:
+    session = mixpose.load_session(TWO_CAMERAS)
+    session = replace(session, estimator=replace(session.estimator, objective=objective))
+    seen: list[Sequence[View]] = []
+    (estimate,) = run(
+        session, selection=Selection(5, 6), watch=lambda _, views, __: seen.append(views)
+    )
+    T, view = estimate.T_world_object, seen[0][0]
+    # the start is 3° off: wider blurs than σ_ε come first, and the fit ends at no wider one
+    sigmas = fitted_blurs([view], estimate)["left"]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert sigmas[0] > 5 * view.observation.sigma >= 5 * sigmas[-1]
+    assert T is not None
+    y, _ = view.sensor.project(transform(T, session.body.means))
+    part, size = Part(2.0, (float(y[0, 0]) - 40, float(y[0, 1]) - 40)), (160, 160)
+    observed, twice = panels_of(view, session.body, T, sigmas, session.estimator, part, size)
+    assert len(observed) == len(sigmas)
+    assert len(twice) == (len(sigmas) if objective == "matched" else 1)
+    # around marker 1 at the finest blur there is its detection alone: one of seven, 2-D Gaussian
+    sigma = sigmas[-1]
+    peak = 1 / 7 / (2 * np.pi * sigma**2)
+    # places half a px apart are up to 0.35 px off the peak: exp(−0.35² / 2 · 1.5²) is 2.7 % less;
+    # and the grid of g, a quarter of a blur, looks it up as 1 / (4 · 16) less at most
+    assert observed[-1].values[78:84, 78:84].max() == pytest.approx(peak, rel=0.045)
+    assert twice[-1].values[78:84, 78:84].max() == pytest.approx(peak / 2, rel=0.045)
+
+
+def test_panels_of_one_kind_have_one_scale(parallel_cameras: list[ParallelBeam]) -> None:
+    camera = parallel_cameras[0]
+    body = Body("dot", (PointFeature(np.zeros(3)),))
+    y, _ = camera.project(body.means)
+    view = View("one", camera, Observation(PointPattern(y, np.ones(1)), 2.0))
+    picture = densities_picture(view, body, np.eye(4), [6.0, 2.0], EstimatorOptions(), (200, 200))
+    brightness = picture[:200].astype(float).sum(axis=-1)
+    wide, narrow = brightness[40:, :200].max(), brightness[40:, 204:404].max()
+    # a ninth of the peak is darker; each panel scaled to itself would have both alike
+    assert wide < 0.9 * narrow
+    # below each row its scale
+    assert picture.shape[0] > 2 * 200 + 2 * 15
+    assert picture.shape[1] == 404
+
+
+def test_a_pose_that_was_not_fitted_is_shown_at_the_blur_that_judges(
+    pose_of_frame_6: NDArray[np.float64], parallel_cameras: list[ParallelBeam]
+) -> None:
+    y = np.zeros((1, 2))
+    view = View("one", parallel_cameras[0], Observation(PointPattern(y, np.ones(1)), 2.0))
+    given = Estimate(6, None, "tracker", "ok", pose_of_frame_6, None, 1.0, {})
+    assert fitted_blurs([view], given) == {"one": [2.0]}
+    # a sensor that was left out took no part in the fit
+    assert fitted_blurs([view], replace(given, blurs=({"two": 9.0},))) == {"one": [2.0]}
 
 
 def test_directions_that_are_held_have_no_slice(

@@ -216,6 +216,9 @@ class Estimate:
     proposer : str
         Which of `mixpose.tracking.proposers` the pose came from; empty without a pose.  It is no
         part of the pose line.
+    blurs : tuple of mapping of str to float
+        Standard deviations of a feature, by sensor, of the objectives that the pose was fitted by,
+        in their order; empty where it was not fitted to this frame.  No part of the pose line.
     guesses : tuple of int or None
         Where the body was searched for: guesses made, tested on everything, and refined.
     delays : mapping of str to DelaySeen
@@ -239,6 +242,7 @@ class Estimate:
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
     proposer: str = field(default="", compare=False)
+    blurs: tuple[Mapping[str, float], ...] = field(default=(), compare=False, repr=False)
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
     doubt: str = field(default="", compare=False)

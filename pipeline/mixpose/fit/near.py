@@ -9,7 +9,7 @@ same pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
@@ -45,7 +45,7 @@ from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
 Floats: TypeAlias = NDArray[np.float64]
-
+Blurs: TypeAlias = list[float]
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
 # what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
@@ -90,11 +90,13 @@ class Fit:
     motion: Motion | None = None  # of the body, where sensors see it at moments of their own
     matches: Matches | None = None  # at the pose, at σ_ε, where detections were looked at
     noise: NoiseEstimate | None = None  # as these show it
+    blurs: tuple[Mapping[str, float], ...] = ()  # by view, of each objective that was climbed
 
     @classmethod
-    def of(cls, ascent: Ascent[Floats]) -> Fit:
-        """Where an ascent ended."""
-        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations)
+    def of(cls, ascent: Ascent[Floats], views: Sequence[View], levels: Sequence[Blurs]) -> Fit:
+        """Where an ascent through blurs of the views ended."""
+        blurs = tuple(dict(zip([view.name for view in views], one)) for one in levels)
+        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations, blurs=blurs)
 
 
 @dataclass(frozen=True)
@@ -160,24 +162,29 @@ def fit_near(
     rules : FitRules
     """
     free = free_mask(options)
-    descend = partial(_through_blurs, views, body, T_start, uncertainty, options, samples, rules)
+    levels: list[Blurs] = []  # blurs by view of each objective that is climbed
+    start = views, body, T_start, uncertainty, options, samples, rules, levels
+    descend = partial(_through_blurs, *start)
+    sigmas = [blur * view.observation.sigma for view in views]
     if options.objective != "matched":
-        return Fit.of(descend(None, FINE))
-    sigmas = [view.observation.sigma for view in views]
-    finest = finest or matched_objective(views, body, sigmas)
-    first = finest if blur == 1 else matched_objective(views, body, [blur * s for s in sigmas])
+        return Fit.of(descend(None, FINE), views, [*levels, sigmas])
+    at_blur = [view.observation.sigma for view in views]
+    finest = finest or matched_objective(views, body, at_blur)
+    first = finest if blur == 1 else matched_objective(views, body, sigmas)
     if has_likelihood(views):
         ascent = descend(finest, FINE)
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
-        return replace(Fit.of(ascent), T_world_object=T, freed=is_freed)
+        return replace(Fit.of(ascent, views, [*levels, sigmas]), T_world_object=T, freed=is_freed)
     ascent = begun or _at_once(first, T_start, free, blur, rules) or descend(first, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
     for one in climbed:
         if one.begins_at(ascent, rules):
             return one.fit
     known = np.zeros((2, len(views))) if noise is None else noise
-    fit = _to_the_noise(ascent, finest, free, known, beside, errors, association, rules, blur)
+    levels.append(sigmas)
+    rest = known, beside, errors, association, rules, levels, blur
+    fit = _to_the_noise(ascent, finest, free, *rest)
     climbed.append(Climbed(ascent, fit))
     return fit
 
@@ -233,6 +240,7 @@ def _through_blurs(
     options: EstimatorOptions,
     samples: Floats,
     rules: FitRules,
+    levels: list[Blurs],
     finest: MatchedObjective | None,
     last: NewtonOptions,
 ) -> Ascent[Floats]:
@@ -242,6 +250,7 @@ def _through_blurs(
     *wider, narrowest = blur_schedule(views, body, T_start, spread, rules.schedule)
     build = partial(build_objective, options.objective, views, body, samples)
     T = T_start
+    levels += wider
     for sigmas in wider:
         T = ascend(build(sigmas, T).linearise, perturb, T, free, COARSE).state
     objective = finest or build(narrowest, T)
@@ -257,6 +266,7 @@ def _to_the_noise(
     errors: ErrorRules,
     association: AssociationRules,
     rules: FitRules,
+    levels: list[Blurs],
     blur: float,
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
@@ -265,7 +275,7 @@ def _to_the_noise(
     likeliest, best = -np.inf, None
     while True:
         matches = associate(finest, ascent.state, association, errors.narrowest)
-        fit, wide = replace(Fit.of(ascent), matches=matches), matches
+        fit, wide = replace(Fit.of(ascent, finest.views, levels), matches=matches), matches
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
             wide = replace(matches, finest=least)
@@ -291,7 +301,8 @@ def _to_the_noise(
         if is_end:
             return best
         blurs = narrower
-        objective = _narrowed(finest, matches, (blurs * sigmas).tolist(), errors.reach)
+        levels.append((blurs * sigmas).tolist())
+        objective = _narrowed(finest, matches, levels[-1], errors.reach)
         ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
 
 

@@ -55,6 +55,8 @@ class ScoredPose:
         Standard deviations where they are as large as the body's motion.
     proposer : str
         Where the pose came from.
+    blurs : tuple of mapping of str to float
+        By sensor, through which it was fitted.
     """
 
     T_world_object: Floats
@@ -68,6 +70,7 @@ class ScoredPose:
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     spread: Floats | None = None
     proposer: str = ""
+    blurs: tuple[Mapping[str, float], ...] = ()
 
     @cached_property
     def used(self) -> Matches:

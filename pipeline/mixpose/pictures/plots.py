@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
+from mixpose.objective import View, matched_objective
 from mixpose.pictures.canvas import Picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import ellipse_95
@@ -28,6 +29,7 @@ _DPI = 100
 _MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"
 _AROUND = 0.6  # of the extent of the expected ranges, shown around them
 _LEAST_AROUND = 6.0  # in σ
+_PLACES = 600  # at which C is drawn
 
 
 def require_matplotlib() -> None:
@@ -55,7 +57,7 @@ def ranges_picture(
     width: int,
     row_height: int,
 ) -> Picture:
-    """Range sensors one below the other: measurement, densities g, and the ranges of the pose.
+    """Range sensors one below the other: measurement, densities g and C, the ranges of the pose.
 
     Parameters
     ----------
@@ -73,7 +75,6 @@ def ranges_picture(
     rows = figure.subplots(len(findings), 1, squeeze=False)[:, 0]
     for axes, finding, blurs in zip(rows, findings, sigmas, strict=True):
         _plot_ranges(axes, finding, blurs, body, estimate)
-    rows[0].legend(fontsize=7, loc="upper right")
     rows[-1].set_xlabel(f"range, {unit}")
     return _raster(figure)
 
@@ -93,7 +94,7 @@ def objective_picture(
     slices, maps
         As of `objective_around`.
     levels : sequence of float
-        Blur of each level in units of the finest.
+        Blur of each level in σ_ε.
     covariance : (6, 6) array or None
         Its 95 % ellipses are drawn on the maps.
     unit : str
@@ -112,7 +113,7 @@ def objective_picture(
         axes.set_axis_off()
     for k, (axes, one) in enumerate(zip(rows, slices, strict=False)):
         for values, colour, level in zip(one.values, colours, levels, strict=True):
-            label = "σ" if level < 1.001 else f"{level:.2g} σ"
+            label = "σ" if abs(level - 1) < 0.001 else f"{level:.2g} σ"
             axes.plot(_shown(one.offsets, one.direction), values, color=colour, label=label)
         axes.axvline(0, color="0.6", lw=0.8, ls=":")
         axes.set_xlabel(_label(one.direction, unit))
@@ -157,7 +158,7 @@ def _magnification(outline: Floats, one: Map) -> int:
 def _plot_ranges(
     axes: Axes, finding: Finding, blurs: Sequence[float], body: Body, estimate: Estimate
 ) -> None:
-    """One range sensor; everything is scaled to its own height."""
+    """One range sensor; each curve is divided by its largest value, which the legend states."""
     axes.set_title(_range_title(finding), fontsize=9, loc="left")
     axes.set_yticks([])
     axes.set_ylim(-0.03, 1.55)
@@ -179,16 +180,28 @@ def _plot_ranges(
             ends = np.array([low]), np.array([high])
             g = finding.view.observation.density(sigma, ends)
             values = np.ravel(g.values)
+            top = max(float(values.max()), 1e-30)
             axes.fill_between(
                 g.window.axis(0),
-                values / max(float(values.max()), 1e-30),
+                values / top,
                 color=str(shade),
                 alpha=0.45,
                 lw=0,
-                label=f"g, σ = {sigma:.2g}",
+                label=f"g / {top:.2g}, σ = {sigma:.2g}",
             )
+        _plot_matched(axes, finding.view, body, blurs[-1], np.linspace(low, high, _PLACES))
     _plot_expected(axes, finding, body, estimate)
     axes.set_xlim(low, high)
+    axes.legend(fontsize=7, loc="upper right")
+
+
+def _plot_matched(axes: Axes, view: View, body: Body, sigma: float, ranges: Floats) -> None:
+    """C, which is g blurred once more, as the matched objective looks it up."""
+    places = np.stack([ranges, np.zeros_like(ranges)], axis=-1)
+    values = matched_objective([view], body, [sigma]).atlas.look_up(places[None, None])[..., 0]
+    top = max(float(values.max()), 1e-30)
+    label = f"C / {top:.2g}, σ = {sigma:.2g}"
+    axes.plot(ranges, np.ravel(values) / top, color="black", lw=0.8, ls="--", label=label)
 
 
 def _plot_expected(axes: Axes, finding: Finding, body: Body, estimate: Estimate) -> None:

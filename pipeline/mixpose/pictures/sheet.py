@@ -10,23 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.fit import ScheduleRules, blur_schedule
 from mixpose.objective import View
 from mixpose.pictures.canvas import WHITE, Picture, words
+from mixpose.pictures.densities import densities_picture
 from mixpose.pictures.finding import Finding
 from mixpose.pictures.layout import in_grid, stacked
 from mixpose.pictures.overlay import FOUND, STATUS_COLOURS
 from mixpose.pictures.plots import objective_picture, ranges_picture
 from mixpose.pictures.slices import objective_around
-from mixpose.pictures.stages import (
-    densities_picture,
-    features_picture,
-    pose_picture,
-    threshold_picture,
-)
+from mixpose.pictures.stages import features_picture, pose_picture, threshold_picture
 from mixpose.records import Estimate
 from mixpose.session import Session
-from mixpose.tracking import Tracker
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -36,21 +30,22 @@ BODIES = "bodies.png"
 _LARGE = (1400, 1050)  # room of a picture of its own
 _SMALL = (460, 345)  # and on the sheet
 _WIDTH = 4 * _SMALL[0] + 12
-_BLURS_ON_SHEET = 4
-_LEVELS_WITHOUT_POSE = 4
+_BLURS_ON_SHEET = 2
+_BAR_PX = 38  # of a scale on the sheet, with the gaps
+_MOST_BLURS = 8  # in a picture of their own
+_GAP_PX = 4
 _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 
 
 def inspection_pictures(
-    session: Session, tracker: Tracker, findings: Sequence[Finding], estimate: Estimate
+    session: Session, body: Body, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
     """Make all pictures of one body in one frame.
 
     Parameters
     ----------
     session : Session
-    tracker : Tracker
-        Of the body: how far from its pose a search begins, and with it the widest blur.
+    body : Body
     findings : sequence of Finding
         One per sensor.
     estimate : Estimate
@@ -60,13 +55,12 @@ def inspection_pictures(
     dict of str to (H, W, 3) uint8
         By file name, ``sheet.png`` first.
     """
-    body = tracker.body
     views = [
         finding.view
         for finding in findings
         if finding.view is not None and not finding.view.observation.is_empty
     ]
-    blurs = blur_levels(views, tracker, estimate)
+    blurs = fitted_blurs(views, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
     names = file_names(_names(session))
@@ -74,12 +68,12 @@ def inspection_pictures(
         if finding.setup.sensor.dimension != 2:
             continue
         sigmas = blurs.get(finding.name, [])
-        made = _camera_pictures(finding, body, estimate, sigmas)
+        made = _camera_pictures(session, finding, body, estimate, sigmas)
         pictures |= {f"{name}_{stage}.png": picture for stage, picture in made.items()}
-        rows.append(_camera_row(finding, body, estimate, sigmas))
+        rows.append(_camera_row(session, finding, body, estimate, sigmas))
     ranged = [finding for finding in findings if finding.setup.sensor.dimension == 1]
     if ranged:
-        ends = [_ends(blurs.get(finding.name, [])) for finding in ranged]
+        ends = [_some(blurs.get(finding.name, []), _BLURS_ON_SHEET) for finding in ranged]
         height = _RANGE_ROW if len(ranged) <= 4 else _LOW_RANGE_ROW
         picture = ranges_picture(ranged, ends, body, estimate, session.unit, _WIDTH, height)
         pictures["ranges.png"] = picture
@@ -101,7 +95,8 @@ def _objective(
     assert T is not None, "without a pose there is nothing to cut the objective around"
     levels = list(zip(*(blurs[view.name] for view in views), strict=True))
     slices, maps = objective_around(views, body, T, covariance, session.estimator, levels)
-    factors = [max(a / b for a, b in zip(level, levels[-1])) for level in levels]
+    finest = [view.observation.sigma for view in views]
+    factors = [max(a / b for a, b in zip(level, finest)) for level in levels]
     return objective_picture(slices, maps, factors, covariance, session.unit, _WIDTH)
 
 
@@ -119,25 +114,24 @@ def prefixes_of(labels: Sequence[str]) -> list[str]:
     return [""] if len(labels) == 1 else [f"{name}_" for name in file_names(labels)]
 
 
-def blur_levels(
-    views: Sequence[View], tracker: Tracker, estimate: Estimate
-) -> dict[str, list[float]]:
-    """Blurs that the estimator descends through, coarse to fine, by sensor."""
-    if not views:
-        return {}
-    if estimate.T_world_object is None:
-        steps = range(_LEVELS_WITHOUT_POSE - 1, -1, -1)
-        return {
-            view.name: [view.observation.sigma * ScheduleRules().ratio ** k for k in steps]
-            for view in views
-        }
-    around = np.where(tracker.free, tracker.start_uncertainty, 0.0)
-    levels = blur_schedule(views, tracker.body, estimate.T_world_object, around)
-    return {view.name: [level[k] for level in levels] for k, view in enumerate(views)}
+def fitted_blurs(views: Sequence[View], estimate: Estimate) -> dict[str, list[float]]:
+    """Blurs that a pose was fitted by, in their order, by sensor.
+
+    Where it was not fitted to this frame, or a sensor was left out, σ_ε, by which it is judged.
+    """
+    levels = estimate.blurs or ({},)
+    return {
+        view.name: [level.get(view.name, view.observation.sigma) for level in levels]
+        for view in views
+    }
 
 
 def _camera_pictures(
-    finding: Finding, body: Body, estimate: Estimate, sigmas: Sequence[float]
+    session: Session,
+    finding: Finding,
+    body: Body,
+    estimate: Estimate,
+    sigmas: Sequence[float],
 ) -> dict[str, Picture]:
     pictures = {
         "features": features_picture(finding, _LARGE),
@@ -145,24 +139,27 @@ def _camera_pictures(
         "pose": pose_picture(finding, body, estimate, _LARGE),
     }
     if finding.view is not None and sigmas:
-        T = estimate.T_world_object
-        pictures["density"] = densities_picture(
-            finding.view, body, T, sigmas, (460, 460), min(len(sigmas), 4)
-        )
+        T, few = estimate.T_world_object, _some(sigmas, _MOST_BLURS)
+        about = finding.view, body, T, few, session.estimator
+        side = min(_WIDTH // len(few) - _GAP_PX, _SMALL[0])
+        pictures["density"] = densities_picture(*about, (side, side))
     return pictures
 
 
 def _camera_row(
-    finding: Finding, body: Body, estimate: Estimate, sigmas: Sequence[float]
+    session: Session,
+    finding: Finding,
+    body: Body,
+    estimate: Estimate,
+    sigmas: Sequence[float],
 ) -> Picture:
     """One camera on the sheet: features, threshold, densities, pose."""
     panels = [features_picture(finding, _SMALL), threshold_picture(finding, _SMALL)]
     if finding.view is not None and sigmas:
-        chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, _BLURS_ON_SHEET)).astype(int))
-        half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - 2
-        few = [sigmas[k] for k in chosen]
-        T = estimate.T_world_object
-        panels.append(densities_picture(finding.view, body, T, few, half, 2))
+        half = _SMALL[0] // 2 - 2, _SMALL[1] // 2 - _BAR_PX
+        T, few = estimate.T_world_object, _some(sigmas, _BLURS_ON_SHEET)
+        about = finding.view, body, T, few, session.estimator
+        panels.append(densities_picture(*about, half))
     panels.append(pose_picture(finding, body, estimate, _SMALL))
     return in_grid(panels, 4, _SMALL)
 
@@ -183,9 +180,10 @@ def _heading(session: Session, estimate: Estimate) -> Picture:
     return picture
 
 
-def _ends(sigmas: Sequence[float]) -> list[float]:
-    """The coarsest and the finest blur."""
-    return list(dict.fromkeys([sigmas[0], sigmas[-1]])) if sigmas else []
+def _some(sigmas: Sequence[float], most: int) -> list[float]:
+    """The first and the last blur, and as many between them as there is room for."""
+    chosen = np.unique(np.round(np.linspace(0, len(sigmas) - 1, most)).astype(int))
+    return [sigmas[k] for k in chosen] if sigmas else []
 
 
 def _names(session: Session) -> list[str]:

@@ -1,8 +1,7 @@
-"""Pictures of what happens to one camera's frame: features, threshold, densities, pose."""
+"""Pictures of what happens to one camera's frame: features, threshold, pose."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TypeAlias
 
 import cv2
@@ -13,7 +12,7 @@ from mixpose.body import Body
 from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
-from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.objective import View
 from mixpose.objective.base import region_of_interest
 from mixpose.pictures.canvas import (
     WHITE,
@@ -26,7 +25,6 @@ from mixpose.pictures.canvas import (
 )
 from mixpose.pictures.display import displayable
 from mixpose.pictures.finding import Finding
-from mixpose.pictures.layout import in_grid
 from mixpose.pictures.overlay import (
     FOUND,
     Part,
@@ -46,12 +44,10 @@ Size: TypeAlias = tuple[int, int]
 ABOVE: Colour = (0, 140, 255)
 _DIMMED = 0.45
 _MARK_PX = 9.0
-_STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
 _MAGNIFIERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 _ELLIPSE_PX = 20.0  # larger half-axis of an ellipse that is easily seen
 _AROUND = 0.35  # of the body's extent, shown around it
 _LEAST_AROUND_PX = 25.0
-_MOST_LEVELS = 8
 
 
 def features_picture(finding: Finding, room: Size) -> Picture:
@@ -60,7 +56,7 @@ def features_picture(finding: Finding, room: Size) -> Picture:
     _mark(picture, part, finding.points)
     count = f"{finding.count:.0f}" if finding.points is not None else f"{finding.count:.1f}"
     text = f"{count} found" if finding.points is not None else f"light as of {count} points"
-    return _titled(picture, f"{finding.name}: {text}")
+    return titled(picture, f"{finding.name}: {text}")
 
 
 def threshold_picture(finding: Finding, room: Size) -> Picture:
@@ -69,7 +65,7 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
     options = finding.setup.extract
     data = None if finding.frame is None else finding.frame.data
     if data is None or isinstance(data, PointPattern | GridPattern):
-        return _titled(picture, "detections: no threshold")
+        return titled(picture, "detections: no threshold")
     size = picture.shape[1], picture.shape[0]
     window = 0, 0, data.shape[1], data.shape[0]
     if options.method == "corners":
@@ -93,42 +89,10 @@ def threshold_picture(finding: Finding, room: Size) -> Picture:
         picture[shown > 0] = ABOVE
         title = f"{'above' if options.polarity == 'bright' else 'below'} the threshold"
     else:
-        return _titled(picture, f"{options.method}: its own threshold")
+        return titled(picture, f"{options.method}: its own threshold")
     if options.method != "intensity":
         _mark(picture, part, finding.points)
-    return _titled(picture, title)
-
-
-def densities_picture(
-    view: View, body: Body, T: Floats | None, sigmas: Sequence[float], room: Size, columns: int
-) -> Picture:
-    """C of one camera, g blurred once more, as the estimator looks it up, blur by blur."""
-    if len(sigmas) > _MOST_LEVELS:
-        keep = np.round(np.linspace(0, len(sigmas) - 1, _MOST_LEVELS)).astype(int)
-        sigmas = [sigmas[k] for k in keep]
-    box = _box(view, body, T, 4 * max(sigmas))
-    part, size = _fitted(box, room)
-    panels = []
-    for sigma in sigmas:
-        drawn = matched_objective([view], body, [sigma])
-        values = _sampled(drawn, sigma, part, size)
-        share = np.clip(values / max(float(values.max()), 1e-30), 0, 1)
-        grey = np.round(255 * np.sqrt(share)).astype(np.uint8)
-        panel = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
-        panels.append(_titled(panel, f"C = g ∗ ε, σ = {sigma:.3g} px"))
-    rows = -(-len(panels) // columns)
-    return in_grid(panels, -(-len(panels) // rows))  # five are three and two, not four and one
-
-
-def _sampled(objective: MatchedObjective, sigma: float, part: Part, size: Size) -> Floats:
-    """Values of a density on a picture (H, W): of each pixel the largest, lest peaks be missed."""
-    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
-    u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
-    pixels = np.stack(np.meshgrid(u, v), axis=-1)
-    places = (pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner
-    values = objective.atlas.look_up(places[None])[..., 0]
-    blocks = values.reshape(size[1], fine, size[0], fine)
-    return np.asarray(blocks.max(axis=(1, 3)))
+    return titled(picture, title)
 
 
 def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -> Picture:
@@ -137,8 +101,8 @@ def pose_picture(finding: Finding, body: Body, estimate: Estimate, room: Size) -
     if finding.view is None or T is None:
         picture, _ = backdrop(finding.setup, finding.frame, room)
         return draw_pose(picture, finding.setup.sensor, body, None, None, estimate.status)
-    box = _box(finding.view, body, T, None)
-    part, size = _fitted(box, room)
+    box = shown_box(finding.view, body, T, None)
+    part, size = fitted(box, room)
     whole, native = backdrop(finding.setup, finding.frame, None)
     matrix = np.array(
         [
@@ -186,7 +150,9 @@ def _magnifier(
     return factor, f"95 % within {max(largest):.2g} px{enlarged}"
 
 
-def _box(view: View, body: Body, T: Floats | None, margin: float | None) -> tuple[Floats, Floats]:
+def shown_box(
+    view: View, body: Body, T: Floats | None, margin: float | None
+) -> tuple[Floats, Floats]:
     """The part of a camera's image around the body, or around all that was found."""
     y = np.zeros((0, 2))
     if T is not None:
@@ -201,7 +167,7 @@ def _box(view: View, body: Body, T: Floats | None, margin: float | None) -> tupl
     return region_of_interest(view.sensor, y, margin)
 
 
-def _fitted(box: tuple[Floats, Floats], room: Size) -> tuple[Part, Size]:
+def fitted(box: tuple[Floats, Floats], room: Size) -> tuple[Part, Size]:
     """How a box of sensor coordinates fits into some room."""
     extent = np.maximum(box[1] - box[0] + 1, 1)
     zoom = float(min(room[0] / extent[0], room[1] / extent[1]))
@@ -218,7 +184,8 @@ def _mark(picture: Picture, part: Part, points: Floats | None) -> None:
         cross(picture, place, reach / 3, reach, FOUND)
 
 
-def _titled(picture: Picture, title: str) -> Picture:
+def titled(picture: Picture, title: str) -> Picture:
+    """The picture, with a caption in its upper left corner."""
     words(picture, title, (0.5 * line_height(picture), 1.1 * line_height(picture)), WHITE, size=0.9)
     return picture
 

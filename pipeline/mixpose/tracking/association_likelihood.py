@@ -188,7 +188,7 @@ class AssociationLikelihood:
         for width in widths:
             posterior = partial(self._posterior, prior, width)
             found = ascend(posterior, perturb, found.state, data.free, _OPTIONS)
-        return Fit(found.state, found.value, found.converged, found.iterations)
+        return Fit.of(found, data.views, np.outer(widths, data.sigmas).tolist())
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by the sum over all associations, with the prior of the start."""

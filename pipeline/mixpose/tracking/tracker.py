@@ -174,7 +174,7 @@ class Tracker:
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
             fits.append(fit)
-            judged = replace(likelihood.judge(fit, start), proposer=name)
+            judged = replace(likelihood.judge(fit, start), proposer=name, blurs=fit.blurs)
             insert(ranked, judged, self.body, self.free, self.rules.acceptance)
             return judged
 
@@ -199,7 +199,9 @@ class Tracker:
         for one in ranked:
             left_out = {n: report.why for n, report in one.sensors.items() if report.why}
             start = Start(one.T_world_object, close, left_out=left_out)
-            judged = replace(likelihood.judge(likelihood.fit(start), start), proposer=one.proposer)
+            fit = likelihood.fit(start)
+            blurs = fit.blurs or one.blurs
+            judged = replace(likelihood.judge(fit, start), proposer=one.proposer, blurs=blurs)
             insert(found, judged, self.body, self.free, self.rules.acceptance)
         return found
 
@@ -230,6 +232,7 @@ class Tracker:
             sensors=reports,
             hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
             proposer=best.proposer if best else "",
+            blurs=best.blurs if best else (),
             doubt=verdict.doubt,
             offsets=offsets,
         )

@@ -1,0 +1,174 @@
+"""The densities of one camera as a frame was estimated with them: g and C, blur by blur.
+
+g is the observed density g0 ∗ ε, and C is g blurred once more, which the matched objective looks
+up.  Objectives that draw samples look g up on a grid around them.  Panels of one kind have one
+scale, which a bar below states: it is logarithmic, as a peak falls with the square of the blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View, matched_objective
+from mixpose.objective.paper import sampled_terms
+from mixpose.pictures.canvas import WHITE, Picture, line_height, words
+from mixpose.pictures.layout import in_grid, stacked
+from mixpose.pictures.overlay import Part
+from mixpose.pictures.stages import fitted, shown_box, titled
+
+Floats: TypeAlias = NDArray[np.float64]
+Size: TypeAlias = tuple[int, int]
+Look: TypeAlias = Callable[[Floats], Floats]
+
+_STEPS_PER_SIGMA = 1.5  # places at which a density is looked up
+_SHOWN = 1e-3  # of the lowest peak: what is less is black
+_BAR_LINES = 1.6  # height of a bar, lines of captions
+_MARGIN = 4  # widest blurs around the body
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A density on a picture.
+
+    Attributes
+    ----------
+    title : str
+    values : (H, W) float64
+        In 1/px², of each pixel the largest.
+    """
+
+    title: str
+    values: Floats
+
+
+def densities_picture(
+    view: View,
+    body: Body,
+    T: Floats | None,
+    sigmas: Sequence[float],
+    options: EstimatorOptions,
+    room: Size,
+) -> Picture:
+    """A row of g at the blurs of a fit, a row of C, and the scale of each below it.
+
+    Parameters
+    ----------
+    view : View
+        Of a camera.
+    body : Body
+    T : (4, 4) array or None
+        The pose, about which is shown what there is; None: about all that was found.
+    sigmas : sequence of float
+        Standard deviations of a feature in px, in the order of the fit, the last σ_ε or less.
+    options : EstimatorOptions
+        Of the session: the objective and its samples.
+    room : (int, int)
+        Of a panel, in px.
+    """
+    box = shown_box(view, body, T, _MARGIN * max(sigmas))
+    part, size = fitted(box, room)
+    rows = []
+    for panels in panels_of(view, body, T, sigmas, options, part, size):
+        top = max(float(one.values.max()) for one in panels)
+        least = min(float(one.values.max()) for one in panels if one.values.max() > 0)
+        bottom = _SHOWN * least
+        drawn = [titled(_coloured(one.values, bottom, top), one.title) for one in panels]
+        row = in_grid(drawn, len(drawn))
+        rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
+    return stacked(rows)
+
+
+def panels_of(
+    view: View,
+    body: Body,
+    T: Floats | None,
+    sigmas: Sequence[float],
+    options: EstimatorOptions,
+    part: Part,
+    size: Size,
+) -> list[list[Panel]]:
+    """The panels of g and those of C, on a picture (width, height) of a part of the image.
+
+    The sampled objectives climb g alone; C is then that at σ_ε, by which the pose is judged.
+    """
+    is_matched = options.objective == "matched"
+    judged = list(sigmas) if is_matched else [view.observation.sigma]
+    observed, twice = [], []
+    for sigma in sigmas:
+        look = _g(view, sigma, part, size)
+        word = "g"
+        if not is_matched and T is not None:
+            samples = body.sample(options.samples, seed=options.seed)
+            look = _sampled_g(view, samples, sigma, T)
+            word = "g sampled"
+        title = f"{word}, σ = {sigma:.3g} px"
+        observed.append(Panel(title, _on_picture(look, sigma, part, size)))
+    for sigma in judged:
+        atlas = matched_objective([view], body, [sigma]).atlas
+        look = _first(atlas.look_up)
+        title = f"C = g ∗ ε, σ = {sigma:.3g} px"
+        twice.append(Panel(title, _on_picture(look, sigma, part, size)))
+    return [observed, twice]
+
+
+def _g(view: View, sigma: float, part: Part, size: Size) -> Look:
+    """The observed density of a sensor on a part of its image, exact sums on a grid."""
+    lower = np.array(part.corner) - 1.0
+    density = view.observation.density(sigma, (lower, lower + np.array(size) / part.zoom + 2.0))
+    return lambda places: np.asarray(density.sample(places), dtype=np.float64)
+
+
+def _sampled_g(view: View, samples: Floats, sigma: float, T: Floats) -> Look:
+    """The same as the objectives that draw samples have it: around these, and 0 elsewhere."""
+    terms = sampled_terms([view], samples, [sigma], T)
+    if not terms:
+        return lambda places: np.zeros(places.shape[:-1])
+    return lambda places: np.asarray(terms[0].density.sample(places)[..., 0], dtype=np.float64)
+
+
+def _first(look_up: Look) -> Look:
+    """The values of one sensor without their gradients."""
+    return lambda places: np.asarray(look_up(places[None])[0, ..., 0])
+
+
+def _on_picture(look: Look, sigma: float, part: Part, size: Size) -> Floats:
+    """Values of a density on a picture (H, W): of each pixel the largest, lest peaks be missed."""
+    fine = max(int(np.ceil(_STEPS_PER_SIGMA / (part.zoom * sigma))), 1)
+    u, v = (np.arange(fine * n, dtype=np.float64) for n in size)
+    pixels = np.stack(np.meshgrid(u, v), axis=-1)
+    places = (pixels + 0.5) / (fine * part.zoom) - 0.5 + part.corner
+    blocks = look(places).reshape(size[1], fine, size[0], fine)
+    return np.asarray(np.maximum(blocks.max(axis=(1, 3)), 0.0))
+
+
+def _coloured(values: Floats, bottom: float, top: float) -> Picture:
+    """Densities in colours, black below `bottom` and brightest at `top`."""
+    share = np.log(np.maximum(values, bottom) / bottom) / np.log(top / bottom)
+    grey = np.round(255 * np.clip(share, 0, 1)).astype(np.uint8)
+    return np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO), dtype=np.uint8)
+
+
+def _bar(width: int, panel: Picture, bottom: float, top: float) -> Picture:
+    """The scale of a row of panels as a bar, with the powers of ten on it."""
+    line = line_height(panel)
+    shares = np.linspace(0, 1, width)
+    bar = np.tile(bottom * (top / bottom) ** shares, (max(round(0.4 * line), 4), 1))
+    picture = np.zeros((round(_BAR_LINES * line), width, 3), np.uint8)
+    picture[: len(bar)] = _coloured(bar, bottom, top)
+    first, last = np.ceil(np.log10(bottom)), np.floor(np.log10(top))
+    baseline = picture.shape[0] - 0.3 * line
+    for power in np.arange(first, last + 1):
+        u = width * (power - np.log10(bottom)) / np.log10(top / bottom)
+        if u < width - 8 * line:
+            picture[: len(bar), max(round(u) - 1, 0) : round(u) + 1] = 255
+            words(picture, f"1e{power:.0f}", (u, baseline), WHITE, size=0.8)
+    words(picture, f"{top:.1e} / px²", (width - 5 * line, baseline), WHITE, size=0.8)
+    return picture
