@@ -1,4 +1,4 @@
-"""The tool that runs the tests as on other processors: its settings, and what it makes of pytest."""
+"""The tool that runs the tests as on other processors: its settings, and how it reads pytest."""
 
 from __future__ import annotations
 
