@@ -1,7 +1,8 @@
-"""The tool that runs the tests as on other processors: its settings, and what it makes of pytest."""
+"""The tool that runs the tests as on other processors: its settings, and how it reads pytest."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -48,7 +49,7 @@ def test_numpy_is_told_to_leave_alone_what_this_processor_has_only() -> None:
     for row in tool.settings(units, 8):  # a name that NumPy does not know here is a warning
         if row.possible:
             command = [sys.executable, "-W", "error", "-c", program]
-            subprocess.run(command, env={**tool.os.environ, **row.environment}, check=True)
+            subprocess.run(command, env={**os.environ, **row.environment}, check=True)
 
 
 def test_tests_that_fail_are_counted_and_named_and_so_is_a_process_that_dies() -> None:

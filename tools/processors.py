@@ -75,7 +75,7 @@ class Outcome:
 
 def vector_units() -> list[str]:
     """Vector units that NumPy uses here, beyond those that it always needs."""
-    found = np.show_config(mode="dicts")["SIMD Extensions"]  # type: ignore[call-overload]
+    found = np.show_config(mode="dicts")["SIMD Extensions"]
     return list(found.get("found", []))
 
 
