@@ -43,9 +43,9 @@ def apart(views: Sequence[View], body: Body, T_a: Floats, T_b: Floats) -> float:
     return float(np.sqrt(twist @ np.linalg.solve(covariance, twist)))
 
 
-def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent[Floats]]:
+def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent]:
     objective = matched_objective(views, body, [view.observation.sigma for view in views])
-    return objective, ascend(objective.linearise, perturb, TRUTH, ALL_FREE, near.SHARP)
+    return objective, ascend(objective, TRUTH[None], perturb, ALL_FREE, near.SHARP)
 
 
 def bent(views: list[View], by_px: float) -> list[View]:
@@ -101,9 +101,9 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         seen = errors_seen(met.offsets, 6, known, errors)
         expected = met.moved(ALL_FREE, np.ones(2), seen.blurs, seen.variances)
         narrow = matched_objective(views, body, (seen.blurs * sigmas).tolist())
-        end = ascend(narrow.linearise, perturb, ascent.state, ALL_FREE, near.SHARP).state
+        end = ascend(narrow, ascent.states, perturb, ALL_FREE, near.SHARP).states[0]
         unit = float(np.sqrt(seen.variances.mean())) * 1.5 / NOISE_PX
-        moved = apart(views, body, end, ascent.state) / unit
+        moved = apart(views, body, end, ascent.states[0]) / unit
         # one step of iterated least squares, of which there are some
         assert 0.6 * moved < np.sqrt(expected) < 1.2 * moved
 
@@ -113,12 +113,12 @@ def test_offsets_are_those_at_the_end_of_an_ascent_whose_last_step_is_not_looked
 ) -> None:
     views = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=4)
     objective, ascent = at_sigma(views, EIGHT)
-    assert ascent.step is not None
+    assert ascent.steps.any()
     sigmas = np.array([view.observation.sigma for view in views])
     found = near._met(objective, ascent, sigmas, 0.0, ErrorRules()).away
-    at, sampled, _ = objective.match(ascent.state[None])
+    at, sampled, _ = objective.match(ascent.states)
     there = 2 * sigmas[:, None, None] * sampled[:, 0, :, 1:] / sampled[:, 0, :, :1]
-    shift = np.abs(at.J[:, 0] @ ascent.step).max() / 1.5
+    shift = np.abs(at.J[:, 0] @ ascent.steps[0]).max() / 1.5
     assert shift > 1e-4
     # to second order of the step
     np.testing.assert_allclose(found, there, atol=shift / 50)

@@ -107,6 +107,8 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
         T[:3, :3] = cv2.Rodrigues(twist[3:])[0] @ T_world_object[:3, :3]
         T[:3, 3] += twist[:3]
         return T
+    if twist.size == 6 and T_world_object.shape == (1, 4, 4):
+        return perturb(T_world_object[0], twist.reshape(6))[None]
     rotation = rotation_matrix(twist[..., 3:]) @ T_world_object[..., :3, :3]
     return from_parts(rotation, T_world_object[..., :3, 3] + twist[..., :3])
 
@@ -119,6 +121,8 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
         twist[:3] = T_to[:3, 3] - T_from[:3, 3]
         twist[3:] = cv2.Rodrigues(R_difference)[0][:, 0]
         return twist
+    if R_difference.shape == (1, 3, 3):
+        return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]
     vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)

@@ -44,8 +44,8 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
         {
             "value": lambda: plain.value(T),
             "remap": remaps_in(lambda: plain.value(T)),
-            "linearise": lambda: graded.linearise(T),
-            "remap with gradients": remaps_in(lambda: graded.linearise(T)),
+            "linearise": lambda: graded.linearise(T[None]),
+            "remap with gradients": remaps_in(lambda: graded.linearise(T[None])),
         },
         rounds=60,
         calls=20,

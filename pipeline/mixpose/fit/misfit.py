@@ -21,8 +21,8 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.objective import Quadratic, pose_jacobian
-from mixpose.optimise import NewtonOptions, ascend
+from mixpose.objective import pose_jacobian
+from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
@@ -163,14 +163,11 @@ class Matching:
         labels, tried = self.nearest(T), set[Labels]()
         while labels not in tried:
             tried.add(labels)
-
-            def model(T: Floats, labels: Labels = labels) -> Quadratic:
-                rest, J = self.offsets(T, labels)
-                return Quadratic(-float(rest @ rest), 2 * rest @ J, 2 * J.T @ J)
-
-            found = ascend(model, perturb, T, self.free, NewtonOptions(60, tolerance=1e-13))
-            T, last, labels = found.state, labels, self.nearest(found.state)
-        return Matched(T, last, -found.value)
+            term = LabelledPlaces(self, labels)
+            found = ascend(term, T[None], perturb, self.free, NewtonOptions(60, tolerance=1e-13))
+            T = found.states[0]
+            last, labels = labels, self.nearest(T)
+        return Matched(T, last, -float(found.values[0]))
 
     def swapped(self, best: Matched) -> list[float]:
         """Sums of squares, to first order, once two features of a sensor change their places."""
@@ -186,16 +183,30 @@ class Matching:
         return squares
 
 
+@dataclass(frozen=True)
+class LabelledPlaces:
+    """Minus the sum of squares between features and the places that are taken for theirs."""
+
+    matching: Matching
+    labels: Labels
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        pairs = [self.matching.offsets(T, self.labels) for T in poses]
+        models = [(-float(rest @ rest), 2 * rest @ J, 2 * J.T @ J) for rest, J in pairs]
+        return Quadratic(*map(np.array, zip(*models, strict=True)))
+
+
 def fit_freed(
     densities: Sequence[SensorDensity],
     points: Floats,
-    starts: Sequence[Floats],
+    starts: Floats,
     free: NDArray[np.bool_],
 ) -> Floats | None:
     """Fit the pose to freed features by least squares; None where no place is surely whose.
 
     The features (n, 3), all of one weight, are seen by all sensors; correspondences are sought from
-    poses (4, 4), which may change in free directions (6,).
+    starts (H, 4, 4), which may change in free directions (6,).
     """
     coordinates = sum(sensor.geometry.dimension for sensor in densities)
     redundant = coordinates * len(points) - int(free.sum())

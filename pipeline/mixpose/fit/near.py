@@ -23,17 +23,17 @@ from mixpose.density import ErrorRules, Noise, Offsets, errors_seen, log_likelih
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import NormalPrior, believed, has_likelihood
+from mixpose.fit.prior import believed, has_likelihood
 from mixpose.objective import (
     MatchedObjective,
-    Quadratic,
-    Together,
+    NormalPrior,
     View,
     build_objective,
     matched_objective,
+    together,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
-from mixpose.optimise import Ascent, NewtonOptions, ascend, ascend_together
+from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
@@ -82,23 +82,24 @@ class Fit:
     motion: Motion | None = None  # of the body, where sensors see it at moments of their own
 
     @classmethod
-    def of(cls, ascent: Ascent[Floats]) -> Fit:
+    def of(cls, ascent: Ascent) -> Fit:
         """Where an ascent ended."""
-        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations)
+        value, converged, iterations = ascent.values[0], ascent.converged[0], ascent.iterations[0]
+        return cls(ascent.states[0], float(value), bool(converged), int(iterations))
 
 
 @dataclass(frozen=True)
 class Climbed:
     """A fit, and the ascent at σ_ε that it went on from."""
 
-    ascent: Ascent[Floats]
+    ascent: Ascent
     fit: Fit
 
-    def begins_at(self, other: Ascent[Floats], rules: FitRules) -> bool:
+    def begins_at(self, other: Ascent, rules: FitRules) -> bool:
         """Whether another ascent ended at the same place, so that it leads to the same fit."""
-        assert other.last is not None
-        away = twist_between(self.ascent.state, other.state)
-        return float(away @ other.last.curvature @ away) < rules.same * abs(other.value)
+        away = twist_between(self.ascent.states[0], other.states[0])
+        value = abs(float(other.values[0]))
+        return float(away @ other.last.curvature[0] @ away) < rules.same * value
 
 
 def fit_near(
@@ -110,7 +111,7 @@ def fit_near(
     samples: Floats,
     *,
     finest: MatchedObjective | None = None,
-    begun: Ascent[Floats] | None = None,
+    begun: Ascent | None = None,
     climbed: list[Climbed] | None = None,
     blur: float = 1.0,
     noise: Sequence[Noise] | None = None,
@@ -157,7 +158,7 @@ def fit_near(
     if has_likelihood(views):
         ascent = descend(finest, FINE)
         prior = NormalPrior(T_start, uncertainty, free)
-        T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
+        T, is_freed = believed(finest, ascent.states[0], prior, rules.misfit)
         return replace(Fit.of(ascent), T_world_object=T, freed=is_freed)
     ascent = begun or _at_once(finest, T_start, free, blur, rules) or descend(finest, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
@@ -175,7 +176,7 @@ def fit_together(
     starts: Sequence[Floats],
     free: NDArray[np.bool_],
     rules: FitRules = FitRules(),
-) -> list[Ascent[Floats] | None]:
+) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
 
     Parameters
@@ -188,15 +189,23 @@ def fit_together(
 
     Returns
     -------
-    list of Ascent or None
-        None for a body that has to descend through the blurs.
+    list of (MatchedObjective, Ascent) or None
+        With what is seen where the ascent ends; None for a body that has to descend through the
+        blurs.
     """
-    together = Together.of(objectives)
-    here = together.models(starts)
-    found = ascend_together(together.models, perturb, starts, free, SHARP, here)
-    together.match([one.state for one in found])
-    least = rules.near * len(objectives[0].views)
-    return [one if at.value >= least else None for one, at in zip(found, here, strict=True)]
+    joint, states = together(objectives), np.array(starts)
+    here = joint.linearise(states)
+    options = replace(SHARP, together=True)
+    ends = ascend(joint, states, perturb, free, options, here)
+    found: list[tuple[MatchedObjective, Ascent] | None] = []
+    for k, seen in enumerate(joint.seen(objectives, ends.states)):
+        own = ends.of(slice(k, k + 1))
+        assert seen.at_hand is not None
+        last = own.last._replace(source=seen.at_hand[1])
+        own = own._replace(last=last, steps=np.zeros((1, 6)))
+        is_near = here.value[k] >= rules.near * len(seen.views)
+        found.append((seen, own) if is_near else None)
+    return found
 
 
 def _at_once(
@@ -205,12 +214,12 @@ def _at_once(
     free: NDArray[np.bool_],
     blur: float,
     rules: FitRules,
-) -> Ascent[Floats] | None:
+) -> Ascent | None:
     """The ascent from a start where most features are near a detection, or said to be."""
-    here = objective.linearise(T_start)
-    if blur == 1 and here.value < rules.near * len(objective.views):
+    here = objective.linearise(T_start[None])
+    if blur == 1 and here.value[0] < rules.near * len(objective.views):
         return None
-    return ascend(objective.linearise, perturb, T_start, free, SHARP, here)
+    return ascend(objective, T_start[None], perturb, free, SHARP, here)
 
 
 def _through_blurs(
@@ -223,21 +232,20 @@ def _through_blurs(
     rules: FitRules,
     finest: MatchedObjective | None,
     last: NewtonOptions,
-) -> Ascent[Floats]:
+) -> Ascent:
     """The ascent at one blur after the other, with options of the last one."""
     free = free_mask(options)
     spread = np.where(free, uncertainty, 0.0)
     *wider, narrowest = blur_schedule(views, body, T_start, spread, rules.schedule)
     build = partial(build_objective, options.objective, views, body, samples)
-    T = T_start
+    states = T_start[None]
     for sigmas in wider:
-        T = ascend(build(sigmas, T).linearise, perturb, T, free, COARSE).state
-    objective = finest or build(narrowest, T)
-    return ascend(objective.linearise, perturb, T, free, last)
+        states = ascend(build(sigmas, states[0]), states, perturb, free, COARSE).states
+    return ascend(finest or build(narrowest, states[0]), states, perturb, free, last)
 
 
 def _to_the_noise(
-    ascent: Ascent[Floats],
+    ascent: Ascent,
     objective: MatchedObjective,
     free: NDArray[np.bool_],
     noise: Sequence[Noise],
@@ -245,7 +253,7 @@ def _to_the_noise(
     errors: ErrorRules,
     rules: FitRules,
     blur: float = 1.0,
-) -> Ascent[Floats]:
+) -> Ascent:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
     known = sums_of(noise)
     sigmas = np.array([view.observation.sigma for view in objective.views])
@@ -277,7 +285,7 @@ def _to_the_noise(
             for view, places in zip(objective.views, met.places, strict=True)
         ]
         objective = matched_objective(near, objective.projection.body, (blurs * sigmas).tolist())
-        ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
+        ascent = ascend(objective, ascent.states, perturb, free, SHARP)
 
 
 class _Met(NamedTuple):
@@ -307,7 +315,7 @@ class _Met(NamedTuple):
 
 def _met(
     objective: MatchedObjective,
-    ascent: Ascent[Floats],
+    ascent: Ascent,
     sigmas: Floats,
     beside: float,
     errors: ErrorRules,
@@ -316,16 +324,13 @@ def _met(
 
     What was looked up is where the last step began; the step is taken off.
     """
-    assert isinstance(ascent.last, Quadratic), "an ascent of the matched objective"
-    assert ascent.last.match is not None
-    at, sampled, _ = ascent.last.match
+    at, sampled, _ = ascent.last.source
     seen, C, y = at.seen[:, 0], sampled[:, 0, :, 0], at.y[:, 0]
     J = at.J[:, 0] / sigmas[:, None, None, None]
     is_near = C > 0
     scale = objective.variances / (np.where(is_near, C, 1.0) * sigmas[:, None])
     away = sampled[:, 0, :, 1:] * scale[..., None]
-    if ascent.step is not None:
-        away -= J @ ascent.step
+    away -= J @ ascent.steps[0]
     squared = (away * away).sum(axis=2)
     is_near &= squared < errors.met**2
     shares = at.weights[:, 0] * is_near

@@ -24,20 +24,13 @@ from numpy.typing import NDArray
 from mixpose.density import close_pairs
 from mixpose.density.overlap import ALL_PAIRS
 from mixpose.objective.projection import Projected
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
 _NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
 _FEW = 24  # features up to which all pairs are looked at first
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 _NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
-
-
-class Slopes(NamedTuple):
-    """Σ_l s_l c_l² / n_l at H poses: value (H,), gradient (H, 6) and curvature (H, 6, 6)."""
-
-    value: Floats
-    gradient: Floats
-    curvature: Floats
 
 
 class Overlaps(NamedTuple):
@@ -114,14 +107,12 @@ def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     return np.stack(np.divmod(np.unique(np.concatenate(each)), n), axis=1)
 
 
-def slopes(
-    at: Projected, sampled: Floats, over: Overlaps, variances: Floats, tops: Floats, scales: Floats
-) -> Slopes:
-    """Second-order models of the matched objective at H poses.
+def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
+    """Second-order models of Σ_l s_l c_l² / n_l at H poses, and the `Match` they come from.
 
-    `sampled` (L, H, n, 3) is C with its gradient at the predicted features; `variances`, `tops` and
-    `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
+    `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
+    at, sampled, over = match
     L, H, n = at.weights.shape
     J = at.J.reshape(L, H, 2 * n, 6)
     C = sampled[..., 0] * at.weights
@@ -137,13 +128,13 @@ def slopes(
     curvature = curvature.sum(axis=0)
     if len(over.pairs):
         near = np.flatnonzero(over.bells.any(axis=(0, 2)))
-        some, _, own = Match(at, sampled, over).of(near)
+        some, _, own = match.of(near)
         half, gram = _pair_terms(some, own, variances, tops)
         level = (strength * amplitude)[:, near, None]
         gradient[near] -= (level * half).sum(axis=0)
         outer = half[..., :, None] * half[..., None, :] / own.norm[..., None, None]
         curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
-    return Slopes(value, gradient, curvature)
+    return Quadratic(value, gradient, curvature, source=match)
 
 
 def _pair_terms(

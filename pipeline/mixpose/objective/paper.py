@@ -20,9 +20,10 @@ import cv2
 import numpy as np
 
 from mixpose.density import Density
-from mixpose.objective.base import Quadratic, View, region_of_interest
+from mixpose.objective.base import View, region_of_interest
 from mixpose.objective.index_maps import ParallelMaps
 from mixpose.objective.projection import pose_jacobian
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam, Sensor
@@ -119,7 +120,11 @@ class _SampledObjective:
         sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
         return np.asarray(sums[:, 0] / size)
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
+        return Quadratic(*map(np.array, zip(*map(self._model, poses), strict=True)))
+
+    def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
         points = transform(T_world_object, self.points)
         if self.offsets is not None:
@@ -137,7 +142,7 @@ class _SampledObjective:
             pull = others * g[:, 0] / (count * term.density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
         value = float((factors[0] * looked_up[0][:, 0]).mean())
-        return Quadratic(value, gradient, curvature)
+        return value, gradient, curvature
 
 
 class PaperObjective(_SampledObjective):
