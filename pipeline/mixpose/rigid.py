@@ -101,14 +101,13 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
     twist : (..., 6) array
         ``(x, y, z, rx, ry, rz)``, lengths and radians.
     """
-    if twist.ndim == 1 and T_world_object.ndim == 2:
+    if twist.size == 6 and T_world_object.size == 16:
         # one pose after the other is what optimisers ask for: no time for broadcasting
         T = T_world_object.copy()
-        T[:3, :3] = cv2.Rodrigues(twist[3:])[0] @ T_world_object[:3, :3]
-        T[:3, 3] += twist[:3]
-        return T
-    if twist.size == 6 and T_world_object.shape == (1, 4, 4):
-        return perturb(T_world_object[0], twist.reshape(6))[None]
+        single, six = T.reshape(4, 4), twist.reshape(6)
+        single[:3, :3] = cv2.Rodrigues(six[3:])[0] @ single[:3, :3]
+        single[:3, 3] += six[:3]
+        return T if T_world_object.ndim > twist.ndim else T.reshape(*twist.shape[:-1], 4, 4)
     rotation = rotation_matrix(twist[..., 3:]) @ T_world_object[..., :3, :3]
     return from_parts(rotation, T_world_object[..., :3, 3] + twist[..., :3])
 

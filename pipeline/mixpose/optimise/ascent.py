@@ -116,14 +116,17 @@ def ascend(
     """
     here = at_start or term.linearise(states)
     climb = _Climb(states, here, None if free.all() else np.flatnonzero(free), options)
-    everything = list(range(len(here.value)))
+    count = len(here.value)
+    everything = list(range(count))
     going = climb.unfinished(everything, 1)
     for iteration in range(2, options.iterations + 1):
         if not going:
             break
         asked = everything if options.together else going
-        rows = slice(None) if len(asked) == len(everything) else np.array(asked)
-        candidates = move(climb.states[rows], climb.steps[rows])
+        if len(asked) == count:
+            candidates = move(climb.states, climb.steps)
+        else:
+            candidates = move(climb.states[asked], climb.steps[asked])
         going = climb.take(candidates, term.linearise(candidates), asked, going, iteration)
         going = climb.unfinished(going, iteration)
     return climb.ended(move)
@@ -168,24 +171,26 @@ class _Climb:
     ) -> list[int]:
         """Go to states that are better, and damp the other steps: those that are not stuck."""
         options, values, better = self._options, self._here.value.tolist(), there.value.tolist()
-        damping = self._damping if options.unchecked else self._less_damped(asked)
+        own, least = self._damping, 1 / options.extreme
+        damping = own if options.unchecked else [max(own[k] / 10, least) for k in asked]
         steps, gains = _steps(there, self._free, damping, options)
         accepted, rejected = [], []
         for row, k in enumerate(asked):
-            if len(going) < len(asked) and k not in going:
-                continue
-            gain = self._gains[k]
+            gain, is_asked = self._gains[k], len(going) == len(asked) or k in going
             is_close = gain <= options.value_error * abs(values[k])
             is_better = better[row] > values[k] or (is_close and gains[row] < gain)
-            if is_better or options.unchecked:
-                self._before[k], self._gains[k], self._damping[k] = gain, gains[row], damping[row]
+            if is_asked and (is_better or options.unchecked):
+                self._before[k], self._gains[k], own[k] = gain, gains[row], damping[row]
                 accepted.append(row)
-                continue
-            self._damping[k] = max(10 * self._damping[k], options.held_back)
-            if self._damping[k] <= options.extreme:
-                rejected.append(k)
-            else:
-                self._converged[k], self._iterations[k] = is_close, iteration
+            elif is_asked:
+                own[k] = max(10 * own[k], options.held_back)
+                if own[k] <= options.extreme:
+                    rejected.append(k)
+                else:
+                    self._converged[k], self._iterations[k] = is_close, iteration
+        if len(accepted) == len(own):
+            self.states, self._here, self.steps, self._is_shared = states, there, steps, True
+            return going
         self._go(states, there, steps, accepted, [asked[row] for row in accepted])
         if rejected:
             self._try_again(rejected)
@@ -193,29 +198,23 @@ class _Climb:
 
     def ended(self, move: Callable[[Any, Floats], Any]) -> Ascent:
         """Where all states are, once the last steps are taken."""
-        taken, states, values = np.array(self._is_taken), self.states, self._here.value
-        steps = self.steps
-        if taken.all():
+        states, values, steps = self.states, self._here.value, self.steps
+        if all(self._is_taken):
             states, values = move(states, steps), values + self._gains
-        else:
+        elif any(self._is_taken):
+            taken = np.array(self._is_taken)
             steps = np.where(taken[:, None], steps, 0.0)
             states, values = states.copy(), values + np.where(taken, self._gains, 0.0)
             states[taken] = move(states[taken], steps[taken])
+        else:
+            steps = np.zeros(steps.shape)
         iterations = np.array(self._iterations)
         return Ascent(states, values, np.array(self._converged), iterations, self._here, steps)
-
-    def _less_damped(self, asked: list[int]) -> list[float]:
-        """Damping of the steps after the next ones, if these are good."""
-        least = 1 / self._options.extreme
-        return [max(self._damping[k] / 10, least) for k in asked]
 
     def _go(
         self, states: Any, there: Quadratic, steps: Floats, accepted: list[int], to: list[int]
     ) -> None:
         """Let some rows of what was evaluated be where their states are."""
-        if len(accepted) == len(self._gains):
-            self.states, self._here, self.steps, self._is_shared = states, there, steps, True
-            return
         if not accepted:
             return
         if self._is_shared:
@@ -244,6 +243,9 @@ def _steps(
 ) -> tuple[Floats, list[float]]:
     """Damped Newton steps (H, q), and the gains that the models expect of them."""
     C, g, hessian = here.curvature, here.gradient, here.hessian
+    if len(damping) == 1 and free is None and hessian is None:  # no time for broadcasting
+        step, gain = _step(C[0], g[0], damping[0])
+        return step[None], [gain]
     if free is not None:
         C, g = C[:, free[:, None], free], g[:, free]
         hessian = None if hessian is None else hessian[:, free[:, None], free]
@@ -251,7 +253,7 @@ def _steps(
         lowest = options.least_curvature * C
         definite = [_is_definite(one) for one in hessian - lowest]
         C = np.where(np.array(definite)[:, None, None], hessian, C)
-    if len(g) == 1:  # no time for broadcasting
+    if len(g) == 1:
         single, gain = _step(C[0], g[0], damping[0])
         partial, gains = single[None], [gain]
     else:
