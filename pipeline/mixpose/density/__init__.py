@@ -21,16 +21,18 @@ from mixpose.density.features_met import (
     features_met,
     surplus,
 )
-from mixpose.density.grid import FAR, FLOOR, Density, Window
+from mixpose.density.grid import FAR, Density, Window
 from mixpose.density.observation import Observation, matched_atlas
 from mixpose.density.overlap import close_pairs, peak, self_overlap
+from mixpose.density.rules import DRAWING, DrawingRules
 
 __all__ = [
+    "DRAWING",
     "FAR",
-    "FLOOR",
     "AssociationRules",
     "Atlas",
     "Density",
+    "DrawingRules",
     "ErrorRules",
     "FeaturesMet",
     "Noise",

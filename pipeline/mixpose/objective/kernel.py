@@ -21,16 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import close_pairs
-from mixpose.density.overlap import ALL_PAIRS
+from mixpose.density import DRAWING, close_pairs
 from mixpose.objective.projection import Projected
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
-_NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
-_FEW = 24  # features up to which all pairs are looked at first
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
-_NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
 
 
 class Overlaps(NamedTuple):
@@ -65,7 +61,7 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
-    pairs = _NO_PAIRS if _are_apart(y, variances) else _pairs(y, variances)
+    pairs = close_pairs(y[0, 0, :0], 1.0) if _are_apart(y, variances) else _pairs(y, variances)
     if not len(pairs):
         away = np.empty((*norm.shape, 0, 2))
         return Overlaps(np.maximum(norm, _NONE), pairs, away[..., 0], away)
@@ -73,7 +69,7 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     away = y[:, :, i] - y[:, :, j]
     exponents = np.einsum("lhpm,lhpm->lhp", away, away) * (-0.5 / variances)[..., None]
     products = weights[:, :, i] * weights[:, :, j]
-    overlap = (exponents > _NEGLIGIBLE) & (products > 0)
+    overlap = (exponents > -DRAWING.negligible) & (products > 0)
     near = overlap.any(axis=(0, 1))
     if not near.all():
         pairs, away, overlap = pairs[near], away[:, :, near], overlap[..., near]
@@ -86,18 +82,18 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
 def _are_apart(y: Floats, variances: Floats) -> bool:
     """Whether no two of few features are near enough to overlap."""
     L, H, n, _ = y.shape
-    if n > _FEW:
+    if n > DRAWING.few:
         return False
     away = y[:, :, :, None] - y[:, :, None]
     away *= away
-    close = away[..., 0] + away[..., 1] < (-2 * _NEGLIGIBLE) * variances[..., None, None]
+    close = away[..., 0] + away[..., 1] < (2 * DRAWING.negligible) * variances[..., None, None]
     return bool(np.count_nonzero(close) <= L * H * n)  # each is close to itself
 
 
 def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     """Pairs of features that may overlap at any of the poses; all of few."""
     n = y.shape[2]
-    if n <= ALL_PAIRS:
+    if n <= DRAWING.few:
         return close_pairs(y[0, 0], 1.0)
     each = [
         close_pairs(y[k, h], float(v)) @ [n, 1]

@@ -18,22 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import Atlas, matched_atlas, peak
+from mixpose.density import DRAWING, Atlas, matched_atlas, peak
 from mixpose.objective.base import View
 from mixpose.objective.kernel import Match, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
-STEPS_PER_SIGMA = 4.0
-"""Cells per standard deviation of C: places are 4e-4 standard deviations off at most, a part of
-what the best centres of blobs err by."""
-
-FINE_STEPS = 48.0
-"""The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
-
-
-_TOGETHER = 200_000  # features times poses that are held in memory at once
+STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
 def look_up_error(steps_per_sigma: float) -> float:
@@ -112,7 +104,7 @@ class MatchedObjective:
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
-        rows = max(_TOGETHER // (n * min(n, 12)), 1)
+        rows = max(DRAWING.held // (n * min(n, 12)), 1)
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 

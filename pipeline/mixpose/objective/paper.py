@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mixpose.density import Density
+from mixpose.density import DRAWING, Density
 from mixpose.objective.base import View, region_of_interest
 from mixpose.objective.index_maps import ParallelMaps
 from mixpose.objective.projection import pose_jacobian
@@ -27,11 +27,6 @@ from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam, Sensor
-
-REACH = 4.0
-"""Margin of a window around the predicted samples, in standard deviations of a feature."""
-
-_SAMPLES_AT_ONCE = 2**18  # of all poses of a batch: bounds its memory to a few MB per sensor
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,7 @@ class _SampledObjective:
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
-        self._poses_at_once = max(1, _SAMPLES_AT_ONCE // len(self.points))
+        self._poses_at_once = max(1, DRAWING.held // len(self.points))
         self.offsets: Floats | None = None
         if world_offsets is not None and world_offsets.any():
             self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
@@ -192,7 +187,7 @@ def sampled_terms(
             y, visible = view.sensor.project(transform(near, samples.reshape(-1, 3)))
             if not visible.any():
                 continue
-            box = region_of_interest(view.sensor, y[visible], REACH * sigma)
+            box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
         density = view.observation.density(sigma, box, gradient=True)
         terms.append(SampledTerm(view.sensor, density))
     return terms
