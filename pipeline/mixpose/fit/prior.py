@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from mixpose.constants import constant
 from mixpose.fit.misfit import MisfitRules, SensorDensity, fit_freed, misfit
 from mixpose.objective import (
     AmplitudesObjective,
@@ -30,11 +31,21 @@ from mixpose.optimise import NewtonOptions, Sum, Term, ascend
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 
-_NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
-_DRAWN = 1e-6  # of the energy: a part in a thousand of heights, which drawing may be off by
-_ROUNDS = 3  # of noise and pose by turns: the noise holds to a part in a hundred
-_ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
-_VALUE_ERROR = value_error(FINE_STEPS)
+
+@dataclass(frozen=True)
+class ProbableRules:
+    """How closely the most probable pose is sought."""
+
+    nats: float = constant(
+        1e-6,
+        "gains of log-likelihood that do not matter: 0.001 standard deviations; and shares "
+        "of the energy: a part in a thousand of heights, which drawing may be off by",
+    )
+    rough: float = constant(1e-2, "nats where it is asked which of several maxima is highest")
+    rounds: int = constant(3, "of noise and pose by turns: the noise holds to a part in a hundred")
+
+
+_RULES = ProbableRules()
 
 
 @dataclass(frozen=True)
@@ -93,11 +104,11 @@ def most_probable(
     likelihood = likelihood_at(objective, T, misfit)
     if not likelihood.is_alone:
         starts = np.concatenate([T[None], prior.points()])
-        T = _climbed(likelihood.objective, prior, starts, _ROUGH)
+        T = _climbed(likelihood.objective, prior, starts, _RULES.rough)
         likelihood = likelihood_at(objective, T, misfit)
-    T = _climbed(likelihood.objective, prior, T[None], _NATS)
+    T = _climbed(likelihood.objective, prior, T[None], _RULES.nats)
     # once more with the noise that the maximum leaves
-    return _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], _NATS)
+    return _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], _RULES.nats)
 
 
 def believed(
@@ -160,11 +171,11 @@ def with_amplitudes(
     """
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
     noise, cells = equal, _cells(objective)
-    smallest = _DRAWN * objective.energies[:, 0] / cells
-    for _ in range(_ROUNDS):
+    smallest = _RULES.nats * objective.energies[:, 0] / cells
+    for _ in range(_RULES.rounds):
         unlike = AmplitudesObjective(objective, noise, rules.unlike)
         noise = np.maximum(unlike.unexplained(T) / cells, smallest)
-        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], _NATS)
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], _RULES.nats)
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
@@ -175,6 +186,6 @@ def with_amplitudes(
 
 def _climbed(likelihood: Term, prior: NormalPrior, starts: Floats, nats: float) -> Floats:
     """The highest maximum (4, 4) of likelihood and prior near starts (H, 4, 4), to some nats."""
-    options = NewtonOptions(60, 1e-11, value_error=_VALUE_ERROR, negligible=nats)
+    options = NewtonOptions(60, 1e-11, value_error=value_error(FINE_STEPS), negligible=nats)
     ends = ascend(Sum((likelihood, prior)), starts, perturb, prior.free, options)
     return np.asarray(ends.states[int(np.argmax(ends.values))])

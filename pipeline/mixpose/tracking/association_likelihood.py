@@ -30,9 +30,6 @@ from mixpose.tracking.association_sum import AssociationTerm, sum_associations
 if TYPE_CHECKING:
     from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 
-_OPTIONS = NewtonOptions(iterations=30, tolerance=1e-7)
-_MIN_INFORMATION = 1e-18  # per squared length or radian: less is as good as none
-
 
 @dataclass(frozen=True)
 class RangeRules:
@@ -44,6 +41,7 @@ class RangeRules:
     stated_degrees: float = constant(
         20.0, "degrees of freedom that σ_ε counts as, where residuals say otherwise"
     )
+    tolerance: float = constant(1e-7, "share of the logarithm that may be left to be gained")
     min_information: float = constant(
         0.02, "of the information of known labels: what a pose has in any direction"
     )
@@ -92,9 +90,9 @@ class AssociationLikelihood:
             levels = blur_schedule(data.views, data.body, T, uncertainty)
             ratios = [max(np.divide(level, data.sigmas).tolist()) for level in levels]
             widths = [ratio for ratio in ratios if ratio > self.noise] + widths
-        states = T[None]
+        states, options = T[None], NewtonOptions(tolerance=data.rules.ranges.tolerance)
         for width in widths:
-            end = ascend(self._posterior(prior, width), states, perturb, data.free, _OPTIONS)
+            end = ascend(self._posterior(prior, width), states, perturb, data.free, options)
             states = end.states
         return Fit.of(end)
 
@@ -146,7 +144,9 @@ class AssociationLikelihood:
         """Minus the Hessian (k, k) where definite; in directions where not, next to nothing."""
         assert here.hessian is not None
         free, least = self.data.free, self.data.rules.ranges.min_information
-        scale = 1 / np.sqrt(np.maximum(np.diagonal(here.curvature[0])[free], _MIN_INFORMATION))
+        scale = 1 / np.sqrt(
+            np.maximum(np.diagonal(here.curvature[0])[free], np.finfo(np.float64).eps)
+        )
         hessian = here.hessian[0][np.ix_(free, free)]
         values, vectors = np.linalg.eigh(hessian * scale * scale[:, None])
         bounded = (vectors * np.maximum(values, least)) @ vectors.T

@@ -16,13 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.constants import constant
 from mixpose.judgement import DetectionModel
 from mixpose.objective import View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Mask, PointPattern
 from mixpose.rigid import perturb
-
-_STEP = 0.01  # of σ_ε: by how much ranges differ for second derivatives, half of their digits
 
 
 @dataclass(frozen=True)
@@ -118,13 +117,17 @@ class AssociationTerm:
     free: Mask
     noise: float
     detection: DetectionModel
+    step: float = constant(
+        0.01, "of the error: by how much ranges differ for second derivatives, half of their digits"
+    )
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
         free, count = self.free, len(poses)
+        step = self.step
         error = self.noise * min(view.observation.sigma for view in self.views)
         arm = float(np.linalg.norm(self.body.means, axis=1).max())
-        scale = np.repeat([_STEP * error, _STEP * error / max(arm, error)], 3)[free]
+        scale = np.repeat([step * error, step * error / max(arm, error)], 3)[free]
         steps = scale[:, None] * np.eye(6)[free]
         twists = np.vstack([np.zeros(6), steps, -steps])
         around = perturb(poses[:, None], twists).reshape(-1, 4, 4)
