@@ -34,8 +34,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body": GROUND,
     "density": GROUND,
     "extraction": GROUND,
-    "optimise": set(),
-    "objective": GROUND | {"sensors", "body", "density"},
+    "optimise": GROUND,
+    "objective": GROUND | {"sensors", "body", "density", "optimise"},
     "matching": GROUND | {"sensors", "body", "density", "objective"},
     "search": GROUND
     | {"sensors", "body", "density", "matching", "objective", "optimise", "judgement"},

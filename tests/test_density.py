@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mixpose.density import (
-    FLOOR,
+    DRAWING,
     Density,
     Observation,
     Window,
@@ -15,7 +15,7 @@ from mixpose.density import (
     render,
     self_overlap,
 )
-from mixpose.density.grid import EXACT_CHANNELS, remap
+from mixpose.density.grid import remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 
@@ -78,7 +78,7 @@ def test_blur_widens_a_feature_to_sigma_even_on_a_reduced_grid() -> None:
     assert np.sqrt(variance) == pytest.approx(np.sqrt(20.0**2 + own), rel=2e-3)
 
 
-@pytest.mark.parametrize("channels", EXACT_CHANNELS)
+@pytest.mark.parametrize("channels", DRAWING.exact_channels)
 def test_remap_samples_float32_to_float_rounding(channels: int) -> None:
     # Before OpenCV 5 coordinates were rounded to 1/32 px: the objective was a staircase.
     # With 2 or more than 4 channels OpenCV 5.0 still does, by up to 0.02 here.
@@ -107,10 +107,10 @@ def test_coordinates_a_thousandth_of_a_step_apart_are_told_apart() -> None:
 def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Pattern) -> None:
     observation = Observation(pattern, 2.0)
     density = observation.density(2.0, observation.extent, gradient=True)
-    assert density.values.shape[2] in EXACT_CHANNELS
+    assert density.values.shape[2] in DRAWING.exact_channels
     y = np.array([observation.extent[0]])
     assert density.sample(y).shape == (1, 1 + density.dimension)
-    assert matched_atlas([observation], [2.0], 4.0).values.shape[2] in EXACT_CHANNELS
+    assert matched_atlas([observation], [2.0], 4.0).values.shape[2] in DRAWING.exact_channels
 
 
 def test_more_samples_than_one_map_side_can_hold() -> None:
@@ -125,7 +125,7 @@ def test_more_samples_than_one_map_side_can_hold() -> None:
 def test_outside_the_window_and_at_nan_is_the_floor() -> None:
     density = render(points_pattern(), 3.0, Window(np.zeros(2), (200, 200), 1.0), gradient=True)
     y = np.array([[-1e6, -1e6], [1e12, 3.0], [np.nan, 4.0], [-5.0, 50.0]])
-    assert (density.sample(y) == FLOOR).all()
+    assert (density.sample(y) == 0).all()
 
 
 @pytest.mark.parametrize("pattern", [points_pattern(), image_pattern(), range_points()])

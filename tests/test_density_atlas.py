@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.density import Atlas
-from mixpose.density.atlas import MOST_OWN, REACH, TILE
-from mixpose.density.pages import MAX_PAGES, Pages, Plane
+from mixpose.density import DRAWING, Atlas
+from mixpose.density.pages import Pages, Plane
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -20,6 +19,7 @@ Floats = NDArray[np.float64]
 SIGMA = 2.0
 """Of the blur that is drawn: √2 σ_ε in the matched objective."""
 
+MOST_OWN, REACH, TILE = DRAWING.own_tiles, DRAWING.reach, DRAWING.tile
 STEPS = [2.5, STEPS_PER_SIGMA, 8.0]
 
 CUT = math.exp(-(REACH**2) / 2)
@@ -346,7 +346,7 @@ def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> Non
         np.testing.assert_allclose(value, expected, rtol=4 * spline_error(STEPS_PER_SIGMA, THIRD))
         many, _ = looked_up(atlas, np.tile(near, (MOST_OWN, 1)))
         np.testing.assert_allclose(many[: len(near)], value, rtol=1e-5)
-        assert len(atlas.pages.table) < 1.1 * MAX_PAGES
+        assert len(atlas.pages.table) < 1.1 * DRAWING.pages
         assert atlas.values.nbytes < 2e6
     several = points_only(rng.uniform(-1e7, 1e7, (20, 2)), STEPS_PER_SIGMA)
     looked_up(several, np.tile(near, (MOST_OWN, 1)))

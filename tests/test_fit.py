@@ -9,8 +9,8 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import Climbed, EstimatorOptions, ScheduleRules, blur_schedule, fit_near
-from mixpose.fit.prior import Likelihood, NormalPrior, likelihood_at, most_probable
-from mixpose.objective import View, matched_objective
+from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
+from mixpose.objective import NormalPrior, View, matched_objective
 from mixpose.records import GridPattern
 from mixpose.rigid import Floats, perturb, twist_between
 from mixpose.sensors import ParallelBeam, PinholeCamera

@@ -134,7 +134,7 @@ def test_a_deformed_body_is_fitted_to_its_features_by_least_squares() -> None:
     places = deformed(1.0)
     found = [seen(one, y) for one, y in zip(BEAMS, places, strict=True)]
     start = perturb(np.eye(4), np.array([2.0, -1.0, 1.0, 0.02, 0.03, -0.02]))
-    T = fit_freed(found, POINTS, [start], FREE)
+    T = fit_freed(found, POINTS, start[None], FREE)
     assert T is not None
     # no step lowers the sum of squares of 2 · 6 distances
     at = sum_of_squares(T, places)
@@ -160,4 +160,4 @@ def test_places_that_might_be_each_others_free_nothing() -> None:
     found = [seen(one, y) for one, y in zip(BEAMS, places, strict=True)]
     assert own_peaks(found[0], 6) is not None
     assert own_peaks(found[1], 6) is not None
-    assert fit_freed(found, points, [np.eye(4)], FREE) is None
+    assert fit_freed(found, points, np.eye(4)[None], FREE) is None

@@ -43,9 +43,9 @@ def apart(views: Sequence[View], body: Body, T_a: Floats, T_b: Floats) -> float:
     return float(np.sqrt(twist @ np.linalg.solve(covariance, twist)))
 
 
-def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent[Floats]]:
+def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent]:
     objective = matched_objective(views, body, [view.observation.sigma for view in views])
-    return objective, ascend(objective.linearise, perturb, TRUTH, ALL_FREE, near.SHARP)
+    return objective, ascend(objective, TRUTH[None], perturb, ALL_FREE, near.SHARP)
 
 
 def matched(objective: MatchedObjective, T: Floats) -> Matches:
@@ -101,13 +101,13 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=seed), 1.2)
         objective, ascent = at_sigma(views, body)
         sigmas = np.array([view.observation.sigma for view in views])
-        matches = matched(objective, ascent.state)
+        matches = matched(objective, ascent.states[0])
         seen = errors_seen(matches, 6, known, errors)
         expected = near._moved(matches, ALL_FREE, seen.blurs, seen.variances)
         narrow = matched_objective(views, body, (seen.blurs * sigmas).tolist())
-        end = ascend(narrow.linearise, perturb, ascent.state, ALL_FREE, near.SHARP).state
+        end = ascend(narrow, ascent.states, perturb, ALL_FREE, near.SHARP).states[0]
         unit = float(np.sqrt(seen.variances.mean())) * 1.5 / NOISE_PX
-        moved = apart(views, body, end, ascent.state) / unit
+        moved = apart(views, body, end, ascent.states[0]) / unit
         # two steps of iterated least squares, of which there are some more
         assert 0.6 * moved < np.sqrt(expected) < 1.2 * moved
 

@@ -11,8 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.fit import prior as prior_module
-from mixpose.fit.prior import NormalPrior, cell_variances, most_probable
-from mixpose.objective import MatchedObjective, Quadratic
+from mixpose.fit.prior import cell_variances, most_probable
+from mixpose.objective import MatchedObjective, NormalPrior
+from mixpose.optimise import Quadratic
 from mixpose.rigid import perturb, twist_between
 
 Floats = NDArray[np.float64]
@@ -28,13 +29,14 @@ class Normals:
     sigma: float
     is_alone: bool = False
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
-        away = self.centres - T_world_object[:3, 3]
-        bells = self.heights * np.exp(-0.5 * (away**2).sum(axis=1) / self.sigma**2)
-        gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        gradient[:3] = bells @ away / self.sigma**2
-        curvature[:3, :3] = np.eye(3) * bells.sum() / self.sigma**2
-        return Quadratic(float(bells.sum()), gradient, curvature)
+    def linearise(self, poses: Floats) -> Quadratic:
+        away = self.centres - poses[:, None, :3, 3]
+        bells = self.heights * np.exp(-0.5 * (away**2).sum(axis=2) / self.sigma**2)
+        value = bells.sum(axis=1)
+        gradient, curvature = np.zeros((len(poses), 6)), np.zeros((len(poses), 6, 6))
+        gradient[:, :3] = (bells[..., None] * away).sum(axis=1) / self.sigma**2
+        curvature[:, :3, :3] = np.eye(3) * value[:, None, None] / self.sigma**2
+        return Quadratic(value, gradient, curvature)
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,11 @@ class Parabola:
     information: Floats
     is_alone: bool = True
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
-        away = twist_between(T_world_object, self.measured)
-        value = -0.5 * float(away @ self.information @ away)
-        return Quadratic(value, self.information @ away, self.information)
+    def linearise(self, poses: Floats) -> Quadratic:
+        away = -twist_between(self.measured, poses)
+        pull = away @ self.information
+        C = np.broadcast_to(self.information, (len(poses), 6, 6))
+        return Quadratic(-0.5 * (away * pull).sum(axis=1), pull, C)
 
 
 Toy = Normals | Parabola

@@ -88,7 +88,7 @@ def test_gradients_agree_with_central_differences(
     views = views_of(request.getfixturevalue(rig), soft_paper_body, TRUTH, 12.0)
     objective = on_fine_grids(name, views, soft_paper_body, 12.0)
     T = perturb(TRUTH, np.array([2.0, -3.0, 2.0, 0.02, 0.03, -0.02]))
-    gradient = objective.linearise(T).gradient
+    gradient = objective.linearise(T[None]).gradient[0]
     numerical = np.zeros(6)
     for k, step in enumerate([1.2] * 3 + [0.012] * 3):
         twist = np.zeros(6)
@@ -111,8 +111,9 @@ def test_a_batch_of_poses_gives_the_values_of_their_linearisations(
     poses = perturb(TRUTH, random_twists(70, 4.0, 0.03))
     values = objective.value(poses)
     assert values.shape == (70,)
-    singles = [objective.linearise(T).value for T in poses]
+    singles = [objective.linearise(T[None]).value[0] for T in poses]
     np.testing.assert_allclose(values, singles, rtol=1e-5)
+    np.testing.assert_allclose(objective.linearise(poses).value, values, rtol=1e-5)
 
 
 def formula_4(
@@ -189,12 +190,12 @@ def test_at_the_truth_the_curvature_agrees_with_differences_of_the_gradient(
     # where everything fits, what Gauss-Newton and mean-shift leave out is zero
     views = views_of(parallel_cameras, paper_body, TRUTH, 12.0)
     objective = on_fine_grids("matched", views, paper_body, 12.0)
-    curvature = objective.linearise(TRUTH).curvature
+    curvature = objective.linearise(TRUTH[None]).curvature[0]
     for k, step in enumerate([0.5] * 3 + [0.005] * 3):
         twist = np.zeros(6)
         twist[k] = step
-        up = objective.linearise(perturb(TRUTH, twist)).gradient
-        down = objective.linearise(perturb(TRUTH, -twist)).gradient
+        up = objective.linearise(perturb(TRUTH, twist)[None]).gradient[0]
+        down = objective.linearise(perturb(TRUTH, -twist)[None]).gradient[0]
         numerical = -(up - down) / (2 * step)
         # third derivatives over a step of σ/24 leave 0.1 %, single precision a few times that
         np.testing.assert_allclose(curvature[k], numerical, atol=0.01 * np.abs(curvature[k]).max())

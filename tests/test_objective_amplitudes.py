@@ -56,7 +56,7 @@ def test_free_amplitudes_leave_what_least_squares_on_the_image_leaves() -> None:
 def test_equal_amplitudes_are_the_matched_kernel() -> None:
     objective = matched()
     noise = 1e-3 * objective.energies[:, 0]
-    equal = AmplitudesObjective(objective, noise, 1e-6).linearise(AWAY)
+    equal = AmplitudesObjective(objective, noise, 1e-6).linearise(AWAY[None])
     weights = (0.5 * objective.energies[:, 0] / noise)[:, None]
     kernel = MatchedObjective(
         objective.views,
@@ -66,7 +66,7 @@ def test_equal_amplitudes_are_the_matched_kernel() -> None:
         objective.tops,
         objective.energies,
         weights,
-    ).linearise(AWAY)
+    ).linearise(AWAY[None])
     assert equal.value == pytest.approx(kernel.value, rel=1e-6)
     np.testing.assert_allclose(equal.gradient, kernel.gradient, rtol=1e-3, atol=1e-3)
 
@@ -75,12 +75,9 @@ def test_equal_amplitudes_are_the_matched_kernel() -> None:
 def test_the_gradient_is_that_of_the_value(spread: float) -> None:
     objective = matched()
     some = AmplitudesObjective(objective, 1e-3 * objective.energies[:, 0], spread)
-    found = some.linearise(AWAY).gradient
+    found = some.linearise(AWAY[None]).gradient[0]
     steps = np.diag(np.repeat([2e-2, 2e-3], 3))
-    ahead, behind = (
-        np.array([some.linearise(perturb(AWAY, sign * step)).value for step in steps])
-        for sign in (1, -1)
-    )
+    ahead, behind = (some.linearise(perturb(AWAY, sign * steps)).value for sign in (1, -1))
     numeric = (ahead - behind) / (2 * np.diag(steps))
     # looked-up values err by 1e-7 of their height; third derivatives by less than a part in 1000
     np.testing.assert_allclose(found, numeric, rtol=3e-3, atol=3e-3 * np.abs(numeric).max())
@@ -92,9 +89,10 @@ def test_gauss_newton_finds_the_place_in_a_few_steps() -> None:
     some = AmplitudesObjective(objective, 1e-6 * objective.energies[:, 0], 0.3)
     T = perturb(np.eye(4), np.array([0.5, -0.3, 0.0, 0.0, 0.0, 0.04]))
     for _ in range(6):
-        model = some.linearise(T)
-        assert np.linalg.eigvalsh(model.curvature).min() > -1e-6 * np.abs(model.curvature).max()
+        model = some.linearise(T[None])
+        C = model.curvature[0]
+        assert np.linalg.eigvalsh(C).min() > -1e-6 * np.abs(C).max()
         step = np.zeros(6)
-        step[free] = np.linalg.solve(model.curvature[np.ix_(free, free)], model.gradient[free])
+        step[free] = np.linalg.solve(C[np.ix_(free, free)], model.gradient[0, free])
         T = perturb(T, step)
     np.testing.assert_allclose(T, np.eye(4), atol=2e-3)

@@ -2,105 +2,176 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.optimise import NewtonOptions, ascend, ascend_together
+from mixpose.objective import NormalPrior
+from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
+from mixpose.rigid import perturb, twist_between
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Model:
-    value: float
-    gradient: Floats
-    curvature: Floats
-    hessian: Floats | None = None
+class Function:
+    """A term that is written down as a function of one state (q,)."""
+
+    model: Callable[[Floats], tuple[float, Floats, Floats] | tuple[float, Floats, Floats, Floats]]
+    asked: list[int] = field(default_factory=list)  # states per evaluation
+
+    def linearise(self, states: Floats) -> Quadratic:
+        self.asked.append(len(states))
+        return Quadratic(*map(np.array, zip(*map(self.model, states), strict=True)))
 
 
-def hill(x: Floats) -> Model:
+def hill(x: Floats) -> tuple[float, Floats, Floats]:
     """A Gaussian hill with its peak at (1, -2) and very unlike scales."""
     A = np.diag([1.0, 1e4])
     away = x - [1.0, -2.0]
     value = float(np.exp(-0.5 * away @ A @ away))
-    return Model(value, -value * (A @ away), value * A)
+    return value, -value * (A @ away), value * A
+
+
+BOTH = np.ones(2, dtype=np.bool_)
+
+
+def climbed(
+    term: Term | Callable[[Floats], tuple[float, Floats, Floats]],
+    *starts: Floats,
+    free: NDArray[np.bool_] = BOTH,
+    options: NewtonOptions = NewtonOptions(),
+) -> Ascent:
+    """Where the ascents of a function from some starts (q,) end."""
+    term = Function(term) if callable(term) else term
+    return ascend(term, np.array(starts), lambda x, step: x + step, free, options)
 
 
 def test_a_hill_of_unlike_scales_is_climbed() -> None:
-    start = np.array([2.2, -2.015])
-    ascent = ascend(hill, lambda x, step: x + step, start, np.ones(2, dtype=np.bool_))
-    assert ascent.converged
-    np.testing.assert_allclose(ascent.state, [1.0, -2.0], atol=1e-6)
+    ascent = climbed(hill, np.array([2.2, -2.015]))
+    assert ascent.converged[0]
+    np.testing.assert_allclose(ascent.states[0], [1.0, -2.0], atol=1e-6)
+
+
+STARTS = np.array([[2.2, -2.015], [1.001, -2.0], [-0.8, -2.01]])
 
 
 def test_climbs_side_by_side_end_where_each_ends_alone() -> None:
-    free, options, asked = np.ones(2, dtype=np.bool_), NewtonOptions(), []
+    term = Function(hill)
+    found = climbed(term, *STARTS)
+    alone = [climbed(hill, start) for start in STARTS]
+    for k, one in enumerate(alone):
+        np.testing.assert_allclose(found.states[k], one.states[0], rtol=0, atol=1e-12)
+        assert found.values[k] == pytest.approx(one.values[0], rel=1e-12)
+        assert found.iterations[k] == one.iterations[0]
+        assert found.converged[k]
+    # what has arrived is evaluated no further: the start that is near, soon
+    assert sum(term.asked) == found.iterations.sum()
+    assert found.iterations[1] < found.iterations[0]
 
-    def both(states: Sequence[Floats]) -> list[Model]:
-        asked.append(len(states))
-        return [hill(x) for x in states]
 
-    starts = [np.array([2.2, -2.015]), np.array([1.001, -2.0])]
-    found = ascend_together(
-        both, lambda x, step: x + step, starts, free, options, [hill(x) for x in starts]
+def test_states_with_data_of_their_own_are_evaluated_until_all_have_arrived() -> None:
+    term = Function(hill)
+    found = climbed(term, *STARTS, options=NewtonOptions(together=True))
+    assert term.asked == [3] * found.iterations.max()
+    np.testing.assert_array_equal(found.iterations, climbed(hill, *STARTS).iterations)
+    np.testing.assert_array_equal(found.states, climbed(hill, *STARTS).states)
+
+
+def test_unchecked_steps_are_as_many_as_were_asked_for() -> None:
+    # value 10 - 50 x² by a curvature of 200: every step goes half of the way, but for the damping
+    term = Function(bowl(200.0))
+    options = NewtonOptions(3, damping=0.01, unchecked=True)
+    found = climbed(term, np.array([0.4]), np.array([0.0]), free=ONE, options=options)
+    assert term.asked == [2, 2, 2]
+    assert found.states[:, 0] == pytest.approx([0.4 * (1 - 100 / 202) ** 3, 0.0])
+
+
+@dataclass(frozen=True)
+class Tape:
+    """The distance of a point of the body from the world's origin, measured with a deviation."""
+
+    point: Floats
+    distance: float
+    deviation: float
+
+    def linearise(self, states: Floats) -> Quadratic:
+        arms = states[:, :3, :3] @ self.point
+        places = arms + states[:, :3, 3]
+        far = np.linalg.norm(places, axis=1)
+        along = places / far[:, None]
+        J = np.concatenate([along, np.cross(arms, along)], axis=1) / self.deviation
+        left = (self.distance - far) / self.deviation
+        return Quadratic(-0.5 * left**2, left[:, None] * J, J[:, :, None] * J[:, None])
+
+
+def test_a_new_kind_of_evidence_is_climbed_with_what_is_known_before() -> None:
+    start = np.eye(4)
+    start[:3, 3] = [300.0, 0.0, 0.0]
+    prior = NormalPrior(start, np.repeat([2.0, 0.01], 3), np.ones(6, dtype=np.bool_))
+    tape = Tape(np.zeros(3), 310.0, 1.0)
+    starts = perturb(
+        start, np.random.default_rng(0).normal(0, 1, (5, 6)) * [2, 2, 2, 0.1, 0.1, 0.1]
     )
-    alone = [ascend(hill, lambda x, step: x + step, start, free, options) for start in starts]
-    for one, other in zip(found, alone, strict=True):
-        np.testing.assert_array_equal(one.state, other.state)
-        assert one.iterations == other.iterations
-    # the one that is near is long done when the other arrives: it asks no further
-    assert len(asked) == max(one.iterations for one in alone) - 1
-    assert alone[1].iterations < alone[0].iterations
+    found = ascend(Sum((tape, prior)), starts, perturb, prior.free)
+    assert found.converged.all()
+    # 300 ± 2 and 310 ± 1: (300/4 + 310) / (1/4 + 1) = 308
+    expected = np.array([8.0, 0, 0, 0, 0, 0])
+    for T in found.states:
+        np.testing.assert_allclose(twist_between(start, T), expected, atol=1e-4)
+    assert found.values == pytest.approx([-0.5 * (2.0**2 + 4.0**2)] * 5, rel=1e-6)
+
+
+def test_a_sum_has_a_hessian_where_all_terms_know_theirs() -> None:
+    prior = NormalPrior(np.eye(4), np.ones(6), np.ones(6, dtype=np.bool_))
+    twice = Sum((prior, prior)).linearise(np.eye(4)[None])
+    assert twice.hessian is not None
+    np.testing.assert_allclose(twice.hessian[0], 2 * np.eye(6))
+    assert Sum((prior, Tape(np.ones(3), 1.0, 1.0))).linearise(np.eye(4)[None]).hessian is None
 
 
 def test_a_direction_that_is_not_free_is_left_alone() -> None:
-    start = np.array([2.0, -2.01])
-    ascent = ascend(hill, lambda x, step: x + step, start, np.array([True, False]))
-    assert ascent.state[1] == -2.01
-    assert ascent.state[0] == pytest.approx(1.0, abs=1e-5)
+    ascent = climbed(hill, np.array([2.0, -2.01]), free=np.array([True, False]))
+    assert ascent.states[0, 1] == -2.01
+    assert ascent.states[0, 0] == pytest.approx(1.0, abs=1e-5)
 
 
 def test_a_direction_without_curvature_does_no_harm() -> None:
-    def ridge(x: Floats) -> Model:
+    def ridge(x: Floats) -> tuple[float, Floats, Floats]:
         value = float(np.exp(-0.5 * x[0] ** 2))
-        return Model(value, np.array([-x[0] * value, 0.0]), np.diag([value, 0.0]))
+        return value, np.array([-x[0] * value, 0.0]), np.diag([value, 0.0])
 
-    ascent = ascend(ridge, lambda x, s: x + s, np.array([0.8, 3.0]), np.ones(2, dtype=np.bool_))
-    np.testing.assert_allclose(ascent.state, [0.0, 3.0], atol=1e-6)
+    for starts in ([[0.8, 3.0]], [[0.8, 3.0], [-0.4, 3.0]]):
+        ascent = climbed(ridge, *np.array(starts))
+        np.testing.assert_allclose(ascent.states, [[0.0, 3.0]] * len(starts), atol=1e-6)
 
 
 def test_values_with_interpolation_error_do_not_stop_the_ascent() -> None:
-    def staircase(x: Floats) -> Model:
-        exact = hill(x)
-        return Model(round(exact.value, 2), exact.gradient, exact.curvature)
+    def staircase(x: Floats) -> tuple[float, Floats, Floats]:
+        value, gradient, curvature = hill(x)
+        return round(value, 2), gradient, curvature
 
     start = np.array([1.3, -2.001])
-    free = np.ones(2, dtype=np.bool_)
-    stuck = ascend(staircase, lambda x, s: x + s, start, free)
-    seeing = ascend(staircase, lambda x, s: x + s, start, free, NewtonOptions(value_error=1e-2))
-    np.testing.assert_allclose(seeing.state, [1.0, -2.0], atol=1e-6)
-    assert np.linalg.norm(stuck.state - [1.0, -2.0]) > 1e-5
+    stuck = climbed(staircase, start)
+    seeing = climbed(staircase, start, options=NewtonOptions(value_error=1e-2))
+    np.testing.assert_allclose(seeing.states[0], [1.0, -2.0], atol=1e-6)
+    assert np.linalg.norm(stuck.states[0] - [1.0, -2.0]) > 1e-5
 
 
 def test_running_out_of_iterations_is_told() -> None:
-    start = np.array([2.5, -2.02])
-    ascent = ascend(
-        hill, lambda x, s: x + s, start, np.ones(2, dtype=np.bool_), NewtonOptions(iterations=2)
-    )
-    assert not ascent.converged
+    ascent = climbed(hill, np.array([2.5, -2.02]), options=NewtonOptions(iterations=2))
+    assert not ascent.converged[0]
+    assert ascent.iterations[0] == 2
 
 
-def bowl(claimed: float, hessian: float | None = None) -> Callable[[Floats], Model]:
+def bowl(claimed: float) -> Callable[[Floats], tuple[float, Floats, Floats]]:
     """Value 10 - 50 x², whose curvature is 100, with another curvature claimed for it."""
 
-    def model(x: Floats) -> Model:
-        known = None if hessian is None else np.array([[hessian]])
-        value = 10.0 - 50.0 * float(x[0] ** 2)
-        return Model(value, -100.0 * x, np.array([[claimed]]), known)
+    def model(x: Floats) -> tuple[float, Floats, Floats]:
+        return 10.0 - 50.0 * float(x[0] ** 2), -100.0 * x, np.array([[claimed]])
 
     return model
 
@@ -108,44 +179,48 @@ def bowl(claimed: float, hessian: float | None = None) -> Callable[[Floats], Mod
 ONE = np.ones(1, dtype=np.bool_)
 
 
-def test_damping_grows_until_a_step_that_is_far_too_long_becomes_short_enough() -> None:
+@pytest.mark.parametrize("starts", [[[0.3]], [[0.3], [-0.2]]])
+def test_damping_grows_until_a_step_that_is_far_too_long_becomes_short_enough(
+    starts: list[list[float]],
+) -> None:
     # by the curvature claimed the first step is a hundred times too long
-    ascent = ascend(bowl(1.0), lambda x, step: x + step, np.array([0.3]), ONE)
-    assert ascent.converged
-    assert ascent.state[0] == pytest.approx(0.0, abs=1e-5)
-    assert ascent.value == pytest.approx(10.0)
+    ascent = climbed(bowl(1.0), *np.array(starts), free=ONE)
+    assert ascent.converged.all()
+    assert ascent.states[:, 0] == pytest.approx([0.0] * len(starts), abs=1e-5)
+    assert ascent.values == pytest.approx([10.0] * len(starts))
 
 
 def test_the_last_step_is_taken_and_its_gain_counted_though_it_is_not_looked_at() -> None:
     # 0.5 of 9.5 is to be gained, less than the tenth that the tolerance asks for
-    start = np.array([0.1])
-    ascent = ascend(
-        bowl(100.0), lambda x, s: x + s, start, ONE, NewtonOptions(tolerance=0.1, damping=1e-6)
-    )
-    assert (ascent.converged, ascent.iterations) == (True, 1)
-    assert ascent.state[0] == pytest.approx(0.0, abs=1e-6)
-    assert ascent.value == pytest.approx(10.0, abs=1e-6)
+    options = NewtonOptions(tolerance=0.1, damping=1e-6)
+    ascent = climbed(bowl(100.0), np.array([0.1]), free=ONE, options=options)
+    assert (ascent.converged[0], ascent.iterations[0]) == (True, 1)
+    assert ascent.states[0, 0] == pytest.approx(0.0, abs=1e-6)
+    assert ascent.values[0] == pytest.approx(10.0, abs=1e-6)
 
 
 def test_a_definite_hessian_is_used_in_place_of_a_curvature_that_is_too_large() -> None:
+    def with_hessian(x: Floats) -> tuple[float, Floats, Floats, Floats]:
+        return *bowl(300.0)(x), np.array([[100.0]])
+
     start, options = np.array([0.3]), NewtonOptions(iterations=12)
-    slow = ascend(bowl(300.0), lambda x, s: x + s, start, ONE, options)
-    fast = ascend(bowl(300.0, hessian=100.0), lambda x, s: x + s, start, ONE, options)
+    slow = climbed(bowl(300.0), start, free=ONE, options=options)
+    fast = climbed(Function(with_hessian), start, free=ONE, options=options)
     # steps of a third of the way leave (2/3)^11 = 0.01 of it, Newton's leave the damping's 1e-4
-    assert not slow.converged
-    assert fast.converged
-    assert fast.iterations <= 4
-    assert fast.state[0] == pytest.approx(0.0, abs=1e-6)
+    assert not slow.converged[0]
+    assert fast.converged[0]
+    assert fast.iterations[0] <= 4
+    assert fast.states[0, 0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_hessian_that_is_not_definite_does_not_lead_to_the_valley_between_two_hills() -> None:
-    def hills(x: Floats) -> Model:
+    def hills(x: Floats) -> tuple[float, Floats, Floats, Floats]:
         """Hills of height 2 at -1 and 1; at the start the second derivative is positive."""
         x0 = float(x[0])
         gradient = np.array([x0 - x0**3])
         hessian = np.array([[3 * x0**2 - 1]])
-        return Model(2 - (x0**2 - 1) ** 2 / 4, gradient, np.array([[3 * x0**2 + 1]]), hessian)
+        return 2 - (x0**2 - 1) ** 2 / 4, gradient, np.array([[3 * x0**2 + 1]]), hessian
 
-    ascent = ascend(hills, lambda x, s: x + s, np.array([0.1]), ONE)
-    assert ascent.converged
-    assert ascent.state[0] == pytest.approx(1.0, abs=1e-5)
+    ascent = climbed(Function(hills), np.array([0.1]), np.array([-0.7]), free=ONE)
+    assert ascent.converged.all()
+    assert ascent.states[:, 0] == pytest.approx([1.0, -1.0], abs=1e-5)

@@ -10,9 +10,9 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import AssociationRules, ErrorRules
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import Case, DetectionModel, JudgementRules, NoiseModel, Prior, judge
+from mixpose.matching import AssociationRules, ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search import search_frame

@@ -17,7 +17,7 @@ from bodies_in_view import CAMERAS, OTHER, TOOL, at, body, off, scene_of, views_
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.objective import SharedDensities, Together, View, matched_objective
+from mixpose.objective import SharedDensities, View, matched_objective, together
 from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
@@ -275,18 +275,19 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
     shared = SharedDensities.drawn(views)
     each = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
     near = [T @ at(0.4, -0.3) for T in poses]
-    together = Together.of(each)
-    for found, one, T in zip(together.models(near), each, near, strict=True):
-        alone = one.linearise(T)
+    joint = together(each)
+    models = joint.linearise(np.array(near))
+    for k, (one, T) in enumerate(zip(each, near, strict=True)):
+        found, alone = models.of(k), one.linearise(T[None]).of(0)
         # looked up on other tiles of an array in which places are rounded to 2e-5 cells
         assert found.value == pytest.approx(alone.value, rel=1e-5)
         for a, b in ((found.gradient, alone.gradient), (found.curvature, alone.curvature)):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5 * np.abs(b).max())
     # what they see at other poses is at hand afterwards, as each would see it
     fresh = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
-    together.match(poses)
-    for one, other, T in zip(each, fresh, poses, strict=True):
-        assert one.at_hand[0][0] is T
+    for one, other, T in zip(joint.seen(each, np.array(poses)), fresh, poses, strict=True):
+        assert one.at_hand is not None
+        np.testing.assert_array_equal(one.at_hand[0], T)
         at_hand, sampled, over = one.match(T[None])
         seen, looked_up, apart = other.match(T[None])
         np.testing.assert_allclose(at_hand.y, seen.y)

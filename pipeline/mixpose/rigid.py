@@ -101,12 +101,13 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
     twist : (..., 6) array
         ``(x, y, z, rx, ry, rz)``, lengths and radians.
     """
-    if twist.ndim == 1 and T_world_object.ndim == 2:
+    if twist.size == 6 and T_world_object.size == 16:
         # one pose after the other is what optimisers ask for: no time for broadcasting
         T = T_world_object.copy()
-        T[:3, :3] = cv2.Rodrigues(twist[3:])[0] @ T_world_object[:3, :3]
-        T[:3, 3] += twist[:3]
-        return T
+        single, six = T.reshape(4, 4), twist.reshape(6)
+        single[:3, :3] = cv2.Rodrigues(six[3:])[0] @ single[:3, :3]
+        single[:3, 3] += six[:3]
+        return T if T_world_object.ndim > twist.ndim else T.reshape(*twist.shape[:-1], 4, 4)
     rotation = rotation_matrix(twist[..., 3:]) @ T_world_object[..., :3, :3]
     return from_parts(rotation, T_world_object[..., :3, 3] + twist[..., :3])
 
@@ -119,6 +120,8 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
         twist[:3] = T_to[:3, 3] - T_from[:3, 3]
         twist[3:] = cv2.Rodrigues(R_difference)[0][:, 0]
         return twist
+    if R_difference.shape == (1, 3, 3):
+        return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]
     vectors = Rotation.from_matrix(R_difference.reshape(-1, 3, 3)).as_rotvec()
     shift = T_to[..., :3, 3] - T_from[..., :3, 3]
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)

@@ -56,7 +56,7 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
             sys.setprofile(None)
         counted.append(counts)
     middle = TRIALS // 2
-    figures = {
+    figures: dict[str, Any] = {
         "calls_per_frame": sorted(one.calls for one in counted)[middle],
         "file_changes_per_frame": sorted(one.changes for one in counted)[middle],
         "kinds_of_record": sorted(len(one.records) for one in counted)[middle],

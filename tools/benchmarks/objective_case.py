@@ -18,9 +18,10 @@ from paper.systems import SCENARIOS, draw, pose, systems
 
 from benchmarks.literal import Camera, LiteralObjective
 from benchmarks.timing import PROCESSOR, Task, medians, show
+from mixpose.density import DRAWING
 from mixpose.objective import View
 from mixpose.objective.base import region_of_interest
-from mixpose.objective.paper import REACH, PaperObjective, SampledTerm, sampled_terms
+from mixpose.objective.paper import PaperObjective, SampledTerm, sampled_terms
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam
 
@@ -44,8 +45,8 @@ def run(_: argparse.Namespace) -> dict[str, Any]:
         {
             "value": lambda: plain.value(T),
             "remap": remaps_in(lambda: plain.value(T)),
-            "linearise": lambda: graded.linearise(T),
-            "remap with gradients": remaps_in(lambda: graded.linearise(T)),
+            "linearise": lambda: graded.linearise(T[None]),
+            "remap with gradients": remaps_in(lambda: graded.linearise(T[None])),
         },
         rounds=60,
         calls=20,
@@ -95,7 +96,7 @@ def value_terms(seen: list[View], samples: Floats, T: Floats) -> list[SampledTer
     for view in seen:
         sigma = view.observation.sigma
         y, _ = view.sensor.project(transform(T, samples.reshape(-1, 3)))
-        box = region_of_interest(view.sensor, y, REACH * sigma)
+        box = region_of_interest(view.sensor, y, DRAWING.paper_reach * sigma)
         terms.append(SampledTerm(view.sensor, view.observation.density(sigma, box)))
     return terms
 

@@ -15,8 +15,8 @@ _ATLAS = (
     Mutant(
         "density-drawn-too-narrowly",
         "density/atlas.py",
-        "REACH = 4.25",
-        "REACH = 2.5",
+        "reach = DRAWING.reach * n",
+        "reach = 2.5 * n",
         "features four widths apart draw each other",
     ),
     Mutant(
@@ -36,7 +36,7 @@ _ATLAS = (
     Mutant(
         "density-look-up-blurs-once-more",
         "density/atlas.py",
-        "drawn = math.sqrt(n**2 - _SPLINE)",
+        "drawn = math.sqrt(n**2 - 1 / 4)",
         "drawn = n",
         "peaks of densities are too low by what a spline blurs",
     ),
@@ -57,8 +57,8 @@ _ATLAS = (
     Mutant(
         "density-tiles-that-are-left",
         "density/atlas.py",
-        "<= 0.5 * TILE",
-        "<= 2.0 * TILE",
+        "<= 0.5 * DRAWING.tile",
+        "<= 2.0 * DRAWING.tile",
         "a fit that goes on by some pixels looks up what another feature has",
     ),
     Mutant(
@@ -137,8 +137,8 @@ _BLUR = (
     Mutant(
         "density-overlap-ends-early",
         "density/overlap.py",
-        "REACH = 5.7",
-        "REACH = 2.0",
+        "DRAWING.overlap * np.sqrt(variance)",
+        "2.0 * np.sqrt(variance)",
         "bodies of many features have too little energy where features lie close",
     ),
 )

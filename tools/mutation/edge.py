@@ -130,8 +130,8 @@ _CHECKING = (
     Mutant(
         "checking-mirrored-tilts-left-out",
         "checking/lookalikes.py",
-        "turning = np.cross(arms[:, :, None, :], by_world)",
-        "turning = np.cross(by_world, arms[:, :, None, :])",
+        "pose_jacobian(by_world, arms), visible",
+        "pose_jacobian(by_world, -arms), visible",
         "look-alikes are not found, as the steps turn the wrong way",
     ),
     Mutant(

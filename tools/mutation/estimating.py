@@ -31,15 +31,15 @@ _NEAR = (
     Mutant(
         "fit-all-starts-lead-to-one",
         "fit/near.py",
-        "curvature @ away) < rules.same",
-        "curvature @ away) * 0 < rules.same",
+        "curvature[0] @ away) < rules.same",
+        "curvature[0] @ away) * 0 < rules.same",
         "rivals are taken for the pose that was found first",
     ),
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "if blur == 1 and here.value < rules.near * len(objective.views):",
-        "if here.value < 0.0:",
+        "if blur == 1 and here.value[0] < rules.near * len(objective.views):",
+        "if here.value[0] < 0.0:",
         "a start some widths off is never corrected",
     ),
     Mutant(
@@ -80,18 +80,18 @@ _NARROW = (
 
 _PROBABLE = (
     Mutant(
-        "fit-start-ignored",
-        "fit/prior.py",
+        "objective-prior-ignored",
+        "objective/normal_prior.py",
         "np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)",
         "np.zeros(6)",
         "what is known of the start does not count",
         (_PRIOR,),
     ),
     Mutant(
-        "fit-start-repels",
-        "fit/prior.py",
-        "gradient - information * away",
-        "gradient + information * away",
+        "objective-prior-repels",
+        "objective/normal_prior.py",
+        "Quadratic(0.5 * (away * pull).sum(axis=1), pull, C, C)",
+        "Quadratic(0.5 * (away * pull).sum(axis=1), -pull, C, C)",
         "the gradient of the prior has the wrong sign",
         (_PRIOR,),
     ),
@@ -104,8 +104,8 @@ _PROBABLE = (
         (_PRIOR,),
     ),
     Mutant(
-        "fit-starts-too-close",
-        "fit/prior.py",
+        "objective-prior-points-too-close",
+        "objective/normal_prior.py",
         "steps = np.sqrt(count) * np.diag(",
         "steps = np.diag(",
         "other maxima are sought within less than the prior allows",

@@ -220,7 +220,7 @@ _GATING = (
 _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-any-clutter",
-        "tracking/association_likelihood.py",
+        "tracking/association_sum.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
@@ -228,7 +228,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-missed-for-free",
-        "tracking/association_likelihood.py",
+        "tracking/association_sum.py",
         "missed = expected * np.log(1 - probability) +",
         "missed = 0 * expected +",
         "poses whose tags have no range are as good as those that meet all",

@@ -22,8 +22,8 @@ _RIGID = (
     Mutant(
         "rigid-one-twist-in-object-axes",
         "rigid.py",
-        "cv2.Rodrigues(twist[3:])[0] @ T_world_object[:3, :3]",
-        "T_world_object[:3, :3] @ cv2.Rodrigues(twist[3:])[0]",
+        "cv2.Rodrigues(six[3:])[0] @ single[:3, :3]",
+        "single[:3, :3] @ cv2.Rodrigues(six[3:])[0]",
         "a step of the ascent turns about the object's axes, its gradient about the world's",
     ),
     Mutant(

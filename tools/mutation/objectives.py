@@ -60,8 +60,8 @@ _KERNEL = (
     Mutant(
         "objective-overlap-ends-early",
         "objective/kernel.py",
-        "_NEGLIGIBLE = -16.0",
-        "_NEGLIGIBLE = -1.0",
+        "exponents > -DRAWING.negligible",
+        "exponents > -1.0",
         "overlaps of features more than 1.4 standard deviations apart are left out",
     ),
     Mutant(
@@ -112,16 +112,16 @@ _MATCHED = (
     Mutant(
         "objective-last-digits-drawn-coarsely",
         "objective/matched.py",
-        "FINE_STEPS = 48.0",
-        "FINE_STEPS = 2.0",
+        "= DRAWING.steps_per_sigma, DRAWING.fine_steps",
+        "= DRAWING.steps_per_sigma, 2.0",
         "poses of grey values stop where the look-up is too coarse",
         ("test_fit*.py",),
     ),
     Mutant(
         "objective-ends-on-coarse-cells",
         "objective/matched.py",
-        "STEPS_PER_SIGMA = 4.0",
-        "STEPS_PER_SIGMA = 1.0",
+        "= DRAWING.steps_per_sigma, DRAWING.fine_steps",
+        "= 1.0, DRAWING.fine_steps",
         "estimates end on cells as large as a feature",
         ("test_fit*.py",),
     ),

@@ -107,8 +107,8 @@ _DESIGN = (
     Mutant(
         "design-tip-turned-the-other-way",
         "design/prediction.py",
-        "J[:, 0, 4], J[:, 0, 5] = z, -y",
-        "J[:, 0, 4], J[:, 0, 5] = -z, y",
+        "(len(arms), 3, 3)), arms)",
+        "(len(arms), 3, 3)), -arms)",
         "errors of the tip along x add up wrongly with those of the position",
     ),
     Mutant(

@@ -115,7 +115,7 @@ def likeliest_near(seen: Sequence[View], body: Body, T_truth: Floats) -> Floats:
     likelihood = matched_objective(seen, body, sigmas)
     options = NewtonOptions(iterations=60, tolerance=1e-11, value_error=1e-4)
     free = np.ones(6, dtype=np.bool_)
-    return ascend(likelihood.linearise, perturb, T_truth, free, options).state
+    return np.asarray(ascend(likelihood, T_truth[None], perturb, free, options).states[0])
 
 
 def views(system: System, scenario: Scenario, measurements: Sequence[Measurement]) -> list[View]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
+from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
 from mixpose.sensors import RangeSensor, Sensor
@@ -274,7 +275,7 @@ def by_parameters(sensor: Any, kind: Kind, world: Floats, by_world: Floats) -> F
         T = sensor.T_sensor_world
         by_sensor = by_world @ T[:3, :3].T
         x = world @ T[:3, :3].T + T[:3, 3]
-        return np.concatenate([by_sensor, np.cross(x[:, None], by_sensor)], axis=2)
+        return pose_jacobian(by_sensor, x)
     if kind == "position":
         return -by_world
     if kind == "range_bias":

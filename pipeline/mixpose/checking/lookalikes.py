@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
+from mixpose.objective import pose_jacobian
 from mixpose.rigid import Floats, perturb, rotation_angle_deg, transform
 from mixpose.search.spread import spread_turns
 from mixpose.sensors import RangeSensor, Sensor
@@ -222,9 +223,8 @@ def _linearised(
     sensor, points = view.setup.sensor, body.means[chosen]
     y, by_world, visible = sensor.linearise(transform(poses, points))
     arms = points @ np.swapaxes(poses[:, :3, :3], -1, -2)
-    turning = np.cross(arms[:, :, None, :], by_world)
     visible = visible & _faces(sensor, poses, body, chosen)
-    return y, np.concatenate([by_world, turning], axis=-1), visible
+    return y, pose_jacobian(by_world, arms), visible
 
 
 def _faces(sensor: Sensor, poses: Floats, body: Body, chosen: NDArray[np.intp]) -> Mask:

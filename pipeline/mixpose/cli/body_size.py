@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from mixpose.objective import pose_jacobian
 from mixpose.records import Estimate, Floats
 from mixpose.session import Session
 
@@ -40,7 +41,7 @@ class BodySize:
             if not len(met):
                 continue
             own, J = arms[one.features[met]], one.by_shift[met] / self._sigmas[name]
-            columns = [J, np.cross(own[:, None], J), (J @ own[..., None])]
+            columns = [pose_jacobian(J, own), J @ own[..., None]]
             A = np.concatenate(columns, axis=2).reshape(-1, 7)
             y = one.offsets[met].ravel() / self._sigmas[name]
             normal, pull, squares = normal + A.T @ A, pull + A.T @ y, squares + float(y @ y)

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import render
-from mixpose.density.grid import FAR, FLOOR, Density, Window
-from mixpose.density.observation import MOST_SIGMAS, Observation, matched_atlas
+from mixpose.density.grid import FAR, Density, Window
+from mixpose.density.observation import Observation, matched_atlas
 from mixpose.density.overlap import close_pairs, peak, self_overlap
+from mixpose.density.rules import DRAWING, DrawingRules
 
 __all__ = [
+    "DRAWING",
     "FAR",
-    "FLOOR",
-    "MOST_SIGMAS",
     "Atlas",
     "Density",
+    "DrawingRules",
     "Observation",
     "Window",
     "close_pairs",

@@ -29,30 +29,8 @@ from numpy.typing import NDArray
 from mixpose.density.blur import factors, mass, reduced
 from mixpose.density.grid import remap
 from mixpose.density.pages import RIM, Pages, Plane
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Indices, Pattern, PointPattern, Singles
-
-REACH = 4.25
-"""Standard deviations around a detection that are drawn: features farther apart draw each other by
-less than 1e-3 σ_ε."""
-
-TILE = 24
-"""Cells along the part of a tile that is looked up: six standard deviations of detections.  Half of
-it is as far as a fit moves; larger ones are drawn for little use."""
-
-MIN_GRID_TILE = 18
-"""The same of grey values alone, at least; as a rule a standard deviation."""
-
-MOST_OWN = 1200
-"""Places that have tiles of their own: with 600 features in two cameras a fit takes two thirds of
-what it takes on pages."""
-
-_SPLINE = 1 / 4  # squared cells: the variance of a quadratic B-spline, by which look-ups blur
-_TOGETHER = 64  # tiles that are drawn at once: they have room for as many detections each
-_FEW_PAIRS = 5000  # of tiles and detections: looking at all is quicker than sorting
-_FARTHEST = 1e9  # cells: farther rows count as that
-_BESIDE = 2.0  # cells beside a place that are looked up, at most
-_SIDES = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
-_QUARTERS = np.full(4, 0.25, dtype=np.float32)
 
 
 class Atlas:
@@ -78,6 +56,10 @@ class Atlas:
         Cells along the part of a tile that is looked up.
     """
 
+    _sides = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
+    _apart = 4e9  # cells between rows of one sensor and the next, where they are sorted
+    _quarters = np.full(4, 0.25, dtype=np.float32)
+
     def __init__(
         self, patterns: Sequence[Pattern], sigmas: Sequence[float], steps_per_sigma: float
     ) -> None:
@@ -99,7 +81,9 @@ class Atlas:
             share[part] = pattern.weights / pattern.weights.sum()
         self._q, self._share = q, share
         self._sensor = np.arange(len(counts)).repeat(counts)
-        self.tile = max(math.ceil(steps_per_sigma), MIN_GRID_TILE) if self._grids else TILE
+        self.tile = (
+            max(math.ceil(steps_per_sigma), DRAWING.grid_tile) if self._grids else DRAWING.tile
+        )
         self._own: _Tiles | None = None
         if self._grids:  # the larger the plane, the larger its pages
             self.tile = self.pages.plane.page
@@ -107,7 +91,7 @@ class Atlas:
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
-        if self._grids or index.size > 2 * MOST_OWN:
+        if self._grids or index.size > 2 * DRAWING.own_tiles:
             self._to_pages(index)
         else:
             self._to_own_tiles(index)
@@ -115,10 +99,10 @@ class Atlas:
         beside = maps - np.rint(maps)
         beside *= beside
         beside += 0.25
-        around = _SIDES * beside[:, None]
+        around = self._sides * beside[:, None]
         around += maps[:, None]
         u, v = around.reshape(2, -1).astype(np.float32)
-        sampled = _QUARTERS @ remap(self.values, u, v).reshape(4, -1)
+        sampled = self._quarters @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._scale.units)
 
     def _to_own_tiles(self, index: Floats) -> None:
@@ -130,7 +114,7 @@ class Atlas:
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
             groups = list(self._groups(len(flat), *self._near(sensors, flat)))
             # columns of so few tiles that places in the array are rounded to 6e-5 cells
-            shape = min(len(flat), _TOGETHER), side, len(groups), 3 * side
+            shape = min(len(flat), DRAWING.tiles_at_once), side, len(groups), 3 * side
             room = np.empty(shape, dtype=np.float32)
             shifts = 0.5 * (side - 1) - flat
             for k, (some, of, which) in enumerate(groups):
@@ -168,7 +152,7 @@ class Atlas:
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
         reach = 0.5 * self.tile + self._scale.reach
-        if len(sensors) * len(self._q) <= _FEW_PAIRS:
+        if len(sensors) * len(self._q) <= DRAWING.few_pairs:
             away = self._q - middles[:, None]
             np.abs(away, out=away)
             inside = away < reach
@@ -176,7 +160,7 @@ class Atlas:
             of, which = np.nonzero(near)
             return of, which
         order, sorted_keys = self._sorted
-        keys = middles[:, 1] + 4 * _FARTHEST * sensors
+        keys = middles[:, 1] + self._apart * sensors
         first = np.searchsorted(sorted_keys, keys - (reach + 1.0))
         counts = np.searchsorted(sorted_keys, keys + (reach + 1.0)) - first
         of = np.arange(len(keys)).repeat(counts)
@@ -187,7 +171,8 @@ class Atlas:
     @cached_property
     def _sorted(self) -> tuple[Indices, Floats]:
         """Detections (D,) by sensor and row, and numbers that are sorted alike."""
-        keys = np.clip(self._q[:, 1], -_FARTHEST, _FARTHEST) + 4 * _FARTHEST * self._sensor
+        farthest = self._apart / 4
+        keys = np.clip(self._q[:, 1], -farthest, farthest) + self._apart * self._sensor
         order = np.argsort(keys)
         return order, keys[order]
 
@@ -195,12 +180,12 @@ class Atlas:
         self, count: int, of: Indices, which: Indices
     ) -> Iterator[tuple[Indices, Indices, Indices]]:
         """Tiles that about as many detections reach, with the pairs of both, as of `_near`."""
-        if count <= _TOGETHER:
+        if count <= DRAWING.tiles_at_once:
             yield np.arange(count), of, which
             return
         order = np.argsort(np.bincount(of, minlength=count), kind="stable")
-        for first in range(0, count, _TOGETHER):
-            some = order[first : first + _TOGETHER]
+        for first in range(0, count, DRAWING.tiles_at_once):
+            some = order[first : first + DRAWING.tiles_at_once]
             number = np.full(count, -1)
             number[some] = np.arange(len(some))
             chosen = np.flatnonzero(number[of] >= 0)
@@ -284,7 +269,7 @@ class _Tiles(NamedTuple):
         """Whether as many places are still on their tiles."""
         if self.middles.shape != index.shape:
             return False
-        return float(np.abs(index - self.middles).max(initial=0.0)) <= 0.5 * TILE
+        return float(np.abs(index - self.middles).max(initial=0.0)) <= 0.5 * DRAWING.tile
 
 
 class _Scale(NamedTuple):
@@ -301,12 +286,13 @@ class _Scale(NamedTuple):
     @lru_cache(maxsize=64)
     def of(cls, dimensions: tuple[int, ...], sigmas: tuple[float, ...], n: float) -> _Scale:
         """For blurs of standard deviations sigmas, of n cells each."""
-        drawn = math.sqrt(n**2 - _SPLINE)
+        # look-ups blur by the variance of a quadratic B-spline
+        drawn = math.sqrt(n**2 - 1 / 4)
         widths = [sigma * drawn / n for sigma in sigmas]
         across = [(n / sigma, (m - 1) * n / sigma) for sigma, m in zip(sigmas, dimensions)]
         tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
         units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
         is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
         per_unit = np.array(across)[:, None, None]
-        reach = REACH * n + _BESIDE
+        reach = DRAWING.reach * n + RIM - 1
         return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)

@@ -14,14 +14,8 @@ import cv2
 import numpy as np
 
 from mixpose.density.grid import Density, Window, merge
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
-
-CUT = 5.0
-"""Standard deviations at which sums over a grid end: the tail holds 6e-7."""
-
-_LEAST_VALUE = 1e-30  # of a grid: what is normalised by less overflows in single precision
-_SAMPLES_PER_SIGMA = 4.0  # of a grid that is averaged before a wide blur: sums err by 1e-30
-_HAT = 0.3  # of a grid's step: a narrower blur is linear interpolation
 
 
 class Factors(NamedTuple):
@@ -73,12 +67,12 @@ def _along(
 ) -> tuple[slice, Singles, Singles]:
     """The part of a grid that matters along an axis, and its Gaussians at places."""
     step, count = pattern.step, pattern.values.shape[1 - axis]
-    margin = max(CUT * sigma, step)
+    margin = max(DRAWING.cut * sigma, step)
     first = int(np.clip((places.min() - margin - pattern.origin[axis]) / step, 0, count - 1))
     last = (places.max() + margin - pattern.origin[axis]) / step + 2
     part = slice(first, int(np.clip(last, first + 1, count)))
     grid = pattern.origin[axis] + step * np.arange(part.start, part.stop)
-    if sigma > _HAT * step:
+    if sigma > DRAWING.hat * step:
         return part, *bell(places, grid, sigma)
     away = (places - grid[:, None]) / step
     hat = np.maximum(1 - np.abs(away), 0.0) / step
@@ -86,16 +80,13 @@ def _along(
     return part, hat.astype(np.float32), slope.astype(np.float32)
 
 
-_VANISHED = 50.0  # squared standard deviations at which a Gaussian is 1e-11 of its peak
-
-
 def bell(axis: Floats, centres: Floats, sigma: float) -> tuple[Singles, Singles]:
     """Gaussians (M, n) around centres (M,) along an axis (n,), and their derivative."""
     away = ((axis - centres[:, None]) / sigma).astype(np.float32)
     squared = away * away
     values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
-    # products of far tails would be subnormal numbers, on which matrix products crawl
-    values[squared > _VANISHED] = 0.0
+    # products of tails beyond (1e-11 of the peak) are subnormal: matrix products crawl on them
+    values[squared > 2 * DRAWING.cut**2] = 0.0
     return values, values * away * np.float32(-1.0 / sigma)
 
 
@@ -118,7 +109,7 @@ def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
     move a feature to the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off
     the blur.
     """
-    factor = odd_factor(sigma / (_SAMPLES_PER_SIGMA * pattern.step))
+    factor = odd_factor(sigma / (DRAWING.steps_per_sigma * pattern.step))
     if factor == 1:
         return pattern, sigma
     flat = pattern.dimension == 1
@@ -172,4 +163,4 @@ def is_empty(pattern: Pattern) -> bool:
         return len(pattern.points) == 0 or not pattern.weights.sum() > 0
     # a profile that lies below zero as a whole has no density anywhere, nor has one that cannot be
     # normalised in single precision
-    return not pattern.values.max() > _LEAST_VALUE
+    return not pattern.values.max() > DRAWING.least_value

@@ -3,7 +3,7 @@
 A density is float32 values plus the affine map from sensor coordinates to array indices,
 ``index = (y - origin) / step``: windows, coarse levels and range profiles (one row high) are all
 the same thing.  Channel 0 holds the density g, the following m channels its gradient by sensor
-coordinates.  Outside the array every channel is `FLOOR`.
+coordinates.  Outside the array every channel is 0.
 
 Arrays have 1, 3 or 4 channels: for those `cv2.remap` of OpenCV 5 is exact to float rounding, for
 2 it still rounds coordinates to 1/32 of a step.  Densities of ranges are padded to 3.
@@ -17,13 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats
 
-FLOOR = 0.0
-"""Density outside the grid, behind the camera and wherever a sensor sees nothing."""
-
-_ROW = 16384  # cv2.remap takes maps of less than 32767 a side
-FAR = -1.0e6  # an index that is outside any array, finite in float32
+FAR = DRAWING.far
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ class Density:
         return map_u, map_v
 
     def sample(self, y: Floats) -> NDArray[np.float32]:
-        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; `FLOOR` outside.
+        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside.
 
         Without the last axis for a single channel.
         """
@@ -90,12 +87,9 @@ class Density:
         return looked_up[:, : 1 + self.dimension].reshape(*y.shape[:-1], 1 + self.dimension)
 
 
-EXACT_CHANNELS = (1, 3, 4)
-
-
 def merge(layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     """Stack layers (H, W) as channels (H, W, C), padded to a number that is looked up exactly."""
-    while len(layers) > 1 and len(layers) not in EXACT_CHANNELS:
+    while len(layers) > 1 and len(layers) not in DRAWING.exact_channels:
         layers = [*layers, np.zeros_like(layers[0])]
     merged = np.asarray(cv2.merge(layers), dtype=np.float32)
     return merged.reshape(*layers[0].shape, len(layers))
@@ -104,9 +98,9 @@ def merge(layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
 def remap(
     values: NDArray[np.float32], map_u: NDArray[np.float32], map_v: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Sample an array bilinearly at n indices: (n, C) or (n,); `FLOOR` outside."""
+    """Sample an array bilinearly at n indices: (n, C) or (n,); 0 outside."""
     count, channels = len(map_u), values.shape[2:]
-    width = min(count, _ROW)
+    width = min(count, DRAWING.side)
     if count == 0:
         return np.zeros((0, *channels), dtype=np.float32)
     if count > width:

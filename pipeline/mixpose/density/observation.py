@@ -20,19 +20,8 @@ from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.overlap import self_overlap
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Pattern, PointPattern
-
-STEPS_PER_SIGMA = 4.0
-"""Grid points per standard deviation of dense windows."""
-
-MOST_CELLS = 1_500_000
-"""Grid points of a dense window; a larger one gets coarser."""
-
-MOST_SIGMAS = 4000.0
-"""Extent of features over the narrowest blur at which they are drawn: pages are 8.5 σ wide, and a
-plane has 250 000 of them."""
-
-_MARGIN = 5.0  # standard deviations around a pattern that its density reaches
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +128,18 @@ class Observation:
             weights = pattern.weights / pattern.weights.sum()
             return self_overlap(pattern.points, weights, 2 * sigma**2)
         lower, upper = self.extent
-        g = self.density(sigma, (lower - _MARGIN * sigma, upper + _MARGIN * sigma))
+        g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
 
     def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
         """A window over the box, fine enough for the blur and within the budget of cells."""
-        margin = _MARGIN * feature_sigma
+        margin = DRAWING.cut * feature_sigma
         near, far = self.extent
         lower = np.maximum(within[0], near - margin)
         upper = np.maximum(np.minimum(within[1], far + margin), lower)
-        affordable = float(np.prod(upper - lower) / MOST_CELLS) ** (1 / self.dimension)
-        step = max(feature_sigma / STEPS_PER_SIGMA, affordable)
+        affordable = float(np.prod(upper - lower) / DRAWING.window_cells) ** (1 / self.dimension)
+        step = max(feature_sigma / DRAWING.steps_per_sigma, affordable)
         if isinstance(self.pattern, PointPattern):
             return Window.around(lower, upper, step)
         grid = self.pattern

@@ -7,13 +7,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices
-
-REACH = 5.7
-"""Standard deviations beyond which two features do not overlap: e^-16."""
-
-ALL_PAIRS = 48
-"""Points up to which all pairs at once are faster than a search for neighbours."""
 
 
 def peak(variance: float, dimension: int) -> float:
@@ -23,13 +18,13 @@ def peak(variance: float, dimension: int) -> float:
 
 def close_pairs(points: Floats, variance: float) -> Indices:
     """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
-    if len(points) <= ALL_PAIRS:
+    if len(points) <= DRAWING.few:
         return _all_pairs(len(points))
-    pairs = cKDTree(points).query_pairs(REACH * np.sqrt(variance), output_type="ndarray")
+    pairs = cKDTree(points).query_pairs(DRAWING.overlap * np.sqrt(variance), output_type="ndarray")
     return np.asarray(pairs, dtype=np.intp)
 
 
-@lru_cache(maxsize=ALL_PAIRS)
+@lru_cache(maxsize=DRAWING.few)
 def _all_pairs(count: int) -> Indices:
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     pairs.flags.writeable = False

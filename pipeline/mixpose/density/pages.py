@@ -9,18 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mixpose.density.grid import FAR
+from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices, Singles
-
-MAX_PAGES = 250_000
-"""Pages of a sensor's plane; detections that are too far from their middle for it are left out,
-and pages of grey values are larger."""
 
 RIM = 3
 """Cells along a tile beside those whose places may be looked up: a spline reaches beyond."""
-
-_LARGEST = 32000  # side of the array: cv2.remap takes less than 32767
-_AT_ONCE = 400  # pages that are drawn together: what is made for them stays in the cache
-_PENDING = -1  # in the table: not drawn yet
 
 
 class Plane(NamedTuple):
@@ -44,13 +37,13 @@ class Plane(NamedTuple):
         grids = np.concatenate([np.zeros((0, 2)), *corners])
         places = q if len(q) else grids
         lower, upper = places.min(axis=0), places.max(axis=0)
-        if len(q) and _count(lower, upper, page) > MAX_PAGES:
-            middle, half = np.median(q, axis=0), page * math.sqrt(MAX_PAGES) / 2.5
+        if len(q) and _count(lower, upper, page) > DRAWING.pages:
+            middle, half = np.median(q, axis=0), page * math.sqrt(DRAWING.pages) / 2.5
             lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
         if corners:
             lower = np.minimum(lower, grids.min(axis=0))
             upper = np.maximum(upper, grids.max(axis=0))
-            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / MAX_PAGES), 1.0))
+            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.pages), 1.0))
         # half a cell is left, lest rounding puts a place on a page of the rim
         origin = page * np.floor((lower - (reach + page + 0.5)) / page)
         columns, rows = ((upper - lower + 2 * reach) / page).tolist()
@@ -78,10 +71,10 @@ class Pages:
 
     def __init__(self, plane: Plane, sensors: int) -> None:
         self.plane = plane
-        self.table = np.full(sensors * plane.squares, _PENDING, dtype=np.int32)
+        self.table = np.full(sensors * plane.squares, -1, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
         side = plane.page + RIM
-        columns = min(len(self.table) * side // _LARGEST + 1, _LARGEST // side)
+        columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1
         # from a place in the plane to one in the array, by page; from nothing out of the array
@@ -110,7 +103,7 @@ class Pages:
         number = self.table[squares]
         if number.min(initial=0) < 0:
             pending = np.unique(squares[number < 0])
-            for some in np.array_split(pending, -(-len(pending) // _AT_ONCE)):
+            for some in np.array_split(pending, -(-len(pending) // DRAWING.pages_at_once)):
                 sensors, place = np.divmod(some, plane.squares)
                 rows, columns = np.divmod(place, plane.shape[0])
                 middles = plane.page * (np.stack([columns, rows], axis=1) + 0.5)
@@ -131,7 +124,7 @@ class Pages:
         if self._drawn > rows * columns:
             # so large that allocators keep it from frame to frame; memory that is not written to
             # is free
-            most = min(4 * -(-self._drawn // columns), _LARGEST // side)
+            most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
             room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
             room[:rows] = self._room
             shifts = np.empty((most * columns, 2))

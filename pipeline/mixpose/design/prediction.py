@@ -130,13 +130,7 @@ def predict(plan: Plan, poses: Floats) -> Prediction:
 def at_tip(prediction: Prediction, tip: Floats) -> Floats:
     """Covariance (P, 3, 3) of a point (3,) of the body, in world axes; infinite where open."""
     arms = prediction.poses[:, :3, :3] @ tip
-    J = np.zeros((len(arms), 3, 6))
-    J[:, :, :3] = np.eye(3)
-    x, y, z = arms.T
-    # a turn ω moves the point by ω × arm
-    J[:, 0, 4], J[:, 0, 5] = z, -y
-    J[:, 1, 3], J[:, 1, 5] = -z, x
-    J[:, 2, 3], J[:, 2, 4] = y, -x
+    J = pose_jacobian(np.broadcast_to(np.eye(3), (len(arms), 3, 3)), arms)
     known = np.isfinite(prediction.covariances)
     result = J @ np.where(known, prediction.covariances, 0.0) @ J.swapaxes(1, 2)
     unknown = ~np.isfinite(np.einsum("pii->pi", prediction.covariances))

@@ -5,14 +5,12 @@ from __future__ import annotations
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.near import Climbed, Fit, FitRules, fit_near, fit_together
 from mixpose.fit.options import EstimatorOptions, SearchName, free_mask
-from mixpose.fit.prior import NormalPrior
 
 __all__ = [
     "Climbed",
     "EstimatorOptions",
     "Fit",
     "FitRules",
-    "NormalPrior",
     "ScheduleRules",
     "SearchName",
     "blur_schedule",

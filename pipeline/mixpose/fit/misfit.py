@@ -21,17 +21,13 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.objective import Quadratic, pose_jacobian
-from mixpose.optimise import NewtonOptions, ascend
+from mixpose.objective import pose_jacobian
+from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
 
 Labels: TypeAlias = tuple[tuple[int, ...], ...]
-
-_STEPS = 30  # peaks two widths apart, the least, draw each other by 0.4 of a step: 0.4³⁰ = 1e-12
-_SAME = 1e-9  # features nearer than 1e-4 of √2 σ have one height
-_ROUNDING = 1 / 512  # of a height: what a body may leave at its features and yet fit
 
 
 @dataclass(frozen=True)
@@ -41,6 +37,7 @@ class MisfitRules:
     believed: float = constant(
         0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
     )
+    rounding: float = constant(1 / 512, "of a height: what a body may leave at its features")
     unlike: float = constant(
         0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
     )
@@ -55,6 +52,10 @@ class SensorDensity:
     variance: float  # 2σ², that of a feature in the matched density, in squared sensor units
     cell_variance: float  # of the noise of a cell, times the size of a cell
     extent: tuple[Floats, Floats]  # smallest and largest coordinates (m,) of the density's cells
+    same: float = constant(1e-9, "of a height: features nearer than 1e-4 of √2 σ have one")
+    steps: int = constant(
+        30, "peaks two widths apart, the least, draw each other by 0.4 of a step: 0.4³⁰ = 1e-12"
+    )
 
     def left(self, y: Floats) -> tuple[Floats, Floats]:
         """What features (n, m), each of its own height (n,), leave of the density's gradient.
@@ -64,7 +65,7 @@ class SensorDensity:
         away = (y[:, None] - y) / np.sqrt(self.variance)
         bells = np.exp(-0.5 * (away * away).sum(axis=2))
         here = self.density(y).astype(np.float64)
-        heights = np.linalg.solve(bells + _SAME * np.eye(len(y)), here[:, 0])
+        heights = np.linalg.solve(bells + self.same * np.eye(len(y)), here[:, 0])
         slopes = -((bells * heights)[..., None] * away).sum(axis=1)
         return np.sqrt(self.variance) * here[:, 1:] - slopes, heights
 
@@ -87,7 +88,7 @@ def misfit(
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
         rest, heights = sensor.left(sensor.geometry.project(points_world)[0])
-        noise = np.hypot(sensor.noise(), _ROUNDING * float(heights.mean()))
+        noise = np.hypot(sensor.noise(), rules.rounding * float(heights.mean()))
         statistic += float((rest * rest).sum()) / noise**2
         freedom += rest.size
     if freedom <= 0 or statistic < float(chdtri(freedom, 1 - rules.believed)):
@@ -108,7 +109,7 @@ def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
     if len(order) < count:
         return None
     y = grid[peaks][order[:count]]
-    for _ in range(_STEPS):
+    for _ in range(sensor.steps):
         rest, own = sensor.left(y)
         if own.min() <= 0:
             return None
@@ -163,14 +164,11 @@ class Matching:
         labels, tried = self.nearest(T), set[Labels]()
         while labels not in tried:
             tried.add(labels)
-
-            def model(T: Floats, labels: Labels = labels) -> Quadratic:
-                rest, J = self.offsets(T, labels)
-                return Quadratic(-float(rest @ rest), 2 * rest @ J, 2 * J.T @ J)
-
-            found = ascend(model, perturb, T, self.free, NewtonOptions(60, tolerance=1e-13))
-            T, last, labels = found.state, labels, self.nearest(found.state)
-        return Matched(T, last, -found.value)
+            term = LabelledPlaces(self, labels)
+            found = ascend(term, T[None], perturb, self.free, NewtonOptions(60, tolerance=1e-13))
+            T = found.states[0]
+            last, labels = labels, self.nearest(T)
+        return Matched(T, last, -float(found.values[0]))
 
     def swapped(self, best: Matched) -> list[float]:
         """Sums of squares, to first order, once two features of a sensor change their places."""
@@ -186,16 +184,30 @@ class Matching:
         return squares
 
 
+@dataclass(frozen=True)
+class LabelledPlaces:
+    """Minus the sum of squares between features and the places that are taken for theirs."""
+
+    matching: Matching
+    labels: Labels
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        pairs = [self.matching.offsets(T, self.labels) for T in poses]
+        models = [(-float(rest @ rest), 2 * rest @ J, 2 * J.T @ J) for rest, J in pairs]
+        return Quadratic(*map(np.array, zip(*models, strict=True)))
+
+
 def fit_freed(
     densities: Sequence[SensorDensity],
     points: Floats,
-    starts: Sequence[Floats],
+    starts: Floats,
     free: NDArray[np.bool_],
 ) -> Floats | None:
     """Fit the pose to freed features by least squares; None where no place is surely whose.
 
     The features (n, 3), all of one weight, are seen by all sensors; correspondences are sought from
-    poses (4, 4), which may change in free directions (6,).
+    starts (H, 4, 4), which may change in free directions (6,).
     """
     coordinates = sum(sensor.geometry.dimension for sensor in densities)
     redundant = coordinates * len(points) - int(free.sum())

@@ -22,7 +22,7 @@ from mixpose.constants import constant
 from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
 from mixpose.fit.misfit import MisfitRules
 from mixpose.fit.options import EstimatorOptions, free_mask
-from mixpose.fit.prior import NormalPrior, believed, has_likelihood
+from mixpose.fit.prior import believed, has_likelihood
 from mixpose.matching import (
     AssociationRules,
     ErrorRules,
@@ -34,13 +34,14 @@ from mixpose.matching import (
 )
 from mixpose.objective import (
     MatchedObjective,
-    Together,
+    NormalPrior,
     View,
     build_objective,
     matched_objective,
+    together,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
-from mixpose.optimise import Ascent, NewtonOptions, ascend, ascend_together
+from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
@@ -93,24 +94,26 @@ class Fit:
     blurs: tuple[Mapping[str, float], ...] = ()  # by view, of each objective that was climbed
 
     @classmethod
-    def of(cls, ascent: Ascent[Floats], views: Sequence[View], levels: Sequence[Blurs]) -> Fit:
+    def of(cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Blurs]) -> Fit:
         """Where an ascent through blurs of the views ended."""
         blurs = tuple(dict(zip([view.name for view in views], one)) for one in levels)
-        return cls(ascent.state, ascent.value, ascent.converged, ascent.iterations, blurs=blurs)
+        value, converged, iterations = ascent.values[0], ascent.converged[0], ascent.iterations[0]
+        end = ascent.states[0], float(value), bool(converged), int(iterations)
+        return cls(*end, blurs=blurs)
 
 
 @dataclass(frozen=True)
 class Climbed:
     """A fit, and the ascent at σ_ε that it went on from."""
 
-    ascent: Ascent[Floats]
+    ascent: Ascent
     fit: Fit
 
-    def begins_at(self, other: Ascent[Floats], rules: FitRules) -> bool:
+    def begins_at(self, other: Ascent, rules: FitRules) -> bool:
         """Whether another ascent ended at the same place, so that it leads to the same fit."""
-        assert other.last is not None
-        away = twist_between(self.ascent.state, other.state)
-        return float(away @ other.last.curvature @ away) < rules.same * abs(other.value)
+        away = twist_between(self.ascent.states[0], other.states[0])
+        value = abs(float(other.values[0]))
+        return float(away @ other.last.curvature[0] @ away) < rules.same * value
 
 
 def fit_near(
@@ -122,7 +125,7 @@ def fit_near(
     samples: Floats,
     *,
     finest: MatchedObjective | None = None,
-    begun: Ascent[Floats] | None = None,
+    begun: Ascent | None = None,
     climbed: list[Climbed] | None = None,
     blur: float = 1.0,
     noise: Floats | None = None,
@@ -174,7 +177,7 @@ def fit_near(
     if has_likelihood(views):
         ascent = descend(finest, FINE)
         prior = NormalPrior(T_start, uncertainty, free)
-        T, is_freed = believed(finest, ascent.state, prior, rules.misfit)
+        T, is_freed = believed(finest, ascent.states[0], prior, rules.misfit)
         return replace(Fit.of(ascent, views, [*levels, sigmas]), T_world_object=T, freed=is_freed)
     ascent = begun or _at_once(first, T_start, free, blur, rules) or descend(first, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
@@ -194,7 +197,7 @@ def fit_together(
     starts: Sequence[Floats],
     free: NDArray[np.bool_],
     rules: FitRules = FitRules(),
-) -> list[Ascent[Floats] | None]:
+) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
 
     Parameters
@@ -207,15 +210,23 @@ def fit_together(
 
     Returns
     -------
-    list of Ascent or None
-        None for a body that has to descend through the blurs.
+    list of (MatchedObjective, Ascent) or None
+        With what is seen where the ascent ends; None for a body that has to descend through the
+        blurs.
     """
-    together = Together.of(objectives)
-    here = together.models(starts)
-    found = ascend_together(together.models, perturb, starts, free, SHARP, here)
-    together.match([one.state for one in found])
-    least = rules.near * len(objectives[0].views)
-    return [one if at.value >= least else None for one, at in zip(found, here, strict=True)]
+    joint, states = together(objectives), np.array(starts)
+    here = joint.linearise(states)
+    options = replace(SHARP, together=True)
+    ends = ascend(joint, states, perturb, free, options, here)
+    found: list[tuple[MatchedObjective, Ascent] | None] = []
+    for k, seen in enumerate(joint.seen(objectives, ends.states)):
+        own = ends.of(slice(k, k + 1))
+        assert seen.at_hand is not None
+        last = own.last._replace(source=seen.at_hand[1])
+        own = own._replace(last=last, steps=np.zeros((1, 6)))
+        is_near = here.value[k] >= rules.near * len(seen.views)
+        found.append((seen, own) if is_near else None)
+    return found
 
 
 def _at_once(
@@ -224,12 +235,12 @@ def _at_once(
     free: NDArray[np.bool_],
     blur: float,
     rules: FitRules,
-) -> Ascent[Floats] | None:
+) -> Ascent | None:
     """The ascent from a start where most features are near a detection, or said to be."""
-    here = objective.linearise(T_start)
-    if blur == 1 and here.value < rules.near * len(objective.views):
+    here = objective.linearise(T_start[None])
+    if blur == 1 and here.value[0] < rules.near * len(objective.views):
         return None
-    return ascend(objective.linearise, perturb, T_start, free, SHARP, here)
+    return ascend(objective, T_start[None], perturb, free, SHARP, here)
 
 
 def _through_blurs(
@@ -243,22 +254,21 @@ def _through_blurs(
     levels: list[Blurs],
     finest: MatchedObjective | None,
     last: NewtonOptions,
-) -> Ascent[Floats]:
+) -> Ascent:
     """The ascent at one blur after the other, with options of the last one."""
     free = free_mask(options)
     spread = np.where(free, uncertainty, 0.0)
     *wider, narrowest = blur_schedule(views, body, T_start, spread, rules.schedule)
     build = partial(build_objective, options.objective, views, body, samples)
-    T = T_start
+    states = T_start[None]
     levels += wider
     for sigmas in wider:
-        T = ascend(build(sigmas, T).linearise, perturb, T, free, COARSE).state
-    objective = finest or build(narrowest, T)
-    return ascend(objective.linearise, perturb, T, free, last)
+        states = ascend(build(sigmas, states[0]), states, perturb, free, COARSE).states
+    return ascend(finest or build(narrowest, states[0]), states, perturb, free, last)
 
 
 def _to_the_noise(
-    ascent: Ascent[Floats],
+    ascent: Ascent,
     finest: MatchedObjective,
     free: NDArray[np.bool_],
     known: Floats,
@@ -274,7 +284,7 @@ def _to_the_noise(
     blurs, count = np.full(len(sigmas), blur), int(free.sum())
     likeliest, best = -np.inf, None
     while True:
-        matches = associate(finest, ascent.state, association, errors.narrowest)
+        matches = associate(finest, ascent.states[0], association, errors.narrowest)
         fit, wide = replace(Fit.of(ascent, finest.views, levels), matches=matches), matches
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
@@ -303,7 +313,7 @@ def _to_the_noise(
         blurs = narrower
         levels.append((blurs * sigmas).tolist())
         objective = _narrowed(finest, matches, levels[-1], errors.reach)
-        ascent = ascend(objective.linearise, perturb, ascent.state, free, SHARP)
+        ascent = ascend(objective, ascent.states, perturb, free, SHARP)
 
 
 def _narrowed(
@@ -319,6 +329,7 @@ def _narrowed(
 
 def _moved(matches: Matches, free: NDArray[np.bool_], narrower: Floats, variances: Floats) -> float:
     """About how far narrower blurs (L,) move the pose, in squared standard deviations.
+
 
     By iterated least squares, at the end of an ascent at wider ones.
     """

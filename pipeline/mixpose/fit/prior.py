@@ -17,52 +17,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from mixpose.constants import constant
 from mixpose.fit.misfit import MisfitRules, SensorDensity, fit_freed, misfit
 from mixpose.objective import (
     AmplitudesObjective,
     MatchedObjective,
-    Quadratic,
+    NormalPrior,
     View,
     matched_objective,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
-from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.optimise import NewtonOptions, Sum, Term, ascend
 from mixpose.records import Floats
-from mixpose.rigid import perturb, transform, twist_between
-
-_NATS = 1e-6  # gains of log-likelihood that do not matter: 0.001 standard deviations
-_DRAWN = 1e-6  # of the energy: a part in a thousand of heights, which drawing may be off by
-_ROUNDS = 3  # of noise and pose by turns: the noise holds to a part in a hundred
-_ROUGH = 1e-2  # the same where it is asked which of several maxima is the highest
-_VALUE_ERROR = value_error(FINE_STEPS)
+from mixpose.rigid import perturb, transform
 
 
 @dataclass(frozen=True)
-class NormalPrior:
-    """A normal distribution of the pose."""
+class ProbableRules:
+    """How closely the most probable pose is sought."""
 
-    T_world_object: Floats  # (4, 4) its mean
-    uncertainty: Floats  # (6,) standard deviations, lengths and radians; positive where free
-    free: NDArray[np.bool_]  # (6,) directions in which the pose may change
+    nats: float = constant(
+        1e-6,
+        "gains of log-likelihood that do not matter: 0.001 standard deviations; and shares "
+        "of the energy: a part in a thousand of heights, which drawing may be off by",
+    )
+    rough: float = constant(1e-2, "nats where it is asked which of several maxima is highest")
+    rounds: int = constant(3, "of noise and pose by turns: the noise holds to a part in a hundred")
 
-    def joined(self, likelihood: Quadratic, T_world_object: Floats) -> Quadratic:
-        """A log-likelihood at a pose (4, 4), with the logarithm of the prior."""
-        information = np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)
-        away = twist_between(self.T_world_object, T_world_object)
-        value, gradient, C, H, _ = likelihood
-        return Quadratic(
-            value - 0.5 * float(away @ (information * away)),
-            gradient - information * away,
-            C + np.diag(information),
-            None if H is None else H + np.diag(information),
-        )
 
-    def points(self) -> list[Floats]:
-        """The mean, and √k standard deviations to either side along each of k directions."""
-        count = int(self.free.sum())
-        steps = np.sqrt(count) * np.diag(np.where(self.free, self.uncertainty, 0.0))[self.free]
-        around = [perturb(self.T_world_object, s * step) for step in steps for s in (1, -1)]
-        return [self.T_world_object, *around]
+_RULES = ProbableRules()
 
 
 @dataclass(frozen=True)
@@ -120,11 +103,12 @@ def most_probable(
     T = T_world_object
     likelihood = likelihood_at(objective, T, misfit)
     if not likelihood.is_alone:
-        T = _highest(likelihood, prior, [T, *prior.points()], _ROUGH)
+        starts = np.concatenate([T[None], prior.points()])
+        T = _climbed(likelihood.objective, prior, starts, _RULES.rough)
         likelihood = likelihood_at(objective, T, misfit)
-    T = _highest(likelihood, prior, [T], _NATS)
+    T = _climbed(likelihood.objective, prior, T[None], _RULES.nats)
     # once more with the noise that the maximum leaves
-    return _highest(likelihood_at(objective, T, misfit), prior, [T], _NATS)
+    return _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], _RULES.nats)
 
 
 def believed(
@@ -150,7 +134,7 @@ def believed(
     sigmas = [view.observation.sigma for view in objective.views]
     # to look for peaks everywhere
     rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
-    starts = [T, *prior.points()]
+    starts = np.concatenate([T[None], prior.points()])
     T_freed = fit_freed(_densities(rough, noises), points, starts, prior.free)
     if T_freed is not None:
         return T_freed, True
@@ -187,11 +171,11 @@ def with_amplitudes(
     """
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
     noise, cells = equal, _cells(objective)
-    smallest = _DRAWN * objective.energies[:, 0] / cells
-    for _ in range(_ROUNDS):
+    smallest = _RULES.nats * objective.energies[:, 0] / cells
+    for _ in range(_RULES.rounds):
         unlike = AmplitudesObjective(objective, noise, rules.unlike)
         noise = np.maximum(unlike.unexplained(T) / cells, smallest)
-        T = _climbed(replace(unlike, noise=misfit * noise), prior, T, _NATS).state
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], _RULES.nats)
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
@@ -200,22 +184,8 @@ def with_amplitudes(
     return T, noise
 
 
-def _highest(
-    likelihood: Likelihood, prior: NormalPrior, starts: Sequence[Floats], nats: float
-) -> Floats:
-    """The highest of the maxima (4, 4) reached from starts (4, 4), but for some nats."""
-    ends = [_climbed(likelihood.objective, prior, T, nats) for T in starts]
-    return max(ends, key=lambda end: end.value).state
-
-
-def _climbed(
-    likelihood: MatchedObjective | AmplitudesObjective, prior: NormalPrior, T: Floats, nats: float
-) -> Ascent[Floats]:
-    """The maximum of likelihood and prior near a pose (4, 4), but for some nats."""
-
-    def posterior(T: Floats) -> Quadratic:
-        return prior.joined(likelihood.linearise(T), T)
-
-    scale = max(abs(posterior(T).value), 1.0)
-    options = NewtonOptions(60, max(1e-11, nats / scale), value_error=_VALUE_ERROR)
-    return ascend(posterior, perturb, T, prior.free, options)
+def _climbed(likelihood: Term, prior: NormalPrior, starts: Floats, nats: float) -> Floats:
+    """The highest maximum (4, 4) of likelihood and prior near starts (H, 4, 4), to some nats."""
+    options = NewtonOptions(60, 1e-11, value_error=value_error(FINE_STEPS), negligible=nats)
+    ends = ascend(Sum((likelihood, prior)), starts, perturb, prior.free, options)
+    return np.asarray(ends.states[int(np.argmax(ends.values))])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.density import MOST_SIGMAS, Observation, peak
+from mixpose.density import DRAWING, Observation, peak
 from mixpose.matching.matches import Matches
 from mixpose.matching.rules import AssociationRules
 from mixpose.objective import Match, MatchedObjective, in_image
@@ -69,7 +69,7 @@ def associate(
     else:
         lower, upper, blind = _box(y, seen)
         hidden = (at.faced[:, 0] & ~seen) @ objective.projection.body.nodes.weights
-    finest = np.maximum(narrowest, (upper - lower).max(axis=1) / (MOST_SIGMAS * sigmas))
+    finest = np.maximum(narrowest, (upper - lower).max(axis=1) / (DRAWING.widest * sigmas))
     finest = np.minimum(finest, 1.0)
     if blind is not None:
         finest[blind] = 1.0

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from mixpose.objective.amplitudes import AmplitudesObjective
-from mixpose.objective.base import Objective, Quadratic, View
+from mixpose.objective.base import Objective, View
 from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
 from mixpose.objective.kernel import Match
 from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
+from mixpose.objective.normal_prior import NormalPrior
 from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
 from mixpose.objective.projection import (
     BodyProjection,
@@ -15,22 +16,22 @@ from mixpose.objective.projection import (
     pose_jacobian,
     project_body,
 )
-from mixpose.objective.together import Together, can_be_together
+from mixpose.objective.together import BodiesObjective, can_be_together, together
 
 __all__ = [
     "OBJECTIVES",
     "AmplitudesObjective",
+    "BodiesObjective",
     "BodyProjection",
     "IndependentObjective",
     "Match",
     "MatchedObjective",
+    "NormalPrior",
     "Objective",
     "ObjectiveName",
     "PaperObjective",
     "Projected",
-    "Quadratic",
     "SharedDensities",
-    "Together",
     "View",
     "build_objective",
     "can_be_together",
@@ -39,4 +40,5 @@ __all__ = [
     "pose_jacobian",
     "project_body",
     "sampled_terms",
+    "together",
 ]

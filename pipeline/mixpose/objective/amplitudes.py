@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.objective.base import Quadratic
 from mixpose.objective.matched import MatchedObjective
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
 
@@ -44,7 +44,11 @@ class AmplitudesObjective:
     noise: Floats  # (L,) variance of a cell's noise times the size of a cell
     spread: float  # s, relative
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        return Quadratic(*map(np.array, zip(*map(self._model, poses), strict=True)))
+
+    def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and curvature at one pose (4, 4)."""
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
         for k, one in enumerate(self._mixtures(T_world_object)):
@@ -64,7 +68,7 @@ class AmplitudesObjective:
             mixed = cross.reshape(n * m, n).T @ J
             solved = np.linalg.solve(one.inner, mixed)
             curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
-        return Quadratic(value, gradient, curvature)
+        return value, gradient, curvature
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""

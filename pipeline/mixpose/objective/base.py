@@ -1,20 +1,18 @@
 """What an objective is, and what it knows of each sensor.
 
-An objective maps poses to numbers to be maximised.  `linearise` gives what an optimiser needs at
-one pose: value, gradient, and a curvature that is positive semidefinite (minus the Hessian,
-without the terms that can make it indefinite).  Order and axes of the six numbers are those of
-`mixpose.rigid`.
+An objective maps poses to numbers to be maximised: a term with values of its own.  Order and axes
+of the six numbers that a pose is moved by are those of `mixpose.rigid`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from mixpose.density import Observation
-from mixpose.objective.kernel import Match
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 from mixpose.sensors import Sensor
 
@@ -34,16 +32,6 @@ class View:
     doubts: tuple[Sensor, ...] = ()
 
 
-class Quadratic(NamedTuple):
-    """Second-order model of an objective at a pose: value + gᵀδ − ½ δᵀCδ."""
-
-    value: float
-    gradient: Floats  # (6,)
-    curvature: Floats  # (6, 6) symmetric, positive semidefinite
-    hessian: Floats | None = None  # minus the second derivative itself; may be indefinite
-    match: Match | None = None  # what a matched objective made it of
-
-
 class Objective(Protocol):
     """A function of the pose, to be maximised."""
 
@@ -52,7 +40,7 @@ class Objective(Protocol):
         ...
 
     def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient and curvature at one pose (4, 4)."""
+        """Second-order models at poses (H, 4, 4)."""
         ...
 
 

@@ -15,11 +15,9 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from mixpose.density import FAR, Window
+from mixpose.density import DRAWING, FAR, Window
 from mixpose.records import Floats, Singles
 from mixpose.sensors import ParallelBeam
-
-_BLOCK = 16384  # cv2.remap takes maps of less than 32767 a side
 
 
 class ParallelMaps:
@@ -35,7 +33,7 @@ class ParallelMaps:
         points: Floats,
         offsets: Floats | None,
     ) -> None:
-        blocks = -(-len(points) // _BLOCK)
+        blocks = -(-len(points) // DRAWING.side)
         # the last block is filled up by repetition
         filled = np.minimum(np.arange(blocks * -(-len(points) // blocks)), len(points) - 1)
         centre = (points.min(axis=0) + points.max(axis=0)) / 2

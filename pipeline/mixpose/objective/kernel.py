@@ -21,23 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density import close_pairs
-from mixpose.density.overlap import ALL_PAIRS
+from mixpose.density import DRAWING, close_pairs
 from mixpose.objective.projection import Projected
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
-_NEGLIGIBLE = -16.0  # exponent below which two features do not overlap: 1e-7
-_FEW = 24  # features up to which all pairs are looked at first
 _NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
-_NO_PAIRS = np.zeros((0, 2), dtype=np.intp)
-
-
-class Slopes(NamedTuple):
-    """Σ_l s_l c_l² / n_l at H poses: value (H,), gradient (H, 6) and curvature (H, 6, 6)."""
-
-    value: Floats
-    gradient: Floats
-    curvature: Floats
 
 
 class Overlaps(NamedTuple):
@@ -72,7 +61,7 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
-    pairs = _NO_PAIRS if _are_apart(y, variances) else _pairs(y, variances)
+    pairs = close_pairs(y[0, 0, :0], 1.0) if _are_apart(y, variances) else _pairs(y, variances)
     if not len(pairs):
         away = np.empty((*norm.shape, 0, 2))
         return Overlaps(np.maximum(norm, _NONE), pairs, away[..., 0], away)
@@ -80,7 +69,7 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
     away = y[:, :, i] - y[:, :, j]
     exponents = np.einsum("lhpm,lhpm->lhp", away, away) * (-0.5 / variances)[..., None]
     products = weights[:, :, i] * weights[:, :, j]
-    overlap = (exponents > _NEGLIGIBLE) & (products > 0)
+    overlap = (exponents > -DRAWING.negligible) & (products > 0)
     near = overlap.any(axis=(0, 1))
     if not near.all():
         pairs, away, overlap = pairs[near], away[:, :, near], overlap[..., near]
@@ -93,18 +82,18 @@ def overlaps(y: Floats, weights: Floats, variances: Floats, tops: Floats) -> Ove
 def _are_apart(y: Floats, variances: Floats) -> bool:
     """Whether no two of few features are near enough to overlap."""
     L, H, n, _ = y.shape
-    if n > _FEW:
+    if n > DRAWING.few:
         return False
     away = y[:, :, :, None] - y[:, :, None]
     away *= away
-    close = away[..., 0] + away[..., 1] < (-2 * _NEGLIGIBLE) * variances[..., None, None]
+    close = away[..., 0] + away[..., 1] < (2 * DRAWING.negligible) * variances[..., None, None]
     return bool(np.count_nonzero(close) <= L * H * n)  # each is close to itself
 
 
 def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     """Pairs of features that may overlap at any of the poses; all of few."""
     n = y.shape[2]
-    if n <= ALL_PAIRS:
+    if n <= DRAWING.few:
         return close_pairs(y[0, 0], 1.0)
     each = [
         close_pairs(y[k, h], float(v)) @ [n, 1]
@@ -114,14 +103,12 @@ def _pairs(y: Floats, variances: Floats) -> NDArray[np.intp]:
     return np.stack(np.divmod(np.unique(np.concatenate(each)), n), axis=1)
 
 
-def slopes(
-    at: Projected, sampled: Floats, over: Overlaps, variances: Floats, tops: Floats, scales: Floats
-) -> Slopes:
-    """Second-order models of the matched objective at H poses.
+def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
+    """Second-order models of Σ_l s_l c_l² / n_l at H poses, and the `Match` they come from.
 
-    `sampled` (L, H, n, 3) is C with its gradient at the predicted features; `variances`, `tops` and
-    `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
+    `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
+    at, sampled, over = match
     L, H, n = at.weights.shape
     J = at.J.reshape(L, H, 2 * n, 6)
     C = sampled[..., 0] * at.weights
@@ -137,13 +124,13 @@ def slopes(
     curvature = curvature.sum(axis=0)
     if len(over.pairs):
         near = np.flatnonzero(over.bells.any(axis=(0, 2)))
-        some, _, own = Match(at, sampled, over).of(near)
+        some, _, own = match.of(near)
         half, gram = _pair_terms(some, own, variances, tops)
         level = (strength * amplitude)[:, near, None]
         gradient[near] -= (level * half).sum(axis=0)
         outer = half[..., :, None] * half[..., None, :] / own.norm[..., None, None]
         curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
-    return Slopes(value, gradient, curvature)
+    return Quadratic(value, gradient, curvature, source=match)
 
 
 def _pair_terms(

@@ -18,12 +18,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.density import DRAWING
 from mixpose.records import Floats, Mask
 from mixpose.sensors import OUTSIDE, Sensor, SensorBatch
-
-CUBATURE = 0.5**0.5  # of the radius: where the four points are
-
-NEAREST = 0.9  # radii by distance from a sensor, the most that a sphere is taken to have
 
 
 class MarkerBatch:
@@ -49,14 +46,14 @@ class MarkerBatch:
         if self._axes is None:
             towards = np.array([sensor.towards(world) for sensor in self._sensors])
             squared = np.einsum("lni,lni->ln", towards, towards)[..., None]
-            share = np.minimum(radii**2 / squared, NEAREST**2)
+            share = np.minimum(radii**2 / squared, DRAWING.nearest**2)
             middle = world + share * towards
             radii = radii * np.sqrt(1 - share)
             axes = across(towards / np.sqrt(squared))
         else:
             turned = self._axes[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
             middle, axes = world, turned.reshape(2, count, 3)
-        steps = CUBATURE * radii * axes
+        steps = np.sqrt(0.5) * radii * axes  # where the four points are
         nodes = np.stack(
             [middle + steps[0], middle - steps[0], middle + steps[1], middle - steps[1]]
         )

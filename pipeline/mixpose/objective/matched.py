@@ -13,26 +13,19 @@ once more by σ: an image, drawn once and looked up with `cv2.remap`.  Nothing i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import Atlas, matched_atlas, peak
-from mixpose.objective.base import Quadratic, View
-from mixpose.objective.kernel import Match, Slopes, overlaps, slopes
+from mixpose.density import DRAWING, Atlas, matched_atlas, peak
+from mixpose.objective.base import View
+from mixpose.objective.kernel import Match, overlaps, slopes
 from mixpose.objective.projection import BodyProjection, project_body
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
-STEPS_PER_SIGMA = 4.0
-"""Cells per standard deviation of C: places are 4e-4 standard deviations off at most, a part of
-what the best centres of blobs err by."""
-
-FINE_STEPS = 48.0
-"""The same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations."""
-
-
-_TOGETHER = 200_000  # features times poses that are held in memory at once
+STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
 def look_up_error(steps_per_sigma: float) -> float:
@@ -61,7 +54,7 @@ class MatchedObjective:
     energies: Floats  # (L, 1) ⟨g, g⟩
     weights: Floats  # (L, 1) ω_l
     # where several bodies were looked up at once: the body's pose, and what it has there
-    at_hand: list[tuple[Floats, Match]] = field(default_factory=list, init=False)
+    at_hand: tuple[Floats, Match] | None = None
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
@@ -87,8 +80,8 @@ class MatchedObjective:
 
     def match(self, poses: Floats) -> Match:
         """What is predicted at poses (H, 4, 4), and what is there."""
-        if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0][0]):
-            return self.at_hand[0][1]
+        if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0]):
+            return self.at_hand[1]
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
         return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
@@ -98,24 +91,20 @@ class MatchedObjective:
         product = (match.sampled[..., 0] * match.at.weights).sum(axis=2)
         return np.asarray(self.weights / self.energies * product**2 / match.over.norm)
 
-    def slopes(self, poses: Floats) -> Slopes:
-        """Second-order models at poses (H, 4, 4)."""
-        parts = [self.slopes_of(self.match(some)) for some in self._blocks(poses)]
-        return Slopes(*map(np.concatenate, zip(*parts)))
-
-    def slopes_of(self, match: Match) -> Slopes:
-        """The same, of what is predicted and found at some poses."""
-        return slopes(*match, self.variances, self.tops, self.weights / self.energies)
-
-    def linearise(self, T_world_object: Floats) -> Quadratic:
-        """Value, gradient and curvature at one pose (4, 4)."""
-        match = self.match(T_world_object[None])
-        value, gradient, curvature = self.slopes_of(match)
-        return Quadratic(float(value[0]), gradient[0], curvature[0], match=match)
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4); of few, with the `Match` they come from."""
+        scales = self.weights / self.energies
+        parts = [
+            slopes(self.match(some), self.variances, self.tops, scales)
+            for some in self._blocks(poses)
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        return Quadratic(*map(np.concatenate, zip(*(part[:3] for part in parts))))
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
-        rows = max(_TOGETHER // (n * min(n, 12)), 1)
+        rows = max(DRAWING.held // (n * min(n, 12)), 1)
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 

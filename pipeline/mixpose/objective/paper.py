@@ -19,18 +19,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mixpose.density import Density
-from mixpose.objective.base import Quadratic, View, region_of_interest
+from mixpose.density import DRAWING, Density
+from mixpose.objective.base import View, region_of_interest
 from mixpose.objective.index_maps import ParallelMaps
 from mixpose.objective.projection import pose_jacobian
+from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam, Sensor
-
-REACH = 4.0
-"""Margin of a window around the predicted samples, in standard deviations of a feature."""
-
-_SAMPLES_AT_ONCE = 2**18  # of all poses of a batch: bounds its memory to a few MB per sensor
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class _SampledObjective:
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
-        self._poses_at_once = max(1, _SAMPLES_AT_ONCE // len(self.points))
+        self._poses_at_once = max(1, DRAWING.held // len(self.points))
         self.offsets: Floats | None = None
         if world_offsets is not None and world_offsets.any():
             self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
@@ -119,7 +115,11 @@ class _SampledObjective:
         sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
         return np.asarray(sums[:, 0] / size)
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
+        return Quadratic(*map(np.array, zip(*map(self._model, poses), strict=True)))
+
+    def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
         points = transform(T_world_object, self.points)
         if self.offsets is not None:
@@ -137,7 +137,7 @@ class _SampledObjective:
             pull = others * g[:, 0] / (count * term.density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
         value = float((factors[0] * looked_up[0][:, 0]).mean())
-        return Quadratic(value, gradient, curvature)
+        return value, gradient, curvature
 
 
 class PaperObjective(_SampledObjective):
@@ -187,7 +187,7 @@ def sampled_terms(
             y, visible = view.sensor.project(transform(near, samples.reshape(-1, 3)))
             if not visible.any():
                 continue
-            box = region_of_interest(view.sensor, y[visible], REACH * sigma)
+            box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
         density = view.observation.density(sigma, box, gradient=True)
         terms.append(SampledTerm(view.sensor, density))
     return terms

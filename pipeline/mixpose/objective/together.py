@@ -13,8 +13,6 @@ from functools import lru_cache
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.objective.base import Quadratic
-from mixpose.objective.kernel import Match
 from mixpose.objective.matched import MatchedObjective
 from mixpose.objective.projection import BodyProjection
 from mixpose.records import Floats
@@ -51,36 +49,33 @@ def can_be_together(body: Body) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Together:
-    """Objectives of K bodies, whose atlas and blurs are the same."""
+class BodiesObjective(MatchedObjective):
+    """Objectives of K bodies, whose atlas and blurs are the same, at a pose of each body's own."""
 
-    each: tuple[MatchedObjective, ...]
-    joint: MatchedObjective
+    bodies: tuple[Body, ...] = ()
 
-    @classmethod
-    def of(cls, each: Sequence[MatchedObjective]) -> Together:
-        """Put objectives side by side."""
-        projection = project_bodies(
-            each[0].projection.sensors, tuple(one.projection.body for one in each)
-        )
-        energies = np.concatenate([one.energies for one in each], axis=1)
-        weights = np.concatenate([one.weights for one in each], axis=1)
-        joint = replace(each[0], projection=projection, energies=energies, weights=weights)
-        return cls(tuple(each), joint)
+    def seen(self, objectives: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
+        """The objectives with what each sees at its own of the poses (K, 4, 4)."""
+        match = self.match(poses)
+        counts = [len(body.nodes.points) for body in self.bodies]
+        parts = [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]
+        pairs = zip(objectives, poses, parts, strict=True)
+        return [replace(objective, at_hand=(T, part)) for objective, T, part in pairs]
 
-    def models(self, poses: Sequence[Floats]) -> list[Quadratic]:
-        """Value, gradient and curvature of each objective at a pose (4, 4) of its own."""
-        match = self.joint.match(np.array(poses))
-        models = zip(*self.joint.slopes_of(match), self._own(match), strict=True)
-        return [Quadratic(float(v), g, C, match=own) for v, g, C, own in models]
+    def _blocks(self, poses: Floats) -> list[Floats]:
+        return [poses]
 
-    def match(self, poses: Sequence[Floats]) -> None:
-        """Let each objective have at hand what it sees at a pose (4, 4) of its own."""
-        found = self._own(self.joint.match(np.array(poses)))
-        for one, T, own in zip(self.each, poses, found, strict=True):
-            one.at_hand[:] = [(T, own)]
 
-    def _own(self, match: Match) -> list[Match]:
-        """What each of the bodies has of what all match."""
-        counts = [len(one.projection.body.nodes.points) for one in self.each]
-        return [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]
+def together(objectives: Sequence[MatchedObjective]) -> BodiesObjective:
+    """Put objectives of different bodies side by side."""
+    first, bodies = objectives[0], tuple(one.projection.body for one in objectives)
+    return BodiesObjective(
+        views=first.views,
+        projection=project_bodies(first.projection.sensors, bodies),
+        atlas=first.atlas,
+        variances=first.variances,
+        tops=first.tops,
+        energies=np.concatenate([one.energies for one in objectives], axis=1),
+        weights=np.concatenate([one.weights for one in objectives], axis=1),
+        bodies=bodies,
+    )

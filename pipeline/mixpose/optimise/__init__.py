@@ -1,7 +1,8 @@
-"""Optimisers: they know a function of a few numbers and never see an image."""
+"""Terms of an objective and their ascent: functions of a few numbers, never an image."""
 
 from __future__ import annotations
 
-from mixpose.optimise.newton import Ascent, NewtonOptions, ascend, ascend_together
+from mixpose.optimise.ascent import Ascent, NewtonOptions, ascend
+from mixpose.optimise.term import Quadratic, Sum, Term
 
-__all__ = ["Ascent", "NewtonOptions", "ascend", "ascend_together"]
+__all__ = ["Ascent", "NewtonOptions", "Quadratic", "Sum", "Term", "ascend"]

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, transform
 from mixpose.search.problem import SearchProblem
@@ -32,10 +35,9 @@ def _centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
     budget, radius = problem.budget, problem.body.radius
     places = _starts(problem)
-    for _ in range(budget.place_steps):
-        steps, _ = _steps(problem, places[:, None], limit=5 * radius)
-        places = places + steps
-    _, off = _steps(problem, places[:, None], limit=0.0)
+    middles = _Middles(problem, np.zeros((len(places), 1, 3)))
+    places = middles.approached(places, budget.place_steps, limit=5 * radius)
+    off = np.sqrt(-2 * middles.linearise(places).value)
     kept: list[int] = []
     for k in np.argsort(off, kind="stable"):
         apart = np.linalg.norm(places[k] - places[kept], axis=1)
@@ -49,9 +51,9 @@ def _placed(problem: SearchProblem, rotations: Floats, centre: Floats) -> Floats
     body, shifts = problem.body, problem.free[:3]
     translations = centre - rotations @ body.means.mean(axis=0)
     translations = np.where(shifts, translations, problem.T_reference[:3, 3])
-    for _ in range(problem.budget.place_steps // 4):
-        points = transform(from_parts(rotations, translations), body.nodes.points)
-        translations = translations + _steps(problem, points, limit=body.radius)[0]
+    middles = _Middles(problem, body.nodes.points @ rotations.swapaxes(1, 2))
+    steps = problem.budget.place_steps // 4
+    translations = middles.approached(translations, steps, limit=body.radius)
     return from_parts(rotations, translations)
 
 
@@ -91,26 +93,37 @@ def _source(sensor: Sensor, length: float) -> Floats:
     return np.asarray(np.linalg.lstsq(across.sum(axis=0), right)[0])
 
 
-def _steps(problem: SearchProblem, points: Floats, limit: float) -> tuple[Floats, Floats]:
-    """Steps (H, 3) that bring means of points (H, n, 3) to where they are seen, and how far off.
+@dataclass(frozen=True, eq=False)
+class _Middles:
+    """Minus half the squared distance of means of points from where sensors see the middle."""
 
-    Both are lengths; no step is longer than `limit`.
-    """
-    A, b = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-    off = np.zeros(len(points))
-    for each in problem.detections:
-        y, by_world, seen = each.view.sensor.linearise(points)
-        share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
-        J = np.einsum("hn,hnmk->hmk", share, by_world)
-        any_seen = np.asarray(seen.any(axis=1))
-        residual = np.where(any_seen[:, None], each.mean - np.einsum("hn,hnm->hm", share, y), 0.0)
-        # per length: the sensor's units are taken off
-        scale = np.maximum((J * J).sum(axis=(1, 2)) / y.shape[2], 1e-30)
-        A += np.einsum("hmk,hml->hkl", J, J) / scale[:, None, None]
-        b += np.einsum("hmk,hm->hk", J, residual) / scale[:, None]
-        off += np.where(any_seen, (residual**2).sum(axis=1) / scale, 1e30)
-    free, steps = problem.free[:3], np.zeros_like(b)
-    inner = A[:, free][:, :, free] + 1e-6 * np.eye(int(free.sum()))
-    steps[:, free] = np.linalg.solve(inner, b[:, free][..., None])[..., 0]
-    length = np.linalg.norm(steps, axis=1, keepdims=True)
-    return steps * np.minimum(1.0, limit / np.maximum(length, 1e-30)), np.sqrt(off)
+    problem: SearchProblem
+    arms: Floats  # (H, n, 3) from the places to points
+
+    def linearise(self, places: Floats) -> Quadratic:
+        """Second-order models at places (H, 3), of lengths: the sensors' units are taken off."""
+        count, points = len(places), self.arms + places[:, None]
+        A, b, off = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count)
+        for each in self.problem.detections:
+            y, by_world, seen = each.view.sensor.linearise(points)
+            share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
+            J = np.einsum("hn,hnmk->hmk", share, by_world)
+            any_seen = np.asarray(seen.any(axis=1))
+            residual = each.mean - np.einsum("hn,hnm->hm", share, y)
+            residual = np.where(any_seen[:, None], residual, 0.0)
+            scale = np.maximum((J * J).sum(axis=(1, 2)) / y.shape[2], 1e-30)
+            A += np.einsum("hmk,hml->hkl", J, J) / scale[:, None, None]
+            b += np.einsum("hmk,hm->hk", J, residual) / scale[:, None]
+            off += np.where(any_seen, (residual**2).sum(axis=1) / scale, 1e30)
+        return Quadratic(np.asarray(-0.5 * off), b, A)
+
+    def approached(self, places: Floats, count: int, limit: float) -> Floats:
+        """Places (H, 3) after so many steps, none longer than a limit."""
+
+        def moved(places: Floats, steps: Floats) -> Floats:
+            length = np.linalg.norm(steps, axis=1, keepdims=True)
+            shares = np.minimum(1.0, limit / np.maximum(length, 1e-30))
+            return np.asarray(places + steps * shares)
+
+        options = NewtonOptions(count, damping=1e-6, unchecked=True)
+        return np.asarray(ascend(self, places, moved, self.problem.free[:3], options).states)

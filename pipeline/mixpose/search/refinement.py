@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import MatchedObjective, View, matched_objective
+from mixpose.optimise import NewtonOptions, ascend
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search.budget import SearchBudget
@@ -56,8 +57,9 @@ class Descent:
         """
         for stage in stages if len(poses) else ():
             objective = self.objective(stage.factors)
-            for _ in range(stage.steps):
-                poses = self._stepped(objective, poses)
+            if stage.steps:
+                options = NewtonOptions(stage.steps, damping=self.budget.damping, unchecked=True)
+                poses = ascend(objective, poses, self._moved, self.free, options).states
             if len(poses) > stage.survivors:
                 # of shares k/n, not of their squares: what counts is how many features are met
                 values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
@@ -65,22 +67,12 @@ class Descent:
             poses = poses[unlike(self.body, poses, self.budget.alike / 5)[: stage.survivors]]
         return poses
 
-    def _stepped(self, objective: MatchedObjective, poses: Floats) -> Floats:
-        """One damped Newton step of every pose."""
-        model, free, most = objective.slopes(poses), self.free, self.budget.max_turn
-        A = model.curvature[:, free][:, :, free]
-        diagonal = np.einsum("hkk->hk", A)
-        largest = diagonal.max(axis=1, keepdims=True)
-        scale = 1 / np.sqrt(np.maximum(diagonal, 1e-12 * largest + np.finfo(np.float64).tiny))
-        A = A * scale[:, :, None] * scale[:, None, :] + self.budget.damping * np.eye(A.shape[1])
-        b = scale * model.gradient[:, free]
-        twists = np.zeros((len(poses), 6))
-        twists[:, free] = scale * np.linalg.solve(A, b[..., None])[..., 0]
-        twists[largest[:, 0] <= 0] = 0.0
+    def _moved(self, poses: Floats, twists: Floats) -> Floats:
+        """Poses (H, 4, 4) moved by twists (H, 6), not farther than the linear model holds."""
+        most = self.budget.max_turn
         shift, turn = (np.linalg.norm(each, axis=1) for each in (twists[:, :3], twists[:, 3:]))
         longest = np.maximum(turn, most / 2 * (shift / max(self.body.radius, 1e-12)))
-        twists *= np.minimum(1.0, most / np.maximum(longest, 1e-12))[:, None]
-        return perturb(poses, twists)
+        return perturb(poses, twists * np.minimum(1.0, most / np.maximum(longest, 1e-12))[:, None])
 
 
 def unlike(body: Body, poses: Floats, cell: float) -> NDArray[np.intp]:

@@ -212,7 +212,7 @@ class MatchedLikelihood:
         """Whether each feature's detection is known, so that one may be left out."""
         return self.data.options.objective == "matched"
 
-    def fit(self, start: Start, begun: Ascent[Floats] | None = None) -> Fit:
+    def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
         if start.uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)

@@ -34,8 +34,10 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
         first.rules.fit,
     )
     fits, cases = {}, []
-    for k, ascent in zip(some, ascents, strict=True):
-        if ascent is not None:
+    for k, end in zip(some, ascents, strict=True):
+        if end is not None:
+            objective, ascent = end
+            begun[k] = replace(begun[k], begun=Begun(objective))
             data, expected = begun[k], begun[k].predictions[0]
             start = Start(expected.T_world_object, expected.uncertainty, expected)
             fits[k] = MatchedLikelihood(data).fit(start, ascent)
