@@ -15,7 +15,6 @@ from mixpose.body.look_alikes import (
 )
 from mixpose.body.model import Body, Gravity, Nodes, Shape
 from mixpose.body.sampling import Sampler, uniforms
-from mixpose.body.shared_parts import SharedPart, shared_parts
 from mixpose.body.symmetry import symmetries
 
 __all__ = [
@@ -29,13 +28,11 @@ __all__ = [
     "Sampler",
     "SegmentFeature",
     "Shape",
-    "SharedPart",
     "Spread",
     "congruent_parts",
     "like_features",
     "mirror_image",
     "other_tilt",
-    "shared_parts",
     "symmetries",
     "thickness",
     "tolerance_of",
