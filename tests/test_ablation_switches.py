@@ -38,6 +38,10 @@ def test_a_row_switches_off_the_kind_of_look_alike_that_it_names(
     ranked = [likelihood.judge(likelihood.fit(start), start)]
     starts = list(look_alikes(data, ranked))
     # the other tilt begins with as much doubt as a prediction has
-    wide = [one for one in starts if np.any(one.uncertainty > data.close)]
+    wide = [
+        one
+        for one in starts
+        if one.uncertainty is not None and (one.uncertainty > data.close).any()
+    ]
     assert (len(wide), len(starts) - len(wide)) == (tilts, turns)
     assert ("mirrored" in tracker.rules.look_alikes.kinds) == (name != "no mirror image")
