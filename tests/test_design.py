@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, PointFeature, congruent_parts
 from mixpose.design import (
     Plan,
     best_marker_move,
     best_new_sensor,
     confirm,
-    congruent_subsets,
     noise_to_equal,
     plan_of,
     predict,
@@ -304,12 +303,12 @@ def test_markers_that_lie_like_those_of_another_body_are_named() -> None:
     R, t = rotation_matrix([0.4, 1.1, -0.3]), np.array([100.0, 5, -30])
     second = np.concatenate([rng.uniform(-80, 80, (2, 3)), first[shared] @ R.T + t])
     second += rng.uniform(-0.5, 0.5, second.shape)
-    alike = congruent_subsets(body_of(first), body_of(second), 2.0)
-    assert alike is not None
-    assert sorted(alike.markers) == sorted((i, 2 + k) for k, i in enumerate(shared))
-    assert alike.misfit < 1.0
-    mirrored = congruent_subsets(body_of(first), body_of(second * [1, 1, -1]), 2.0)
-    assert mirrored is None or len(mirrored.markers) == 3  # three are their own mirror image
+    alike = congruent_parts(body_of(first), body_of(second), 2.0)[0]
+    pairs = zip(alike.features, alike.partners, strict=True)
+    assert sorted(pairs) == sorted((i, 2 + k) for k, i in enumerate(shared))
+    assert alike.off < 1.0
+    mirrored = congruent_parts(body_of(first), body_of(second * [1, 1, -1]), 2.0)
+    assert all(len(part.features) == 3 for part in mirrored)  # three are their own mirror image
 
 
 def test_bodies_of_a_recording_that_are_taken_for_each_other_are_told(recordings: Path) -> None:
@@ -319,14 +318,12 @@ def test_bodies_of_a_recording_that_are_taken_for_each_other_are_told(recordings
         for name in ("ForearmL", "ArmL")
     )
     tolerance = SHARE_OF_RADIUS * min(forearm.radius, arm.radius)
-    alike = congruent_subsets(forearm, arm, tolerance)
-    assert alike is not None
-    assert len(alike.markers) == 3
-    assert congruent_subsets(forearm, arm, tolerance / 2) is None
+    assert len(congruent_parts(forearm, arm, tolerance)[0].features) == 3
+    assert not congruent_parts(forearm, arm, tolerance / 2)
 
 
 def test_markers_on_a_line_do_not_count_as_alike() -> None:
     line = np.array([[0, 0, 0], [10, 0, 0], [30, 0, 0.0]])
     one = np.concatenate([line, [[0, 50, 0]]])
     other = np.concatenate([line, [[0, 0, 90]]])
-    assert congruent_subsets(body_of(one), body_of(other), 1.0) is None
+    assert not congruent_parts(body_of(one), body_of(other), 1.0)

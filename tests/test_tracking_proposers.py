@@ -26,8 +26,8 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
+from mixpose.tracking.proposers.look_alikes import look_alikes
 from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.narrowed import narrowed
 
 Floats = NDArray[np.float64]
@@ -148,7 +148,7 @@ def test_a_flat_body_followed_at_the_wrong_tilt_is_turned_over(seed: int) -> Non
     tracker = Tracker.create(PLATE, EstimatorOptions(), T_wrong)
     assert is_right(first_frame(tracker, views), T)
     # the wrong tilt meets all features, within a pixel or two: nothing else is asked
-    estimate = first_frame(without(tracker, "mirrored"), views)
+    estimate = first_frame(without(tracker, "look_alikes"), views)
     assert estimate.T_world_object is not None
     assert rotation_angle_deg(estimate.T_world_object, T) > 40
 
@@ -167,7 +167,7 @@ def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body()
         data = tracker.data(tracker.begin(), 0, None, views)
         start = Start(T)
         likelihood = likelihood_of(data)
-        return list(mirrored(data, [likelihood.judge(likelihood.fit(start), start)]))
+        return list(look_alikes(data, [likelihood.judge(likelihood.fit(start), start)]))
 
     (tilt,) = tilts([both[0], clutter])
     (alone,) = tilts(both[:1])

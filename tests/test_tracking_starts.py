@@ -31,12 +31,12 @@ from mixpose.rigid import (
 )
 from mixpose.search import SearchBudget, SearchReport, SearchResult, SearchState
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Rules, Track, Tracker
+from mixpose.tracking import ASIDE, Rules, Track, Tracker
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
+from mixpose.tracking.proposers.look_alikes import look_alikes
 from mixpose.tracking.proposers.multistart import multistart, starts_around
 from mixpose.tracking.proposers.predicted import is_doubtful, predicted
 from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.stepped_aside import ASIDE, stepped_aside
 from mixpose.tracking.proposers.without_sensor import disagreeing
 from mixpose.tracking.track import Branch, SensorTally
 
@@ -89,10 +89,10 @@ def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
     tracker = Tracker.create(board, EstimatorOptions(), TRUTH)
     data = data_of(tracker, detect(pinhole_cameras, board, TRUTH))
     slipped = judged_here(data, shifted(TRUTH, np.array([20.0, 0.0, 0.0])))
-    starts = [start.T_world_object for start in stepped_aside(data, [slipped])]
+    starts = [start.T_world_object for start in look_alikes(data, [slipped])]
     assert min(np.abs(T - TRUTH).max() for T in starts) < 1e-9
     # 30 of 35 at the most are met a step aside of the truth
-    assert not list(stepped_aside(data, [judged_here(data, TRUTH)]))
+    assert not list(look_alikes(data, [judged_here(data, TRUTH)]))
 
 
 def test_a_board_with_a_row_more_than_there_is_stays_ambiguous_however_it_moves(

@@ -10,11 +10,9 @@ from mixpose.judgement import DetectionModel
 from mixpose.tracking import Rules, Tracker
 from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.narrowed import narrowed
 from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 FREE = 0.0
@@ -89,11 +87,12 @@ def unfused(tracker: Tracker) -> Tracker:
 
 
 SWITCHES = (
-    Switch("no stepped_aside", without_proposer(stepped_aside)),
     Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
     Switch("static clutter searched alike", ruled("static", frames=NEVER_STATIC)),
-    Switch("no mirrored", without_proposer(mirrored)),
+    Switch("no congruent features", ruled("look_alikes", kinds=("tilted", "mirrored"))),
+    Switch("no other tilt", ruled("look_alikes", kinds=("congruent", "mirrored"))),
+    Switch("no mirror image", ruled("look_alikes", kinds=("congruent", "tilted"))),
     Switch("no merged_pair", without_refinement(merged_pair)),
     Switch("no narrowed", without_refinement(narrowed)),
     Switch("no without_sensor", without_refinement(without_sensor)),

@@ -8,8 +8,8 @@ _BODY = (
     Mutant(
         "body-symmetric-on-average",
         "body/symmetry.py",
-        "distance.max() <= tolerance",
-        "distance.mean() <= tolerance",
+        "if one_to_one and distance.max() <= tolerance",
+        "if one_to_one and distance.mean() <= tolerance",
         "a marker moved on purpose to break a symmetry is overlooked",
     ),
     Mutant(
@@ -22,8 +22,8 @@ _BODY = (
     Mutant(
         "body-one-normal-is-enough",
         "body/symmetry.py",
-        "sum(axis=1).min() > _SAME_NORMAL",
-        "sum(axis=1).max() > _SAME_NORMAL",
+        "sum(axis=1).min() > SAME_NORMAL",
+        "sum(axis=1).max() > SAME_NORMAL",
         "a symmetry holds though most normals are turned",
     ),
     Mutant(

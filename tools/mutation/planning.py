@@ -120,8 +120,8 @@ _DESIGN = (
     ),
     Mutant(
         "design-mirror-images-are-alike",
-        "design/congruence.py",
-        "R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt",
+        "body/symmetry.py",
+        "R = (U * proper[:, None]) @ Vt",
         "R = U @ Vt",
         "bodies that are each other's mirror image are called alike",
     ),

@@ -15,12 +15,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from mixpose.rigid import from_parts, transform
 
 Floats: TypeAlias = NDArray[np.float64]
 
-_SAME_NORMAL = 0.99  # cosine
+SAME_NORMAL = 0.99  # cosine
+_SAME_TURN = np.radians(1.0)
 _NEIGHBOURS = 24  # of a point, among which the steps of a grid are found
 
 
@@ -47,27 +49,42 @@ def symmetries(points: Floats, tolerance: float) -> Floats:
     centred = points - centre
     if np.linalg.svd(centred, compute_uv=False)[1] <= tolerance:
         return from_parts(*_line_symmetries(centred, centre, tolerance))
-    base = _widest_triple(centred)
+    base = centred[list(widest_triple(centred))]
     tree = cKDTree(centred)
     found = [np.eye(3)]
-    for image in _congruent_triples(centred, base, tolerance):
-        R = _aligning_rotation(centred[list(base)], centred[list(image)])
-        _, mapped = tree.query(centred @ R.T)
+    for turn in motions(base, centred[congruent_triples(base, centred, 2 * tolerance)])[:, :3, :3]:
+        _, mapped = tree.query(centred @ turn.T)
+        R = turn
         if len(set(mapped.tolist())) == len(points):
-            R = _aligning_rotation(centred, centred[mapped])
+            R = motions(centred, centred[mapped][None])[0, :3, :3]
         distance, index = tree.query(centred @ R.T)
         one_to_one = len(set(index.tolist())) == len(points)
         if one_to_one and distance.max() <= tolerance and not _known(R, found):
             found.append(R)
-    rotations = np.array(found)
+    rotations = _closed(np.array(found), centred, tree, 2 * tolerance)
     return from_parts(rotations, centre - rotations @ centre)
+
+
+def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float) -> Floats:
+    """Rotations (G, 3, 3) and their products, which map the body onto itself, too.
+
+    A product errs by as much as both together, so that some are not found by themselves.
+    """
+    for R in (rotations[:, None] @ rotations[None]).reshape(-1, 3, 3):
+        # of the same turn the trace of the difference is 3
+        if np.einsum("ij,kij->k", R, rotations).max() > 1 + 2 * np.cos(_SAME_TURN):
+            continue
+        distance, index = tree.query(centred @ R.T)
+        if len(set(index.tolist())) == len(centred) and distance.max() <= tolerance:
+            rotations = np.concatenate([rotations, R[None]])
+    return rotations
 
 
 def keeps_normals(T: Floats, points: Floats, normals: Floats) -> bool:
     """Whether a symmetry of points (N, 3) maps their normals (N, 3) onto each other, within 8°."""
     _, image = cKDTree(points).query(transform(T, points))
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > _SAME_NORMAL)
+    return bool(((normals @ T[:3, :3].T) * normals[image]).sum(axis=1).min() > SAME_NORMAL)
 
 
 def grid_steps(points: Floats, tolerance: float, share: float) -> Floats:
@@ -108,44 +125,39 @@ def _line_symmetries(centred: Floats, centre: Floats, tolerance: float) -> tuple
     return rotations, np.asarray(centre - rotations @ centre)
 
 
-def _widest_triple(centred: Floats) -> tuple[int, int, int]:
-    """Three features that span the largest triangle with the first of them farthest out."""
-    first = int(np.linalg.norm(centred, axis=1).argmax())
-    second = int(np.linalg.norm(centred - centred[first], axis=1).argmax())
-    edge = centred[second] - centred[first]
-    area = np.linalg.norm(np.cross(centred - centred[first], edge), axis=1)
+def widest_triple(points: Floats) -> tuple[int, int, int]:
+    """Three of points (N, 3) that span a large triangle, the first farthest from the middle."""
+    first = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
+    second = int(np.linalg.norm(points - points[first], axis=1).argmax())
+    edge = points[second] - points[first]
+    area = np.linalg.norm(np.cross(points - points[first], edge), axis=1)
     area[[first, second]] = -1.0
     return first, second, int(area.argmax())
 
 
-def _congruent_triples(
-    centred: Floats, base: tuple[int, int, int], tolerance: float
-) -> list[tuple[int, int, int]]:
-    """Ordered triples with the side lengths and radii of the base triple."""
-    radius = np.linalg.norm(centred, axis=1)
-    distance = np.linalg.norm(centred[:, None] - centred[None], axis=-1)
-    a, b, c = base
-    slack = 2 * tolerance
-    alike = [np.flatnonzero(np.abs(radius - radius[i]) <= slack).tolist() for i in base]
-    triples = []
-    for i in alike[0]:
-        for j in alike[1]:
-            if i == j or abs(distance[i, j] - distance[a, b]) > slack:
-                continue
-            for k in alike[2]:
-                if k in (i, j) or abs(distance[i, k] - distance[a, c]) > slack:
-                    continue
-                if abs(distance[j, k] - distance[b, c]) <= slack:
-                    triples.append((i, j, k))
-    return triples
+def congruent_triples(base: Floats, points: Floats, slack: float) -> NDArray[np.intp]:
+    """Ordered triples (K, 3) of points (N, 3) with the sides of a base triple (3, 3)."""
+    sides = np.linalg.norm(base[[1, 2, 2]] - base[[0, 0, 1]], axis=1)
+    apart = cdist(points, points)
+    np.fill_diagonal(apart, np.inf)
+    i, j = np.nonzero(np.abs(apart - sides[0]) <= slack)
+    fits = (np.abs(apart[i] - sides[1]) <= slack) & (np.abs(apart[j] - sides[2]) <= slack)
+    pair, k = np.nonzero(fits)
+    return np.column_stack([i[pair], j[pair], k])
 
 
-def _aligning_rotation(source: Floats, target: Floats) -> Floats:
-    """Least-squares rotation (3, 3) from vectors (n, 3) to vectors (n, 3)."""
-    U, _, Vt = np.linalg.svd(target.T @ source)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+def motions(source: Floats, targets: Floats) -> Floats:
+    """Least-squares motions (K, 4, 4) of points (n, 3) onto points (K, n, 3), without mirrors.
+
+    Kabsch, Acta Cryst. A32 (1976) 922.
+    """
+    a, b = source.mean(axis=0), targets.mean(axis=1)
+    U, _, Vt = np.linalg.svd(np.swapaxes(targets - b[:, None], 1, 2) @ (source - a))
+    proper = np.ones((len(targets), 3))
+    proper[:, 2] = np.linalg.det(U @ Vt)
+    R = (U * proper[:, None]) @ Vt
+    return from_parts(R, b - R @ a)
 
 
 def _known(R: Floats, found: list[Floats]) -> bool:
-    angles = [np.arccos(np.clip((np.trace(R.T @ S) - 1) / 2, -1, 1)) for S in found]
-    return bool(min(angles) < np.radians(1.0))
+    return bool(np.einsum("ij,kij->k", R, np.array(found)).max() > 1 + 2 * np.cos(_SAME_TURN))

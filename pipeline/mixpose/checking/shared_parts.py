@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from mixpose.body import Body, SharedPart, shared_parts
+from mixpose.body import Body, LookAlike, congruent_parts
 from mixpose.checking.lookalikes import noise_of
 from mixpose.checking.typical import typical_poses
 from mixpose.session import Session
@@ -23,9 +23,9 @@ def shared_part_warnings(session: Session) -> list[str]:
     warnings = []
     noise = _noise_length(session)
     for one, other in combinations([each.body for each in session.objects], 2):
-        parts = shared_parts(one.means, other.means, _tolerance(one, other, noise))
+        parts = congruent_parts(one, other, _tolerance(one, other, noise))
         if parts:
-            warnings.append(_text(one, other, parts[0], session.unit))
+            warnings.append(_text(parts[0], session.unit))
     return warnings
 
 
@@ -50,9 +50,10 @@ def _noise_length(session: Session) -> float:
     return min(lengths, default=0.0)
 
 
-def _text(one: Body, other: Body, part: SharedPart, unit: str) -> str:
-    pairs = ", ".join(f"{i} like {j}" for i, j in zip(part.own, part.others, strict=True))
-    whole = len(part.own) == len(one) == len(other)
+def _text(part: LookAlike, unit: str) -> str:
+    one, other = part.body, part.other
+    pairs = ", ".join(f"{i} like {j}" for i, j in zip(part.features, part.partners, strict=True))
+    whole = len(part.features) == len(one) == len(other)
     if whole:
         return (
             f"the bodies {one.name!r} and {other.name!r} are congruent to {part.off:.2g} {unit} "
@@ -60,7 +61,8 @@ def _text(one: Body, other: Body, part: SharedPart, unit: str) -> str:
             "a marker"
         )
     return (
-        f"{len(part.own)} markers of {one.name!r} lie like {len(part.own)} of {other.name!r} to "
+        f"{len(part.features)} markers of {one.name!r} lie like {len(part.features)} of "
+        f"{other.name!r} to "
         f"{part.off:.2g} {unit} ({pairs}): where the others are hidden the one may be the other; "
         "expect ambiguous frames, or move a marker"
     )

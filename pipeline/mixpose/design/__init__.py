@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
 from mixpose.design.confirmation import Confirmation, confirm
-from mixpose.design.congruence import Congruence, congruent_subsets
 from mixpose.design.equality import noise_to_equal
 from mixpose.design.poses import spread_poses
 from mixpose.design.prediction import Plan, Prediction, plan_of, predict
@@ -13,7 +12,6 @@ from mixpose.design.summary import Summary, summarise
 
 __all__ = [
     "Confirmation",
-    "Congruence",
     "MarkerMove",
     "NewSensor",
     "Plan",
@@ -24,7 +22,6 @@ __all__ = [
     "best_marker_move",
     "best_new_sensor",
     "confirm",
-    "congruent_subsets",
     "noise_to_equal",
     "plan_of",
     "predict",

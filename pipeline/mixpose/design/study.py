@@ -8,11 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from mixpose.body import Body
+from mixpose.body import Body, LookAlike, congruent_parts
 from mixpose.checking import noise_of
 from mixpose.design.advice import MarkerMove, NewSensor, best_marker_move, best_new_sensor
 from mixpose.design.confirmation import Confirmation, confirm
-from mixpose.design.congruence import Congruence, congruent_subsets
 from mixpose.design.equality import noise_to_equal, scaled
 from mixpose.design.prediction import Plan, at_tip, plan_of, predict
 from mixpose.design.summary import Summary, pooled, summarise
@@ -96,7 +95,7 @@ class Study:
     request: Request
     unit: str
     systems: tuple[System, ...]
-    congruences: tuple[Congruence, ...]
+    congruences: tuple[LookAlike, ...]
 
 
 def study(
@@ -212,8 +211,8 @@ def _equal(
     return Equal(factor, plan.noises, first.error, found)
 
 
-def _congruences(bodies: Sequence[Body], request: Request) -> list[Congruence]:
-    found: list[Congruence] = []
+def _congruences(bodies: Sequence[Body], request: Request) -> list[LookAlike]:
+    found: list[LookAlike] = []
     known: list[Body] = []
     for body in bodies:
         if any(_same(body, other) for other in known):
@@ -222,9 +221,7 @@ def _congruences(bodies: Sequence[Body], request: Request) -> list[Congruence]:
             tolerance = request.tolerance
             if tolerance is None:
                 tolerance = SHARE_OF_RADIUS * min(body.radius, other.radius)
-            alike = congruent_subsets(other, body, tolerance)
-            if alike is not None:
-                found.append(alike)
+            found += congruent_parts(other, body, tolerance)[:1]
         known.append(body)
     return found
 

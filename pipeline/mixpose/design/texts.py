@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.body import Body
+from mixpose.body import LookAlike
 from mixpose.design.confirmation import Confirmation
-from mixpose.design.congruence import Congruence
 from mixpose.design.prediction import Plan
 from mixpose.design.study import Equal, Study, System
 from mixpose.design.summary import Summary, Weakness, pooled
@@ -33,14 +32,9 @@ def study_text(study: Study) -> str:
         lines += ["", *_system_lines(system, study)]
     if len(study.systems) > 1:
         lines += ["", *_comparison(study)]
-    bodies = {body.name: body for s in study.systems for body in _bodies(s)}
     for alike in study.congruences:
-        lines += ["", _congruence_text(alike, bodies, study.unit)]
+        lines += ["", _congruence_text(alike, study.unit)]
     return "\n".join(lines) + "\n"
-
-
-def _bodies(system: System) -> list[Body]:
-    return [each.body for each in system.session.objects]
 
 
 def _system_lines(system: System, study: Study) -> list[str]:
@@ -189,13 +183,12 @@ def _equal_text(system: System, equal: Equal, first: str, unit: str) -> str:
     return text
 
 
-def _congruence_text(alike: Congruence, bodies: dict[str, Body], unit: str) -> str:
-    first, second = (bodies[name] for name in alike.bodies)
-    ours = ", ".join(first.labels[i] for i, _ in alike.markers)
-    theirs = ", ".join(second.labels[j] for _, j in alike.markers)
+def _congruence_text(alike: LookAlike, unit: str) -> str:
+    ours = ", ".join(alike.body.labels[i] for i in alike.features)
+    theirs = ", ".join(alike.other.labels[j] for j in alike.partners)
     return (
-        f"{len(alike.markers)} markers of {alike.bodies[0]} ({ours}) lie like those of "
-        f"{alike.bodies[1]} ({theirs}), to {_number(alike.misfit)} {unit}: one body may be taken "
+        f"{len(alike.features)} markers of {alike.body.name} ({ours}) lie like those of "
+        f"{alike.other.name} ({theirs}), to {_number(alike.off)} {unit}: one body may be taken "
         "for the other; move one of them"
     )
 
@@ -236,9 +229,11 @@ def study_json(study: Study) -> dict[str, Any]:
         "systems": [_system_json(system) for system in study.systems],
         "congruent": [
             {
-                "bodies": list(alike.bodies),
-                "markers": [list(pair) for pair in alike.markers],
-                "misfit": alike.misfit,
+                "bodies": [alike.body.name, alike.other.name],
+                "markers": [
+                    list(pair) for pair in zip(alike.features, alike.partners, strict=True)
+                ],
+                "misfit": alike.off,
             }
             for alike in study.congruences
         ],

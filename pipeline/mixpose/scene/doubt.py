@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
-from mixpose.body import Body, SharedPart, shared_parts
+from mixpose.body import like_features, tolerance_of
 from mixpose.judgement import ScoredPose
 from mixpose.scene.members import Member
 from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.proposers.look_alikes import met_features
 
 
 def may_be_another(
@@ -25,9 +25,10 @@ def may_be_another(
     members: Sequence[Member],
     data: Mapping[int, FrameData],
     elsewhere: Sequence[bool],
-    alike: float,
-) -> bool:
-    """Whether a pose of member k might as well be one of another body, or another of its own.
+) -> str:
+    """Why a pose of member k might as well be one of another body, or another of its own.
+
+    Empty where it might not.
 
     Parameters
     ----------
@@ -38,32 +39,22 @@ def may_be_another(
         The frame as it is left for each.
     elsewhere : sequence of bool
         Which members are surely where they are.
-    alike : float
-        How far markers of two bodies may be off each other, of the smaller one's radius; at least
-        as far as either gives way.
     """
-    met = set(np.flatnonzero(best.matches.met_by).tolist())
-    body = members[k].tracker.body
+    met, body = met_features(best), members[k].tracker.body
     for j, other in enumerate(members):
         theirs = other.tracker.body
         # a body's own markers may repeat themselves: then it may be turned another way
         if j != k and (theirs is body or elsewhere[j]):
             continue
         limit = best.log_evidence + float(np.log(other.tracker.rules.acceptance.rival))
-        for part in parts_of(body, theirs, alike):
-            if not met <= set(part.own):
+        tolerance = tolerance_of(body, theirs, other.tracker.rules.look_alikes.alike)
+        for part in like_features(body, met, theirs, tolerance):
+            if len(part.features) < len(met):
                 continue
             there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
             own = data[j]
             seen = replace(own, views=data[k].views, begun=None)
             found = other.tracker.again(seen, [there], fitted=True)
             if found and found[0].log_evidence > limit:
-                return True
-    return False
-
-
-@lru_cache(maxsize=4096)
-def parts_of(body: Body, other: Body, alike: float) -> tuple[SharedPart, ...]:
-    """Parts that two bodies have in common."""
-    tolerance = max(alike * min(body.radius, other.radius), body.spread, other.spread)
-    return tuple(shared_parts(body.means, other.means, tolerance))
+                return part.reason
+    return ""

@@ -39,11 +39,6 @@ class SceneRules:
         "squared offset in σ_ε² from which such a spot is taken for both: two and a half "
         "times what blobs have (0.2²)",
     )
-    alike: float = constant(
-        0.05,
-        "of the smaller body's radius, how far markers of two bodies may be off each other "
-        "for the one to pass for the other: bodies are as rigid as that",
-    )
     forgotten: int = constant(
         5,
         "frames without a pose after which identical bodies are searched for as one: velocities "

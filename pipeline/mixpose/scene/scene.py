@@ -64,9 +64,8 @@ class Scene:
         for k, one in enumerate(found):
             best = one.verdict.best
             if sure[k] and best is not None:
-                others = (self.members, joint.data, sure, self.rules.alike)
-                if may_be_another(k, best, *others):
-                    found[k] = Decided(replace(one.verdict, status="ambiguous"), one.ranked)
+                why = may_be_another(k, best, self.members, joint.data, sure)
+                found[k] = Decided(one.verdict.doubted(why), one.ranked)
         outcomes = [
             self._outcome(k, found[k], joint.data[k], frame, time_s, views)
             for k in range(len(self.members))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from mixpose.body import ASIDE
 from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
 from mixpose.tracking.in_motion import UNKNOWN_S
-from mixpose.tracking.proposers.stepped_aside import ASIDE
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Companion, Prediction, Track, predict
 from mixpose.tracking.tracker import Tracker, estimate_pose

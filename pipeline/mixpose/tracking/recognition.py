@@ -12,12 +12,11 @@ few are met, it is looked for everywhere, in the first frames.
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, mirror_image, thickness
 from mixpose.judgement import ScoredPose, is_far_off
 from mixpose.tracking.likelihood import FrameData, SearchLog, Start, likelihood_of
 from mixpose.tracking.proposers.searched import candidates_of, starts_at
@@ -28,7 +27,7 @@ ALONE = "one sensor of several meets the body, which none of its frames was sure
 MIRRORED = "it shows the body's mirror image"
 
 _CORNERS = 3
-_FLAT = 1e-6  # thickness by length, below which no camera tells one side's markers from the other's
+_FLAT = 1e-6  # thickness by width, below which no camera tells one side's markers from the other's
 
 
 def is_alone(data: FrameData, judged: ScoredPose, sensors: int) -> bool:
@@ -60,17 +59,18 @@ def is_known(data: FrameData, judged: ScoredPose) -> bool:
 
 def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
-    if not data.body.is_exact or _is_flat(data.body):
+    body, rules, seen = data.body, data.rules, judged.matches
+    if "mirrored" not in rules.look_alikes.kinds or not body.is_exact or _is_flat(body):
         return False
-    ahead, seen = data.rules.acceptance.standing_out, judged.matches
-    met = seen.met_by
+    ahead, met = rules.acceptance.standing_out, seen.met_by
     # of these the mirror image may meet more than the body
     if np.minimum(seen.missed, seen.unmatched_nearby).sum() > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
-        flat = _reflected(data.body, sharp if sharp.sum() >= 3 else met > 0)
-        near = replace(data, body=flat, begun=None)
-        if _evidence(near, Start(judged.T_world_object, data.close)) > judged.log_evidence + ahead:
+        near = _numbers(sharp if sharp.sum() >= 3 else met > 0)
+        there = replace(data, body=mirror_image(body, near), begun=None)
+        start = Start(judged.T_world_object, data.close)
+        if _meets(there, data, start) and _evidence(there, start) > judged.log_evidence + ahead:
             return True
     if not _is_by_chance(data, judged):
         return False
@@ -81,23 +81,31 @@ def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     nothing = replace(data, predictions=(), beside=None, begun=None)
     alone = replace(nothing, track=track, log=SearchLog(), options=options)
     own = _evidence(alone, Start(judged.T_world_object))
-    mirror = replace(alone, body=_reflected(data.body, met >= 0))
-    least = own - data.rules.search.outdone
+    mirror = replace(alone, body=mirror_image(body, _numbers(met >= 0)))
+    least = own - rules.search.outdone
     starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
     return any(_evidence(mirror, start) > own + ahead for start in starts)
 
 
-@lru_cache(maxsize=16)
 def _is_flat(body: Body) -> bool:
     """Whether a turn brings the body onto its mirror image."""
-    extents = np.linalg.svd(body.means - body.means.mean(axis=0), compute_uv=False)
-    return len(extents) < 3 or bool(extents[2] < _FLAT * extents[0])
+    return thickness(body) < _FLAT
+
+
+def _meets(mirror: FrameData, data: FrameData, start: Start) -> bool:
+    """Whether the mirror image meets a quarter of what the body meets, where a fit begins.
+
+    The features met lie about the plane that it is reflected in, or it is no rival: then its value
+    is a hundredth of the body's, and that grows as the square of the features met.
+    """
+    values = [one.finest.value(start.T_world_object[None])[0] for one in (mirror, data)]
+    return bool(values[0] > values[1] / 16)
 
 
 def _is_by_chance(data: FrameData, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
     rules, seen = data.rules, judged.matches
-    if judged.measurements - 6 > rules.proposals.by_chance:
+    if judged.measurements - 6 > rules.look_alikes.by_chance:
         return False
     if data.track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
@@ -111,13 +119,5 @@ def _evidence(data: FrameData, start: Start) -> float:
     return likelihood.judge(likelihood.fit(start), start).log_evidence
 
 
-def _reflected(body: Body, near: NDArray[np.bool_]) -> Body:
-    """The body reflected in the plane nearest to some of its features."""
-    points = body.means
-    centre = points[near].mean(axis=0)
-    normal = np.linalg.svd(points[near] - centre)[2][-1]
-    mirrored = points - 2 * ((points - centre) @ normal)[:, None] * normal
-    outward = body.normals
-    if outward is not None:
-        outward = outward - 2 * (outward @ normal)[:, None] * normal
-    return Body(body.name, tuple(PointFeature(one) for one in mirrored), outward)
+def _numbers(mask: NDArray[np.bool_]) -> frozenset[int]:
+    return frozenset(np.flatnonzero(mask).tolist())

@@ -17,11 +17,6 @@ from mixpose.tracking.static_clutter import StaticRules
 class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
-    aside: float = constant(
-        1.5,
-        "features fewer that a pose a step aside may meet to be a rival still: each is worth four "
-        "of the log odds, or so",
-    )
     drawn: int = constant(
         512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
     )
@@ -32,6 +27,32 @@ class ProposalRules:
         "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
         "at which drawn ones are scored; one that was searched for, by its square",
     )
+    blurs: tuple[float, ...] = constant(
+        (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
+    )
+    believed: int = constant(
+        3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
+    )
+
+
+@dataclass(frozen=True)
+class LookAlikeRules:
+    """Which look-alikes of a body are rivals; see `mixpose.body.look_alikes`."""
+
+    kinds: tuple[str, ...] = constant(
+        ("congruent", "tilted", "mirrored"),
+        "looked for: features that lie like others, the other tilt, the mirror image",
+    )
+    alike: float = constant(
+        0.05,
+        "of the smaller body's radius, how far features may be off their partners: bodies are as "
+        "rigid as that",
+    )
+    fewer: float = constant(
+        1.5,
+        "features fewer that a look-alike may meet to be a rival still: each is worth four of the "
+        "log odds, or so",
+    )
     flat: float = constant(
         0.15, "thickness of a body against its smaller width below which it may be tilted"
     )
@@ -39,12 +60,6 @@ class ProposalRules:
         14.0,
         "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
         "been met anywhere: five features by two cameras, where three always lie alike",
-    )
-    blurs: tuple[float, ...] = constant(
-        (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
-    )
-    believed: int = constant(
-        3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
     )
 
 
@@ -59,6 +74,7 @@ class Rules:
     course: CourseRules = CourseRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
+    look_alikes: LookAlikeRules = LookAlikeRules()
     static: StaticRules = StaticRules()
     search: SearchBudget = THOROUGH
     live: SearchBudget = LIVE

@@ -26,7 +26,7 @@ from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
-from mixpose.tracking.proposers.stepped_aside import ASIDE, is_a_step
+from mixpose.tracking.proposers.look_alikes import reason
 from mixpose.tracking.recognition import (
     ALONE,
     MIRRORED,
@@ -146,9 +146,10 @@ class Tracker:
         best = verdict.best
         if best is None:
             return verdict
-        steps = (is_a_step(self.body, best, one) for one, _ in verdict.kept)
-        if verdict.status != "ok" and any(steps):
-            return replace(verdict, doubt=ASIDE)
+        if verdict.status != "ok":
+            rivals = [one for one, _ in verdict.kept if one is not best]
+            if why := reason(data, best, rivals):
+                return replace(verdict, doubt=why)
         # a sure pose that has rivals may have them for a reason that can be told
         if not is_sure(best, self.free, rules):
             return verdict

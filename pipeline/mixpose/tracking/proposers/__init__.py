@@ -11,13 +11,12 @@ from typing import Protocol
 
 from mixpose.judgement import ScoredPose
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
+from mixpose.tracking.proposers.look_alikes import look_alikes
 from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.mirrored import mirrored
 from mixpose.tracking.proposers.multistart import multistart
 from mixpose.tracking.proposers.narrowed import narrowed
 from mixpose.tracking.proposers.predicted import predicted
 from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.stepped_aside import stepped_aside
 from mixpose.tracking.proposers.without_sensor import without_sensor
 
 
@@ -41,5 +40,5 @@ class Refinement(Protocol):
         """Where fits may begin; nothing where the pose leaves nothing to mend."""
 
 
-PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, stepped_aside, mirrored)
+PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
 REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, narrowed)

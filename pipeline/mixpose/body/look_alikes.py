@@ -1,0 +1,323 @@
+"""Motions of a body, or onto another body, under which it looks the same or nearly so.
+
+Found from coordinates alone: parts of two bodies that are congruent, all ways in which some of a
+body's features lie like others of it or of another body (a step of a grid, a turn of a square),
+the other tilt of a flat body along a line of sight, and the mirror image.
+
+A motion is fixed by where it sends three features that are not on a line.  All triples with the
+same sides are tried, and those kept under which the other features have partners, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import combinations
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from mixpose.body.features import PointFeature
+from mixpose.body.model import Body
+from mixpose.body.symmetry import SAME_NORMAL, congruent_triples, motions, widest_triple
+from mixpose.rigid import from_parts, rotation_angle_deg, transform
+
+Floats: TypeAlias = NDArray[np.float64]
+
+ASIDE = "the body explains as much a step of its grid aside"
+
+Pairs: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
+
+FEWEST = 3
+"""Features that fix a motion."""
+
+_TOGETHER = 8  # features that motions are tried with at a time
+
+
+@dataclass(frozen=True, eq=False)
+class LookAlike:
+    """Features of a body that lie like features of another, or like others of its own.
+
+    Attributes
+    ----------
+    body, other : Body
+    T_body_other : (4, 4) float64
+        The motion that puts the other's features on the body's: with the body at T, the other at
+        T @ T_body_other has them in the same places.
+    features, partners : tuple of int
+        Of the body and of the other, pair by pair, by ascending number of the body's.
+    off : float
+        The largest distance of a pair, length units.
+    """
+
+    body: Body
+    other: Body
+    T_body_other: Floats
+    features: tuple[int, ...]
+    partners: tuple[int, ...]
+    off: float
+
+    @property
+    def turn_deg(self) -> float:
+        """Angle by which the other is turned against the body."""
+        return float(rotation_angle_deg(self.T_body_other, np.eye(4)))
+
+    @cached_property
+    def is_step(self) -> bool:
+        """Whether features are shifted, by far the most of the way the same for all of them."""
+        points = self.body.means[list(self.features)]
+        moved = transform(self.T_body_other, points) - points
+        step = moved.mean(axis=0)
+        return bool(np.abs(moved - step).max() < 0.1 * np.linalg.norm(step))
+
+    @property
+    def reason(self) -> str:
+        """In words: what else there may be in place of the body."""
+        if self.other is not self.body:
+            return f"what is met lies like features of {self.other.name!r}"
+        return (
+            ASIDE
+            if self.is_step
+            else f"the body explains as much turned by {self.turn_deg:.0f} deg"
+        )
+
+
+def tolerance_of(body: Body, other: Body, share: float) -> float:
+    """How far features may be off each other: a share of the smaller body's radius, or its spread.
+
+    At most a quarter of the way between neighbours, whose partners would be mistaken.
+    """
+    least = max(body.spread, other.spread)
+    return max(least, min(share * min(body.radius, other.radius), _spacing(other) / 4))
+
+
+@lru_cache(maxsize=4096)
+def like_features(
+    body: Body, features: frozenset[int], other: Body, tolerance: float
+) -> tuple[LookAlike, ...]:
+    """All motions under which features of a body lie like features of another, or of itself.
+
+    All but one of the features need a partner, where these are more than fix a motion.  The body's
+    own symmetries are left out, and what turns a face away that was seen.
+
+    Parameters
+    ----------
+    body : Body
+    features : frozenset of int
+        Of the body, such as those that are met in a frame.
+    other : Body
+    tolerance : float
+        How far partners may be off, length units.
+    """
+    chosen = np.array(sorted(features), dtype=np.intp)
+    points, targets = body.means[chosen], other.means
+    found: dict[Pairs, LookAlike] = {}
+    least = min(len(points), max(len(points) - 1, FEWEST + 1))
+    for base in _bases(points, tolerance):
+        triples = congruent_triples(points[base], targets, 2 * tolerance)
+        T = motions(points[base], targets[triples])
+        for part in _kept(body, chosen, other, T, tolerance, least):
+            pairs = _modulo_symmetry(other, part)
+            known = found.get(pairs)
+            if known is None or part.turn_deg < known.turn_deg:
+                found[pairs] = part
+    if body is other:
+        found = {pairs: part for pairs, part in found.items() if not _is_symmetry(part)}
+    return tuple(found.values())
+
+
+@lru_cache(maxsize=256)
+def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlike, ...]:
+    """The largest parts of two bodies that are congruent, largest first, none within another.
+
+    Parts have three features or more that are not on a line.  Of a body by itself the identity is
+    left out.  At most 60 features of each are compared: triples of more take minutes.
+    """
+    points, targets = body.means[:60], other.means[:60]
+    same = body is other or (points.shape == targets.shape and np.array_equal(points, targets))
+    found: list[LookAlike] = []
+    for triple in combinations(range(len(points)), FEWEST):
+        base = list(triple)
+        if _is_narrow(points[base], tolerance):
+            continue
+        images = congruent_triples(points[base], targets, 2 * tolerance)
+        for image in images:
+            pairs = set(zip(triple, image.tolist(), strict=True))
+            if same and all(i == j for i, j in pairs):
+                continue
+            if any(pairs <= _pairs(known) for known in found):
+                continue
+            part = _grown(body, other, base, image, tolerance)
+            if part is None or any(_pairs(part) <= _pairs(known) for known in found):
+                continue
+            found = [known for known in found if not _pairs(known) <= _pairs(part)]
+            found.append(part)
+    return tuple(sorted(found, key=lambda part: (-len(part.features), part.off)))
+
+
+def other_tilt(body: Body, T_world_object: Floats, towards: Floats) -> Floats:
+    """The pose (4, 4) of a flat body tilted the other way, as seen along a direction (3,).
+
+    Depths about its middle change their sign, which changes its image by perspective alone.
+    """
+    centre = body.means.mean(axis=0)
+    R, v = T_world_object[:3, :3], towards / np.linalg.norm(towards)
+    n = np.linalg.svd(body.means - centre, full_matrices=False)[2][2]
+    # two mirrors make a turn: across the body's own plane, which leaves it alone, and in depth
+    R_tilted = (np.eye(3) - 2 * np.outer(v, v)) @ R @ (np.eye(3) - 2 * np.outer(n, n))
+    return from_parts(R_tilted, T_world_object[:3, 3] + (R - R_tilted) @ centre)
+
+
+@lru_cache(maxsize=64)
+def thickness(body: Body) -> float:
+    """Extent across the plane nearest to the features, by the shorter extent in it; 0 if flat."""
+    extents = np.linalg.svd(body.means - body.means.mean(axis=0), compute_uv=False)
+    if len(extents) < 3 or extents[1] <= len(body) * np.finfo(np.float64).eps * extents[0]:
+        return 0.0
+    return float(extents[2] / extents[1])
+
+
+@lru_cache(maxsize=64)
+def mirror_image(body: Body, near: frozenset[int]) -> Body:
+    """The body reflected in the plane nearest to some of its features."""
+    points = body.means
+    chosen = points[sorted(near)]
+    centre = chosen.mean(axis=0)
+    normal = np.linalg.svd(chosen - centre)[2][-1]
+    mirrored = points - 2 * ((points - centre) @ normal)[:, None] * normal
+    outward = body.normals
+    if outward is not None:
+        outward = outward - 2 * (outward @ normal)[:, None] * normal
+    return Body(body.name, tuple(PointFeature(one) for one in mirrored), outward)
+
+
+@lru_cache(maxsize=256)
+def _spacing(body: Body) -> float:
+    """The smallest distance between two features."""
+    apart = cdist(body.means, body.means)
+    np.fill_diagonal(apart, np.inf)
+    return float(apart.min())
+
+
+def _bases(points: Floats, tolerance: float) -> list[list[int]]:
+    """Wide triples of points (n, 3), such that each point is missing in one where there are more.
+
+    None where they are on a line.
+    """
+    if len(points) < FEWEST:
+        return []
+    first = list(widest_triple(points))
+    if _is_narrow(points[first], tolerance):
+        return []
+    bases = [first]
+    if len(points) > FEWEST + 1:
+        for left_out in first:
+            rest = np.delete(np.arange(len(points)), left_out)
+            base = rest[list(widest_triple(points[rest]))].tolist()
+            if not _is_narrow(points[base], tolerance):
+                bases.append(base)
+    return bases
+
+
+def _is_narrow(points: Floats, tolerance: float) -> bool:
+    """Whether points (n, 3) lie on a line, within what they may be off."""
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= 2 * tolerance)
+
+
+def _kept(
+    body: Body,
+    chosen: NDArray[np.intp],
+    other: Body,
+    T_other_body: Floats,
+    tolerance: float,
+    least: int,
+) -> Iterable[LookAlike]:
+    """Of motions (K, 4, 4), those that bring enough of the chosen features to partners."""
+    alive, lacking = np.arange(len(T_other_body)), np.zeros(len(T_other_body), dtype=np.intp)
+    partners, near = np.zeros((2, len(T_other_body), len(chosen)), dtype=np.intp)
+    for first in range(0, len(chosen), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        partners[alive, some], fits = _partners(
+            body, chosen[some], other, T_other_body[alive], 2 * tolerance
+        )
+        near[alive, some] = fits
+        lacking[alive] += (~fits).sum(axis=1)
+        alive = alive[lacking[alive] <= len(chosen) - least]
+    for k in alive:
+        keep = near[k] > 0
+        # once more after a fit to all of them, which errs less than that to three
+        part = _fitted(body, other, chosen[keep], partners[k][keep])
+        if part.off <= tolerance and len(set(part.partners)) >= least:
+            yield part
+
+
+def _partners(
+    body: Body, chosen: NDArray[np.intp], other: Body, T_other_body: Floats, reach: float
+) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Nearest partners (K, n) of features moved by motions (K, 4, 4), and whether they will do."""
+    moved = transform(T_other_body, body.means[chosen])
+    away = cdist(moved.reshape(-1, 3), other.means).reshape(*moved.shape[:2], len(other))
+    partners = away.argmin(axis=2)
+    near = away.min(axis=2) <= reach
+    if body.normals is not None and other.normals is not None:
+        turned = _unit(body.normals[chosen]) @ np.swapaxes(T_other_body[:, :3, :3], 1, 2)
+        near &= (turned * _unit(other.normals)[partners]).sum(axis=2) > SAME_NORMAL
+    return partners, near
+
+
+def _fitted(
+    body: Body, other: Body, features: NDArray[np.intp], partners: NDArray[np.intp]
+) -> LookAlike:
+    """The motion of the other's features onto a body's."""
+    points, targets = body.means[features], other.means[partners]
+    T = motions(targets, points[None])[0]
+    off = float(np.linalg.norm(points - transform(T, targets), axis=1).max())
+    return LookAlike(body, other, T, tuple(features.tolist()), tuple(partners.tolist()), off)
+
+
+def _grown(
+    body: Body, other: Body, base: Sequence[int], image: NDArray[np.intp], tolerance: float
+) -> LookAlike | None:
+    """All pairs that fit the motion of a triple, or none if the triple itself does not."""
+    points, targets = body.means[:60], other.means[:60]
+    part = _fitted(body, other, np.array(base), image)
+    if part.off > tolerance:
+        return None
+    away = cdist(points, transform(part.T_body_other, targets))
+    partners = away.argmin(axis=1)
+    mutual = away.argmin(axis=0)[partners] == np.arange(len(points))
+    near = mutual & (away.min(axis=1) <= tolerance)
+    if near.sum() < FEWEST:
+        return None
+    return _fitted(body, other, np.flatnonzero(near), partners[near])
+
+
+def _pairs(part: LookAlike) -> set[tuple[int, int]]:
+    return set(zip(part.features, part.partners, strict=True))
+
+
+def _modulo_symmetry(other: Body, part: LookAlike) -> Pairs:
+    """Pairs of a part, the same for all motions that differ by a symmetry of the other body."""
+    images = _permutations(other)[:, list(part.partners)].tolist()
+    return part.features, tuple(min(images))
+
+
+def _is_symmetry(part: LookAlike) -> bool:
+    """Whether a motion of a body is the identity or one of its symmetries."""
+    images = _permutations(part.body)[:, list(part.features)]
+    return bool((images == part.partners).all(axis=1).any())
+
+
+@lru_cache(maxsize=256)
+def _permutations(body: Body) -> NDArray[np.intp]:
+    """The feature that each feature goes to (G, N), by each symmetry."""
+    return np.array([cdist(moved, body.means).argmin(axis=1)
+                     for moved in transform(body.symmetries, body.means)])  # fmt: skip
+
+
+def _unit(vectors: Floats) -> Floats:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
