@@ -41,7 +41,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "judgement": GROUND | {"sensors", "body", "density", "objective"},
     "tracking": GROUND
     | {"sensors", "body", "density", "objective", "optimise", "search", "fit", "judgement"},
-    "scene": GROUND | {"sensors", "body", "density", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -53,7 +52,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
     | {"simulation", "runner"},
     "runner": GROUND
-    | {"sensors", "body", "density", "extraction", "objective", "tracking", "scene"}
+    | {"sensors", "body", "density", "extraction", "objective", "tracking"}
     | {"frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},

@@ -70,18 +70,17 @@ def inspect_frame(
         estimates = [one.estimate for one in outcomes]
     else:
         estimates = _from_file(poses, session, number)
-    trackers = [member.tracker for member in scene.members]
-    bodies = [tracker.body for tracker in trackers]
+    bodies = [tracked.body for tracked in scene.bodies]
     found = find_several(session.sensors, frame_set.frames, views, bodies, estimates)
     pictures: dict[str, Picture] = {}
     lines = []
     if len(bodies) > 1:
         pictures[BODIES] = draw_scene(session, frame_set, *estimates)
-    each = zip(prefixes_of(session.labels), trackers, found, estimates, strict=True)
-    for prefix, tracker, findings, estimate in each:
-        made = inspection_pictures(session, tracker, findings, estimate)
+    each = zip(prefixes_of(session.labels), scene.bodies, found, estimates, strict=True)
+    for prefix, tracked, findings, estimate in each:
+        made = inspection_pictures(session, tracked, findings, estimate)
         pictures |= {prefix + name: picture for name, picture in made.items()}
-        lines += _summary(session, tracker.body, estimate, findings, poses)
+        lines += _summary(session, tracked.body, estimate, findings, poses)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:

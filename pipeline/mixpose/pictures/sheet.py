@@ -26,7 +26,7 @@ from mixpose.pictures.stages import (
 )
 from mixpose.records import Estimate
 from mixpose.session import Session
-from mixpose.tracking import Tracker
+from mixpose.tracking import TrackedBody
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -42,14 +42,14 @@ _RANGE_ROW, _LOW_RANGE_ROW = 210, 140  # px, of few and of many range sensors
 
 
 def inspection_pictures(
-    session: Session, tracker: Tracker, findings: Sequence[Finding], estimate: Estimate
+    session: Session, tracked: TrackedBody, findings: Sequence[Finding], estimate: Estimate
 ) -> dict[str, Picture]:
     """Make all pictures of one body in one frame.
 
     Parameters
     ----------
     session : Session
-    tracker : Tracker
+    tracked : TrackedBody
         Of the body: how far from its pose a search begins, and with it the widest blur.
     findings : sequence of Finding
         One per sensor.
@@ -60,13 +60,13 @@ def inspection_pictures(
     dict of str to (H, W, 3) uint8
         By file name, ``sheet.png`` first.
     """
-    body = tracker.body
+    body = tracked.body
     views = [
         finding.view
         for finding in findings
         if finding.view is not None and not finding.view.observation.is_empty
     ]
-    blurs = blur_levels(views, tracker, estimate)
+    blurs = blur_levels(views, tracked, estimate)
     pictures: dict[str, Picture] = {}
     rows = [_heading(session, estimate)]
     names = file_names(_names(session))
@@ -120,7 +120,7 @@ def prefixes_of(labels: Sequence[str]) -> list[str]:
 
 
 def blur_levels(
-    views: Sequence[View], tracker: Tracker, estimate: Estimate
+    views: Sequence[View], tracked: TrackedBody, estimate: Estimate
 ) -> dict[str, list[float]]:
     """Blurs that the estimator descends through, coarse to fine, by sensor."""
     if not views:
@@ -131,8 +131,8 @@ def blur_levels(
             view.name: [view.observation.sigma * ScheduleRules().ratio ** k for k in steps]
             for view in views
         }
-    around = np.where(tracker.free, tracker.start_uncertainty, 0.0)
-    levels = blur_schedule(views, tracker.body, estimate.T_world_object, around)
+    around = np.where(tracked.free, tracked.start_uncertainty, 0.0)
+    levels = blur_schedule(views, tracked.body, estimate.T_world_object, around)
     return {view.name: [level[k] for level in levels] for k, view in enumerate(views)}
 
 

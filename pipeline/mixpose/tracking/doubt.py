@@ -14,16 +14,17 @@ from functools import lru_cache
 import numpy as np
 
 from mixpose.body import Body, SharedPart, shared_parts
-from mixpose.judgement import Judged
-from mixpose.scene.members import Member
-from mixpose.tracking.likelihood import FrameData
+from mixpose.judgement import Judged, insert
+from mixpose.rigid import transform
+from mixpose.tracking.explain import Explanation, explain_by
+from mixpose.tracking.tracked_body import TrackedBody
 
 
 def may_be_another(
     k: int,
     best: Judged,
-    members: Sequence[Member],
-    data: Mapping[int, FrameData],
+    members: Sequence[TrackedBody],
+    found: Mapping[int, Explanation],
     elsewhere: Sequence[bool],
     alike: float,
 ) -> bool:
@@ -33,32 +34,36 @@ def may_be_another(
     ----------
     k : int
     best : Judged
-    members : sequence of Member
-    data : mapping of int to FrameData
-        The frame as it is left for each.
+    members : sequence of TrackedBody
+    found : mapping of int to Explanation
+        Of the frame as it is left for each.
     elsewhere : sequence of bool
         Which members are surely where they are.
     alike : float
         How far markers of two bodies may be off each other, of the smaller one's radius; at least
         as far as either gives way.
     """
+    if any(one.J.shape[1] == 1 for one in best.associations):
+        return False  # ranges are no markers in space
     met = {int(i) for one in best.associations for i in one.features[one.shares > 0]}
-    body = members[k].tracker.body
+    body = members[k].body
     for j, other in enumerate(members):
-        theirs = other.tracker.body
+        theirs = other.body
         # a body's own markers may repeat themselves: then it may be turned another way
         if j != k and (theirs is body or elsewhere[j]):
             continue
-        limit = best.log_evidence + float(np.log(other.tracker.rules.acceptance.rival))
+        limit = best.log_evidence + float(np.log(other.rules.acceptance.rival))
         for part in parts_of(body, theirs, alike):
             if not met <= set(part.own):
                 continue
             there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
-            own = data[j]
-            seen = replace(own, views=data[k].views, begun=None)
-            found = other.tracker.again(seen, [there], fitted=True)
-            if found and found[0].log_evidence > limit:
-                return True
+            seen = replace(found[j].frame, views=found[k].frame.views, begun=None)
+            rival = explain_by(other, seen, found[k].left, [there], fitted=True)
+            if rival.ranked and rival.evidence > limit:
+                distinct = [best]
+                insert(distinct, rival.ranked[0], body, seen.free, other.rules.acceptance)
+                if j != k or len(distinct) > 1:
+                    return True
     return False
 
 
@@ -66,4 +71,14 @@ def may_be_another(
 def parts_of(body: Body, other: Body, alike: float) -> tuple[SharedPart, ...]:
     """Parts that two bodies have in common."""
     tolerance = max(alike * min(body.radius, other.radius), body.spread, other.spread)
-    return tuple(shared_parts(body.means, other.means, tolerance))
+    parts = shared_parts(body.means, other.means, tolerance)
+    if body is not other:
+        return tuple(parts)
+    # what looks the same all over is no other pose
+    places = transform(body.symmetries, body.means)
+
+    def is_symmetry(part: SharedPart) -> bool:
+        away = np.linalg.norm(transform(part.T_body_other, body.means) - places, axis=-1)
+        return bool(away.max(axis=-1).min() < 2 * tolerance)
+
+    return tuple(part for part in parts if not is_symmetry(part))
