@@ -14,8 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from mixpose.body import Body, SharedPart, shared_parts
-from mixpose.judgement import Judged, insert
-from mixpose.rigid import transform
+from mixpose.judgement import Judged
 from mixpose.tracking.explain import Explanation, explain_by
 from mixpose.tracking.tracked_body import TrackedBody
 
@@ -43,8 +42,6 @@ def may_be_another(
         How far markers of two bodies may be off each other, of the smaller one's radius; at least
         as far as either gives way.
     """
-    if any(one.J.shape[1] == 1 for one in best.associations):
-        return False  # ranges are no markers in space
     met = {int(i) for one in best.associations for i in one.features[one.shares > 0]}
     body = members[k].body
     for j, other in enumerate(members):
@@ -60,10 +57,7 @@ def may_be_another(
             seen = replace(found[j].frame, views=found[k].frame.views, begun=None)
             rival = explain_by(other, seen, found[k].left, [there], fitted=True)
             if rival.ranked and rival.evidence > limit:
-                distinct = [best]
-                insert(distinct, rival.ranked[0], body, seen.free, other.rules.acceptance)
-                if j != k or len(distinct) > 1:
-                    return True
+                return True
     return False
 
 
@@ -71,14 +65,4 @@ def may_be_another(
 def parts_of(body: Body, other: Body, alike: float) -> tuple[SharedPart, ...]:
     """Parts that two bodies have in common."""
     tolerance = max(alike * min(body.radius, other.radius), body.spread, other.spread)
-    parts = shared_parts(body.means, other.means, tolerance)
-    if body is not other:
-        return tuple(parts)
-    # what looks the same all over is no other pose
-    places = transform(body.symmetries, body.means)
-
-    def is_symmetry(part: SharedPart) -> bool:
-        away = np.linalg.norm(transform(part.T_body_other, body.means) - places, axis=-1)
-        return bool(away.max(axis=-1).min() < 2 * tolerance)
-
-    return tuple(part for part in parts if not is_symmetry(part))
+    return tuple(shared_parts(body.means, other.means, tolerance))

@@ -121,6 +121,8 @@ class Scene:
 
     def _doubted(self, decided: list[Decided], found: Mapping[int, Explanation]) -> list[Decided]:
         """The same; in doubt where the pose might as well be another body's, or another one."""
+        if len(self.bodies) == 1:  # three markers of it are in doubt in any case
+            return decided
         sure = [one.told.status == "ok" for one in decided]
         after = list(decided)
         for k, one in enumerate(decided):
