@@ -107,7 +107,7 @@ def explain(
         Whether to stop where the body is not convincing where it is expected.
     """
     begun = before or Explanation(tracked, frame, left)
-    if not frame.views:
+    if not frame.views or begun.tried == len(tracked.proposers):
         return begun
     likelihood = begun.likelihood or likelihood_of(frame)
     ranked, fits = list(begun.ranked), list(begun.fits)
@@ -122,9 +122,7 @@ def explain(
         return judged
 
     def explained(tried: int) -> Explanation:
-        return replace(
-            begun, ranked=tuple(ranked), tried=tried, fits=tuple(fits), likelihood=likelihood
-        )
+        return Explanation(tracked, frame, left, tuple(ranked), tried, tuple(fits), likelihood)
 
     for k, propose in enumerate(tracked.proposers[begun.tried :], begun.tried):
         for start in propose(frame, ranked):

@@ -54,6 +54,11 @@ class Moment:
     sensors: int  # that had a frame
     rules: SceneRules
 
+    @property
+    def is_single(self) -> bool:
+        """Whether there is no other body to share with."""
+        return len(self.bodies) == 1
+
     @cached_property
     def shared(self) -> SharedDensities | None:
         """The densities of all that is seen; None where a sensor has no single detections."""
@@ -63,6 +68,8 @@ class Moment:
 
     def left(self, k: int, owners: Owners) -> Unclaimed:
         """What others leave for a body."""
+        if self.is_single:
+            return Unclaimed(self.views, {}, self.sensors)
         return left_for(k, self.views, owners, self.sensors)
 
     def data(self, k: int, left: Unclaimed, track: Track | None = None) -> FrameData:
@@ -116,8 +123,8 @@ class Shares:
 
     def owners(self, moment: Moment) -> Owners:
         """Owners of all detections."""
-        if len(moment.bodies) == 1:
-            return nobody(moment.views)  # there is nobody to share with
+        if moment.is_single:
+            return {}
         owners = owners_of(moment.views, self.claims)
         for name, numbers in self.merged.items():
             owners[name][numbers] = MERGED
@@ -134,7 +141,7 @@ def shared_out(moment: Moment) -> Shares:
     away = [k for k in range(len(moment.bodies)) if k not in shares.claimed]
     shares = _on_the_rest(moment, shares, [k for k in away if not moment.is_forgotten(k)])
     shares = _on_the_rest(moment, shares, [k for k in away if moment.is_forgotten(k)])
-    if len(moment.bodies) == 1:
+    if moment.is_single:
         return shares
     shares = _without_merged(moment, shares)
     owners = shares.owners(moment)
@@ -147,9 +154,9 @@ def shared_out(moment: Moment) -> Shares:
 def _where_expected(moment: Moment) -> Shares:
     """Bodies that are where they are expected, all at once, until nothing changes hands."""
     trusted = [k for k in range(len(moment.bodies)) if moment.is_trusted(k)]
-    shares, owners = Shares(), nobody(moment.views)
+    shares, owners = Shares(), Shares().owners(moment)
     places: dict[int, dict[str, Floats]] = {}
-    if len(moment.bodies) > 1:
+    if not moment.is_single:
         places = {k: moment.expected_places(k) for k in trusted}
         owners = expected_owners(moment.views, places, moment.rules.gate)
     for _ in range(moment.rules.rounds):
@@ -183,7 +190,9 @@ def _at_once(
     if alike and moment.shared is not None:
         begun = begun_together([frames[k] for k in alike], moment.shared)
         frames.update(zip(alike, begun, strict=True))
-    return {k: explain(moment.bodies[k], frames[k], left[k], quickly=True) for k in some}
+    return {
+        k: explain(moment.bodies[k], frames[k], left[k], quickly=not moment.is_single) for k in some
+    }
 
 
 def _is_touched(moment: Moment, k: int, one: Explanation, owners: Owners) -> bool:
@@ -195,7 +204,7 @@ def _is_touched(moment: Moment, k: int, one: Explanation, owners: Owners) -> boo
 
 def _on_the_rest(moment: Moment, shares: Shares, waiting: list[int]) -> Shares:
     """Bodies that are not where they are expected, on what is left, the most evident first."""
-    shares = shares.after(_everywhere(moment, shares, waiting))
+    shares = shares.after(_everywhere(moment, shares, waiting)) if waiting else shares
     while possible := [k for k in waiting if shares.found[k].checks.is_possible]:
         winner = _most_evident(moment, shares, possible)
         shares = replace(shares, claimed=(*shares.claimed, winner))
@@ -232,7 +241,7 @@ def _everywhere(moment: Moment, shares: Shares, some: Iterable[int]) -> dict[int
 def _look(moment: Moment, shares: Shares, k: int, left: Unclaimed, as_one: bool) -> Explanation:
     """A body by all proposers, after those that were asked already where the same is left."""
     track, before, told = moment.tracks[k], shares.found.get(k), _companion(moment, shares, k)
-    if before and before.tried == 1 and told is None and _is_same(before.left, left):
+    if before and told is before.frame.beside and _is_same(before.left, left):
         return explain(before.tracked, before.frame, left, before)
     data = moment.data(k, left, replace(track, branches=()) if as_one else track)
     data = replace(data, beside=told)
