@@ -57,9 +57,8 @@ def identify(group: Sequence[int], explained: Mapping[int, Explanation]) -> Iden
     likely = _likelihoods(known, finders, found, data)
     poses = _assigned(group, known, finders, likely)
     lost = {k for k in known if data[k].track.misses > rules.motion.coasting}
-    return Identities(
-        poses, _exchanges(known, poses, finders, likely, rules.acceptance.rival, lost)
-    )
+    limit = float(np.log(rules.acceptance.rival))
+    return Identities(poses, _exchanges(known, poses, finders, likely, limit, lost))
 
 
 def _likelihoods(
