@@ -12,9 +12,8 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
-from mixpose.scene import Member, Scene
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Tracker
+from mixpose.tracking import Scene, Tracker
 
 TOOL = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [10, -30, 45], [35, 30, -40.0]])
 OTHER = np.array([[0, 0, 0], [45, 0, 20], [-30, 35, 0], [5, -55, 10], [20, 20, 50.0]])
@@ -39,8 +38,8 @@ def scene_of(*bodies: Body) -> Scene:
     for k, one in enumerate(bodies):
         alike = [other for other in bodies if other is one]
         instance = [j for j, other in enumerate(bodies) if other is one].index(k)
-        tracker = Tracker.create(one, EstimatorOptions())
-        members.append(Member(tracker, instance if len(alike) > 1 else None))
+        which = instance if len(alike) > 1 else None
+        members.append(Tracker.create(one, EstimatorOptions(), instance=which))
     return Scene(tuple(members))
 
 

@@ -44,8 +44,6 @@ MAY_IMPORT: dict[str, set[str]] = {
     "tracking": GROUND
     | {"sensors", "body", "density", "matching", "objective", "optimise", "search"}
     | {"fit", "judgement"},
-    "scene": GROUND
-    | {"sensors", "body", "density", "matching", "objective", "judgement", "tracking"},
     "frames": GROUND,
     "pictures": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "session"}
@@ -58,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"simulation", "runner"},
     "runner": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "matching", "tracking"}
-    | {"scene", "frames", "session"},
+    | {"frames", "session"},
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }

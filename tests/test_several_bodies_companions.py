@@ -14,8 +14,7 @@ from mixpose.density import Observation
 from mixpose.judgement import Prior
 from mixpose.records import PointPattern
 from mixpose.rigid import Floats, from_rotation_vector, transform
-from mixpose.scene import Scene
-from mixpose.tracking import Companion, Rules, Track
+from mixpose.tracking import Companion, Rules, Scene, Track
 from mixpose.tracking.track import either
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"

@@ -24,11 +24,10 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import Floats
-from mixpose.scene import Scene
-from mixpose.scene.joint import Joint
-from mixpose.scene.ownership import MERGED, Claim, claimed, expected_owners, overlap
 from mixpose.search import SearchResult, search_frame
-from mixpose.tracking import Track
+from mixpose.tracking import Scene, SceneRules, Track
+from mixpose.tracking.claims import Claim, expected_owners, merged_spots, overlap, owners_of
+from mixpose.tracking.sharing import Moment, evidence_of_both, shared_out
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 
@@ -86,10 +85,10 @@ def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> No
     # three markers of four are where three of five are; without them nothing speaks for the small
     small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
     scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
-    joint = Joint(scene.members, scene.begin(), 0, None, views, scene.rules)
-    joint.solve()
-    keeps, hidden = joint.ranked[1][0].log_evidence, joint.ranked[0][:1]
-    assert joint.together(1, 0) == pytest.approx(keeps, abs=1e-6)
+    moment = Moment(scene.bodies, scene.begin(), 0, None, tuple(views), 2, scene.rules)
+    shares = shared_out(moment)
+    keeps, hidden = shares.found[1].evidence, shares.found[0].ranked[:1]
+    assert evidence_of_both(moment, shares, 1, 0) == pytest.approx(keeps, abs=1e-6)
     assert not hidden or hidden[0].log_evidence < 0.0
 
 
@@ -250,8 +249,8 @@ def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
     views = spots([0.0, 0.0], [50.0, 0.0])
     first = {"left": claim([0, 1], [[0.4, 0.0], [50.0, 0.0]], [0.16, 0.0])}
     second = {"left": claim([0], [[0.1, 0.0]], [0.01])}
-    assert claimed(views, {0: first, 1: second})["left"].tolist() == [1, 0]
-    assert claimed(views, {1: second, 0: first})["left"].tolist() == [1, 0]
+    assert owners_of(views, {0: first, 1: second})["left"].tolist() == [1, 0]
+    assert owners_of(views, {1: second, 0: first})["left"].tolist() == [1, 0]
     assert overlap(first, second) == 1.0
 
 
@@ -259,7 +258,9 @@ def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
     views = spots([0.0, 0.0])
     first = {"left": claim([0], [[-1.5, 0.0]], [2.25])}
     second = {"left": claim([0], [[1.5, 0.0]], [2.25])}
-    assert claimed(views, {0: first, 1: second})["left"].tolist() == [MERGED]
+    rules = SceneRules()
+    merged = merged_spots(views, {0: first, 1: second}, {}, rules.touching, rules.pulled)
+    assert merged["left"].tolist() == [0]
 
 
 def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
+from mixpose.judgement import ScoredPose
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.rigid import (
@@ -24,7 +26,7 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
 from mixpose.tracking.proposers.look_alikes import look_alikes
 from mixpose.tracking.proposers.merged_pair import merged_pair
@@ -78,6 +80,21 @@ def test_without_any_proposer_every_frame_is_lost(pinhole_cameras: list[PinholeC
     estimate = first_frame(tracker, detect(pinhole_cameras, EIGHT, TRUTH))
     assert estimate.status == "lost"
     assert estimate.T_world_object is None
+
+
+def test_a_proposer_of_ones_own_is_a_function_that_yields_starts(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    elsewhere = from_rotation_vector([1.4, -2.0, 0.7], [80.0, 20.0, -30.0])
+    views = detect(pinhole_cameras, EIGHT, elsewhere, noise=0.1, false=3, hidden=1)
+
+    def told(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
+        return [] if ranked else [Start(perturb(elsewhere, np.full(6, 0.01)), data.close)]
+
+    tracker = replace(Tracker.create(EIGHT, EstimatorOptions()), proposers=(told,))
+    estimate = first_frame(tracker, views)
+    assert is_right(estimate, elsewhere)
+    assert (estimate.status, estimate.proposer) == ("ok", "told")
 
 
 def test_a_prediction_finds_a_pose_in_clutter_in_which_nothing_else_does(

@@ -6,8 +6,9 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,19 +28,10 @@ from mixpose.records import (
     RawFrame,
     SensorReport,
 )
-from mixpose.scene import Member, Outcome, Scene
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.sensors import doubted
 from mixpose.threads import one_blas_thread
-from mixpose.tracking import (
-    UNKNOWN_S,
-    Expectation,
-    Track,
-    Tracker,
-    are_as_good,
-    have_fewer,
-    is_convincing,
-)
+from mixpose.tracking import UNKNOWN_S, Scene, Track, Tracker, WindowedScene
 
 if TYPE_CHECKING:
     from mixpose.body import Body
@@ -63,12 +55,9 @@ class Memory:
     ----------
     tracks : tuple of Track
         One per body.
-    tracked : bool
-        Whether the frame before convinced.
     """
 
     tracks: tuple[Track, ...]
-    tracked: bool = False
 
 
 Remember: TypeAlias = Callable[[Memory], None]
@@ -140,13 +129,13 @@ def run(
 
 def scene_of(session: Session, starts: Starts | None = None) -> Scene:
     """The bodies of a session, with poses to begin at in place of the session's, by label."""
-    members = []
+    bodies = []
     for one in session.objects:
         for instance, label in zip(one.instances, one.labels, strict=True):
             start = one.start if not instance else None
-            tracker = _tracker(session, one.body, start, (starts or {}).get(label))
-            members.append(Member(tracker, instance))
-    return Scene(tuple(members))
+            T_start = (starts or {}).get(label)
+            bodies.append(_tracker(session, one.body, start, T_start, instance))
+    return Scene(tuple(bodies))
 
 
 def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Track]:
@@ -155,7 +144,13 @@ def begin(session: Session, T_start: Floats | None = None) -> tuple[Tracker, Tra
     return tracker, tracker.begin()
 
 
-def _tracker(session: Session, body: Body, start: Start | None, T_start: Floats | None) -> Tracker:
+def _tracker(
+    session: Session,
+    body: Body,
+    start: Start | None,
+    T_start: Floats | None,
+    instance: int | None = None,
+) -> Tracker:
     if T_start is None and start is not None:
         T_start = start.T_world_object
     return Tracker.create(
@@ -164,6 +159,7 @@ def _tracker(session: Session, body: Body, start: Start | None, T_start: Floats 
         T_start,
         rotation_deg=start.rotation_deg if start else None,
         distance=start.distance if start else None,
+        instance=instance,
     )
 
 
@@ -216,26 +212,33 @@ def _estimates(
     watch: Watch | None,
     remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
-    cameras = _windowed(session)
-    expectations = [
-        Expectation(one.tracker.body, cameras, one.tracker.free) for one in scene.members
-    ]
-    tracks, tracked = memory.tracks, memory.tracked
+    windowed, tracks = WindowedScene.of(scene, _windowed(session)), memory.tracks
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
             with one_blas_thread():
-                step = _advance(session, scene, expectations, tracks, frame_set, tracked)
-            tracks, tracked = tuple(one.track for one in step.outcomes), step.convinces
+                outcomes, views = windowed.advance(
+                    tracks,
+                    frame_set.number,
+                    frame_set.time_s,
+                    partial(observe, session, frame_set),
+                    _images(frame_set),
+                )
+            tracks = tuple(one.track for one in outcomes)
             latency_ms = 1e3 * (time.perf_counter() - began)
-            for k, outcome in enumerate(step.outcomes):
+            for k, outcome in enumerate(outcomes):
                 estimate = _with_silent_sensors(outcome.estimate, session.sensors)
                 estimate = replace(estimate, latency_ms=latency_ms)
                 if watch is not None:
-                    watch(frame_set, step.views, estimate)
+                    watch(frame_set, views, estimate)
                 if remember is not None and k == 0:
-                    remember(Memory(tracks, tracked))
+                    remember(Memory(tracks))
                 yield estimate
+
+
+def _images(frame_set: FrameSet) -> set[str]:
+    """Sensors whose frames are images."""
+    return {name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)}
 
 
 def _windowed(session: Session) -> dict[str, Sensor]:
@@ -251,72 +254,6 @@ def _windowed(session: Session) -> dict[str, Sensor]:
         and setup.extract.method == "blobs"
         and (setup.extract.threshold == "auto" or not isinstance(setup.extract.threshold, str))
     }
-
-
-class _Step(NamedTuple):
-    """A frame's estimates, what they are made from, and whether windows will do for the next."""
-
-    outcomes: list[Outcome]
-    views: list[View]
-    convinces: bool
-
-
-def _advance(
-    session: Session,
-    scene: Scene,
-    expectations: Sequence[Expectation],
-    tracks: Sequence[Track],
-    frame_set: FrameSet,
-    tracked: bool,
-) -> _Step:
-    """Estimate a frame: around the predictions if that convinces, else from all that is there.
-
-    `tracked` tells whether the frame before convinced.
-    """
-
-    def estimated(views: list[View]) -> _Step:
-        outcomes = scene.advance(tracks, frame_set.number, frame_set.time_s, views)
-        met = all(
-            one.estimate.status == "ok"
-            and is_convincing(
-                one.track.tallies, expected.cameras, member.tracker.rules.acceptance.convincing
-            )
-            for one, expected, member in zip(outcomes, expectations, scene.members, strict=True)
-        )
-        return _Step(outcomes, views, met)
-
-    if tracked:
-        windows = _windows(scene, expectations, tracks, frame_set)
-        if windows:
-            views = observe(session, frame_set, windows)
-            if not any(have_fewer(views, track.tallies) for track in tracks):
-                step = estimated(views)
-                after = zip(step.outcomes, tracks, strict=True)
-                if step.convinces and all(
-                    are_as_good(one.track.tallies, before.tallies) for one, before in after
-                ):
-                    return step
-    return estimated(observe(session, frame_set))
-
-
-def _windows(
-    scene: Scene,
-    expectations: Sequence[Expectation],
-    tracks: Sequence[Track],
-    frame_set: FrameSet,
-) -> dict[str, Window]:
-    """In which part of each image the bodies are expected, one window around all of them."""
-    images = {name for name, one in frame_set.frames.items() if isinstance(one.data, np.ndarray)}
-    windows: dict[str, Window] = {}
-    if not images:
-        return windows
-    for member, expected, track in zip(scene.members, expectations, tracks, strict=True):
-        predictions = member.tracker.predictions(track, frame_set.number, frame_set.time_s)
-        for name, (u0, v0, u1, v1) in expected.windows(predictions).items():
-            if name in images:
-                a, b, c, d = windows.get(name, (u0, v0, u1, v1))
-                windows[name] = (min(a, u0), min(b, v0), max(c, u1), max(d, v1))
-    return windows
 
 
 def observe(

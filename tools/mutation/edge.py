@@ -222,13 +222,6 @@ _RUNNER = (
         "grey values count as narrower than they are",
     ),
     Mutant(
-        "runner-worse-than-before-convinces",
-        "runner.py",
-        "are_as_good(one.track.tallies, before.tallies) for one, before in after",
-        "True for one, before in after",
-        "features that left the window are not looked for",
-    ),
-    Mutant(
         "runner-replaced-source-beside-the-session",
         "runner.py",
         "base=session.folder if replaced is None else Path(),",

@@ -215,6 +215,14 @@ _GATING = (
         "a window that cuts features off is not noticed",
         (_WINDOWS,),
     ),
+    Mutant(
+        "tracking-worse-than-before-convinces",
+        "tracking/gating.py",
+        "are_as_good(now.tallies, then.tallies)",
+        "True",
+        "features that left the window are not looked for",
+        ("test_runner_windows.py",),
+    ),
 )
 
 _RANGE_POSTERIOR = (
@@ -263,7 +271,7 @@ _RANGE_POSTERIOR = (
 _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
-        "tracking/tracker.py",
+        "tracking/outcome.py",
         "residuals=best.noise if is_ok else track.residuals,",
         "residuals=best.noise,",
         "residuals of a wrong pose make the frames after it unsure",
@@ -271,7 +279,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sensors-left-out-are-tallied",
-        "tracking/tracker.py",
+        "tracking/outcome.py",
         "used = best.used\n",
         "used = best.matches\n",
         "the next frame is looked at as a whole although all is well",
@@ -279,7 +287,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-start-widths-ignored",
-        "tracking/tracker.py",
+        "tracking/tracked_body.py",
         "start[:3] = distance",
         "start[:3] *= 1.0",
         "how far off a start may be does nothing",
@@ -287,7 +295,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sure-frames-have-rivals",
-        "tracking/tracker.py",
+        "tracking/outcome.py",
         'hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),',
         "hypotheses=tuple(hypotheses),",
         "frames that are sure list hypotheses",

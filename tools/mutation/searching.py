@@ -179,9 +179,9 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-live-search-forgets",
-        "tracking/tracker.py",
-        "return track.missed(data.log.state, clutter)",
-        "return track.missed(track.search, clutter)",
+        "tracking/outcome.py",
+        "track.missed(data.log.state, clutter)",
+        "track.missed(track.search, clutter)",
         "a live search tries the same guesses in every frame",
         (_STARTS,),
     ),
@@ -220,8 +220,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-never-in-doubt",
         "tracking/proposers/predicted.py",
-        "if not ranked or not is_sure(ranked[0], data.free, rules):",
-        "if not ranked:",
+        "(checks.is_sure and _is_met_as_before(data, ranked[0]))",
+        "_is_met_as_before(data, ranked[0])",
         "where a prediction fails nothing else is tried",
         (_STARTS,),
     ),

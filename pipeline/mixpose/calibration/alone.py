@@ -15,6 +15,8 @@ from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse
 from mixpose.sensors import Sensor
 from mixpose.tracking import Tracker
+from mixpose.tracking.claims import Unclaimed
+from mixpose.tracking.explain import explain
 
 _LEAST = 4  # detections: three leave four poses of any triangle
 
@@ -62,7 +64,8 @@ def hypotheses(
     pattern = PointPattern(points, np.ones(len(points)))
     views = [View(name, own, Observation(pattern, sigma))]
     tracker = Tracker.create(body, EstimatorOptions())
-    ranked = tracker.ranked(tracker.data(tracker.begin(), 0, None, views))
+    frame = tracker.data(tracker.begin(), 0, None, views)
+    ranked = explain(tracker, frame, Unclaimed.whole(views)).ranked
     best = ranked[0].log_evidence if ranked else 0.0
     kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
     kept = kept[: rules.hypotheses]

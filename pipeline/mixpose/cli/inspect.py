@@ -70,7 +70,7 @@ def inspect_frame(
         estimates = [one.estimate for one in outcomes]
     else:
         estimates = _from_file(poses, session, number)
-    bodies = [member.tracker.body for member in scene.members]
+    bodies = [tracked.body for tracked in scene.bodies]
     found = find_several(session.sensors, frame_set.frames, views, bodies, estimates)
     pictures: dict[str, Picture] = {}
     lines = []

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from mixpose.body import ASIDE
-from mixpose.tracking.gating import Expectation, are_as_good, have_fewer, is_convincing
+from mixpose.tracking.gating import (
+    Expectation,
+    WindowedScene,
+    are_as_good,
+    have_fewer,
+    is_convincing,
+)
 from mixpose.tracking.in_motion import UNKNOWN_S
-from mixpose.tracking.rules import Rules
+from mixpose.tracking.rules import Rules, SceneRules
+from mixpose.tracking.scene import Outcome, Scene
 from mixpose.tracking.track import Companion, Prediction, Track, predict
+from mixpose.tracking.tracked_body import TrackedBody
 from mixpose.tracking.tracker import Tracker, estimate_pose
 
 __all__ = [
@@ -14,10 +22,15 @@ __all__ = [
     "UNKNOWN_S",
     "Companion",
     "Expectation",
+    "Outcome",
     "Prediction",
     "Rules",
+    "Scene",
+    "SceneRules",
     "Track",
+    "TrackedBody",
     "Tracker",
+    "WindowedScene",
     "are_as_good",
     "estimate_pose",
     "have_fewer",

@@ -1,13 +1,13 @@
 """Where a track expects the body in its cameras, and whether it was met there.
 
-A frame of which only that was looked at, and whose pose is not as convincing as the one before it,
-is looked at again as a whole (`mixpose.runner`).
+A frame of which only that was looked at, and whose poses are not as convincing as those before it,
+is looked at again as a whole.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -21,10 +21,12 @@ from mixpose.constants import constant
 from mixpose.objective import View, project_body
 from mixpose.records import PointPattern
 from mixpose.sensors import Sensor
-from mixpose.tracking.track import Prediction, SensorTally
+from mixpose.tracking.scene import Outcome, Scene
+from mixpose.tracking.track import Prediction, SensorTally, Track
 
 Box: TypeAlias = tuple[int, int, int, int]
 Tallies: TypeAlias = Mapping[str, SensorTally]
+Observe: TypeAlias = Callable[[Mapping[str, Box]], list[View]]
 
 
 @dataclass(frozen=True)
@@ -104,3 +106,84 @@ def have_fewer(views: Sequence[View], before: Tallies) -> bool:
         and len(view.observation.pattern.points) < before[view.name].met
         for view in views
     )
+
+
+@dataclass(frozen=True)
+class WindowedScene:
+    """A scene that looks where its bodies are expected, and at all there is if that is too little.
+
+    Attributes
+    ----------
+    scene : Scene
+    expectations : tuple of Expectation
+        One per body; their cameras are those whose features in a part of the image are those of
+        the whole image.
+    """
+
+    scene: Scene
+    expectations: tuple[Expectation, ...]
+
+    @classmethod
+    def of(cls, scene: Scene, cameras: Mapping[str, Sensor]) -> WindowedScene:
+        """A scene before cameras that may be looked at in part."""
+        return cls(scene, tuple(Expectation(one.body, cameras, one.free) for one in scene.bodies))
+
+    def advance(
+        self,
+        tracks: Sequence[Track],
+        frame: int,
+        time_s: float | None,
+        observe: Observe,
+        images: Collection[str],
+    ) -> tuple[list[Outcome], list[View]]:
+        """Estimate a frame: around the predictions if that convinces, else from all that is there.
+
+        Parameters
+        ----------
+        tracks, frame, time_s
+            As of `Scene.advance`.
+        observe : callable
+            From boxes of pixels by camera to the views of all sensors; cameras without a box are
+            seen whole.
+        images : collection of str
+            Cameras of which the frame has an image.
+        """
+        if self._are_followed(tracks):
+            windows = self._windows(tracks, frame, time_s, images)
+            views = observe(windows) if windows else []
+            if windows and not any(have_fewer(views, track.tallies) for track in tracks):
+                outcomes = self.scene.advance(tracks, frame, time_s, views)
+                after = [one.track for one in outcomes]
+                if self._are_followed(after) and all(
+                    are_as_good(now.tallies, then.tallies)
+                    for now, then in zip(after, tracks, strict=True)
+                ):
+                    return outcomes, views
+        views = observe({})
+        return self.scene.advance(tracks, frame, time_s, views), views
+
+    def _are_followed(self, tracks: Sequence[Track]) -> bool:
+        """Whether the last frame was sure of all bodies, and met most of each."""
+        bodies = zip(self.scene.bodies, self.expectations, tracks, strict=True)
+        return all(
+            not track.misses
+            and not track.doubted
+            and is_convincing(track.tallies, expected.cameras, tracked.rules.acceptance.convincing)
+            for tracked, expected, track in bodies
+        )
+
+    def _windows(
+        self, tracks: Sequence[Track], frame: int, time_s: float | None, images: Collection[str]
+    ) -> dict[str, Box]:
+        """In which part of each image the bodies are expected, one window around all of them."""
+        windows: dict[str, Box] = {}
+        if not images:
+            return windows
+        for tracked, expected, track in zip(
+            self.scene.bodies, self.expectations, tracks, strict=True
+        ):
+            for name, box in expected.windows(tracked.predictions(track, frame, time_s)).items():
+                if name in images:
+                    a, b, c, d = windows.get(name, box)
+                    windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])
+        return windows

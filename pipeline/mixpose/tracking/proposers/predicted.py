@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mixpose.judgement import ScoredPose, convinces, is_sure
+from mixpose.judgement import ScoredPose
+from mixpose.tracking.assess import assess
 from mixpose.tracking.likelihood import FrameData, Start
 
 
@@ -19,10 +20,10 @@ def predicted(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 def is_doubtful(data: FrameData, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere."""
-    rules = data.rules.acceptance
-    if not ranked or not is_sure(ranked[0], data.free, rules):
+    if not ranked:
         return True
-    return not (convinces(ranked[0], data.free, rules) or _is_met_as_before(data, ranked[0]))
+    checks = assess(ranked[0], data.free, data.rules.acceptance)
+    return not (checks.convinces or (checks.is_sure and _is_met_as_before(data, ranked[0])))
 
 
 def _is_met_as_before(data: FrameData, best: ScoredPose) -> bool:

@@ -14,16 +14,16 @@ import numpy as np
 
 from mixpose.body import like_features, tolerance_of
 from mixpose.judgement import ScoredPose
-from mixpose.scene.members import Member
-from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.explain import Explanation, explain_by
 from mixpose.tracking.proposers.look_alikes import met_features
+from mixpose.tracking.tracked_body import TrackedBody
 
 
 def may_be_another(
     k: int,
     best: ScoredPose,
-    members: Sequence[Member],
-    data: Mapping[int, FrameData],
+    members: Sequence[TrackedBody],
+    found: Mapping[int, Explanation],
     elsewhere: Sequence[bool],
 ) -> str:
     """Why a pose of member k might as well be one of another body, or another of its own.
@@ -34,27 +34,26 @@ def may_be_another(
     ----------
     k : int
     best : ScoredPose
-    members : sequence of Member
-    data : mapping of int to FrameData
-        The frame as it is left for each.
+    members : sequence of TrackedBody
+    found : mapping of int to Explanation
+        Of the frame as it is left for each.
     elsewhere : sequence of bool
         Which members are surely where they are.
     """
-    met, body = met_features(best), members[k].tracker.body
+    met, body = met_features(best), members[k].body
     for j, other in enumerate(members):
-        theirs = other.tracker.body
+        theirs = other.body
         # a body's own markers may repeat themselves: then it may be turned another way
         if j != k and (theirs is body or elsewhere[j]):
             continue
-        limit = best.log_evidence + float(np.log(other.tracker.rules.acceptance.rival))
-        tolerance = tolerance_of(body, theirs, other.tracker.rules.look_alikes.alike)
+        limit = best.log_evidence + float(np.log(other.rules.acceptance.rival))
+        tolerance = tolerance_of(body, theirs, other.rules.look_alikes.alike)
         for part in like_features(body, met, theirs, tolerance):
             if len(part.features) < len(met):
                 continue
             there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
-            own = data[j]
-            seen = replace(own, views=data[k].views, begun=None)
-            found = other.tracker.again(seen, [there], fitted=True)
-            if found and found[0].log_evidence > limit:
+            seen = replace(found[j].frame, views=found[k].frame.views, begun=None)
+            rival = explain_by(other, seen, found[k].left, [there], fitted=True)
+            if rival.ranked and rival.evidence > limit:
                 return part.reason
     return ""

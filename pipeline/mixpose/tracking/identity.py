@@ -13,16 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from mixpose.records import Floats
+from mixpose.tracking.explain import Explanation
 from mixpose.tracking.likelihood import FrameData
-
-Floats: TypeAlias = NDArray[np.float64]
-
 
 _EVEN = float(np.log(0.5))  # odds of an exchange where nobody knows, against the likelier way
 
@@ -43,37 +40,25 @@ class Identities:
     exchanged: Mapping[int, Sequence[tuple[int, float]]]
 
 
-def identify(
-    group: Sequence[int],
-    found: Mapping[int, Floats],
-    data: Mapping[int, FrameData],
-    rival: float,
-    forgotten: int,
-) -> Identities:
-    """Tell which identical body has which pose.
+def identify(group: Sequence[int], explained: Mapping[int, Explanation]) -> Identities:
+    """Tell which of some identical bodies has which pose.
 
-    Parameters
-    ----------
-    group : sequence of int
-        Members that are identical.
-    found : mapping of int to (4, 4) array
-        Poses of those of them that have one.
-    data : mapping of int to FrameData
-        What was known of each before the frame.
-    rival : float
-        Odds from which an exchange casts doubt.
-    forgotten : int
-        Frames without a pose after which two that were lost together may have changed places,
-        wherever they were before.
+    Where two were lost together for so long that no velocity is believed any more, they may have
+    changed places, wherever they were before.
     """
+    data = {k: explained[k].frame for k in group}
+    bests = {k: explained[k].verdict.best for k in group}
+    found = {k: best.T_world_object for k, best in bests.items() if best is not None}
+    rules = explained[group[0]].tracked.rules
     known = [k for k in group if data[k].predictions]
     finders = sorted(found, key=lambda k: tuple(np.round(found[k][:3, 3], 6)))
     if not finders:
         return Identities({}, {})
     likely = _likelihoods(known, finders, found, data)
     poses = _assigned(group, known, finders, likely)
-    lost = {k for k in known if data[k].track.misses > forgotten}
-    return Identities(poses, _exchanges(known, poses, finders, likely, rival, lost))
+    lost = {k for k in known if data[k].track.misses > rules.motion.coasting}
+    limit = float(np.log(rules.acceptance.rival))
+    return Identities(poses, _exchanges(known, poses, finders, likely, limit, lost))
 
 
 def _likelihoods(
@@ -129,12 +114,11 @@ def _exchanges(
     poses: Mapping[int, int],
     finders: Sequence[int],
     likely: Floats,
-    rival: float,
+    limit: float,
     lost: set[int],
 ) -> dict[int, list[tuple[int, float]]]:
     """Members whose poses might be each other's; one without a pose might have any other's."""
     exchanged: dict[int, list[tuple[int, float]]] = {}
-    limit = float(np.log(rival))
     row = {k: i for i, k in enumerate(known)}
     column = {finder: j for j, finder in enumerate(finders)}
     for a in known:
