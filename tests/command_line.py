@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
@@ -21,12 +22,29 @@ def mixpose(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Compl
 
 
 @contextmanager
+def no_signals_ignored() -> Iterator[None]:
+    """Let processes take the signals that this one ignores, as under nohup or behind a `&`."""
+    names = [name for name in ("SIGINT", "SIGHUP") if hasattr(signal, name)]
+    numbers = [signal.Signals[name] for name in names]
+    ignored = [number for number in numbers if signal.getsignal(number) is signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)
+
+
+@contextmanager
 def started(command: list[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
     """A process that goes on while a test does, and is gone after it however it ends.
 
     One that a failing test left behind would be told of, and fail, any test after it.
     """
-    with subprocess.Popen(command, text=True, **options) as process:
+    with no_signals_ignored():
+        process = subprocess.Popen(command, text=True, **options)
+    with process:
         try:
             yield process
         finally:

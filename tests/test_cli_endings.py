@@ -32,9 +32,6 @@ def test_a_request_to_end_finishes_the_video_as_an_interrupt_does(
 ) -> None:
     import cv2
 
-    if signal.getsignal(request_to_end) is signal.SIG_IGN:
-        pytest.skip("run under nohup, which makes all that is started ignore a hang-up")
-
     poses, video = tmp_path / "poses.jsonl", tmp_path / "seen.mp4"
     session = long_cameras(tmp_path)
     command = [sys.executable, "-m", "mixpose", "run", str(session), "-o", str(poses)]

@@ -16,14 +16,15 @@ _GRACE_S = 5.0  # to finish what is open, as after an interrupt
 
 
 def end_with_parent() -> None:
-    """Watch standard input in a thread, and interrupt this process when it ends."""
+    """Watch standard input in a thread, and ask this process to end when it does."""
     threading.Thread(target=_watch, daemon=True).start()
 
 
 def _watch() -> None:
     while os.read(sys.stdin.fileno(), 1):
         pass
-    os.kill(os.getpid(), signal.SIGINT)
+    # taken like an interrupt, which is ignored by what a script starts in the background
+    os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_GRACE_S)
     os._exit(130)
 

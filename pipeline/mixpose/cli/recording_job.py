@@ -138,7 +138,8 @@ class Running:
             self.stopped = True
             for process in self._running:
                 if sys.platform != "win32":  # there the keyboard reaches all by itself
-                    process.send_signal(signal.SIGINT)
+                    # an interrupt is ignored by what a script starts in the background
+                    process.send_signal(signal.SIGTERM)
 
 
 def finished(job: Job) -> Outcome | None:
