@@ -364,6 +364,16 @@ def test_panels_of_one_kind_have_one_scale(parallel_cameras: list[ParallelBeam])
     assert picture.shape[1] == 404
 
 
+def test_what_was_found_far_from_the_pose_leaves_its_density_black(
+    parallel_cameras: list[ParallelBeam],
+) -> None:
+    body = Body("dot", (PointFeature(np.zeros(3)),))
+    far = PointPattern(parallel_cameras[0].project(body.means)[0] + 150.0, np.ones(1))
+    view = View("one", parallel_cameras[0], Observation(far, 2.0))
+    picture = densities_picture(view, body, np.eye(4), [2.0], EstimatorOptions(), (200, 200))
+    assert picture[40:200].max() < 10  # the lowest colour is nearly black
+
+
 def test_a_pose_that_was_not_fitted_is_shown_at_the_blur_that_judges(
     pose_of_frame_6: NDArray[np.float64], parallel_cameras: list[ParallelBeam]
 ) -> None:

@@ -127,7 +127,8 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
 def _untested(surveys: Mapping[str, Survey]) -> str:
     """What takes estimates of a few frames to know, and how to have them."""
     first = min((min(each.numbers) for each in surveys.values() if each.numbers), default=0)
-    return f"whether the geometry fits the recording, mixpose run --stop {first + 3} shows"
+    shown = f"mixpose run --stop {first + 3} shows, as far as it can be seen"
+    return f"whether the geometry fits the recording, {shown}"
 
 
 def _say_object(report: _Report, session: Session, one: ObjectSetup) -> None:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions, check_level
+from mixpose.extraction.point_patterns import points_in
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.sampling import sample
 from mixpose.extraction.threshold import Window
@@ -56,22 +57,10 @@ class CornerRules:
 def extract_corners(
     image: Image, options: ExtractOptions, window: Window, rules: CornerRules = CornerRules()
 ) -> PointPattern:
-    """Saddle points of the grey values in a window.
+    """Saddle points of the grey values in a window of an image, as `points_in` has them.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `threshold` is "auto", or the least difference of grey between bright and dark fields.
-        Corners have neither polarity nor area.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    rules : CornerRules
-
-    Returns
-    -------
-    PointPattern
-        Points in pixels of the whole image, each of weight 1; none where nothing is found.
+    The threshold of the options is "auto", or the least difference of grey between bright and dark
+    fields; corners have neither polarity nor area.
 
     Raises
     ------
@@ -79,11 +68,13 @@ def extract_corners(
         If the threshold is neither "auto" nor a number.
     """
     check_level(options.threshold, "corners", "the least step from bright to dark")
-    u0, v0, u1, v1 = window
-    crop = image[v0:v1, u0:u1].astype(np.float32)
-    large = min(crop.shape) > 2 * rules.margin
-    corners = _find(crop, options.threshold, rules) if large else np.empty((0, 2))
-    return PointPattern(corners + np.array([u0, v0]), np.ones(len(corners)))
+
+    def find(part: Image) -> Floats:
+        if min(part.shape) <= 2 * rules.margin:
+            return np.empty((0, 2))
+        return _find(part.astype(np.float32), options.threshold, rules)
+
+    return points_in(image, window, find)
 
 
 def _find(grey: Grey, threshold: str | float, rules: CornerRules) -> Floats:

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from mixpose.constants import constant
 from mixpose.extraction.background import BackgroundRules, Grey, noise_of
 from mixpose.extraction.options import ExtractOptions, check_level
+from mixpose.extraction.point_patterns import points_in
 from mixpose.extraction.quadratic import stationary_points
 from mixpose.extraction.threshold import Window
 from mixpose.records import Floats, Image, PointPattern
@@ -56,22 +57,10 @@ def extract_log(
     window: Window,
     rules: LaplacianRules = LaplacianRules(),
 ) -> PointPattern:
-    """Centres of unsharp or faint spots in a window.
+    """Centres of unsharp or faint spots in a window of an image, as `points_in` has them.
 
-    Parameters
-    ----------
-    image : (H, W) uint8, uint16 or float32
-    options : ExtractOptions
-        `spot_sigma` is the width of the spots in px, 0 for 3 px.  `threshold` is "auto", or the
-        least height of a spot above what surrounds it, in grey values.  Areas do not matter.
-    window : (u0, v0, u1, v1)
-        Non-empty box inside the image, u1 and v1 exclusive.
-    rules : LaplacianRules
-
-    Returns
-    -------
-    PointPattern
-        Points in pixels of the whole image, each of weight 1; none where nothing is found.
+    Of the options, `spot_sigma` is the width of the spots in px, 0 for 3 px; `threshold` is "auto",
+    or the least height of a spot above what surrounds it, in grey values.  Areas do not matter.
 
     Raises
     ------
@@ -79,9 +68,7 @@ def extract_log(
         If the threshold is neither "auto" nor a number.
     """
     check_level(options.threshold, "log", "the least height of a spot")
-    u0, v0, u1, v1 = window
-    spots = _find(image[v0:v1, u0:u1], options, rules)
-    return PointPattern(spots + np.array([u0, v0]), np.ones(len(spots)))
+    return points_in(image, window, lambda part: _find(part, options, rules))
 
 
 def spot_strength(

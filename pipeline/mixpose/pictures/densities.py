@@ -77,9 +77,9 @@ def densities_picture(
     part, size = fitted(box, room)
     rows = []
     for panels in panels_of(view, body, T, sigmas, options, part, size):
-        top = max(float(one.values.max()) for one in panels)
-        least = min(float(one.values.max()) for one in panels if one.values.max() > 0)
-        bottom = _SHOWN * least
+        peaks = [float(one.values.max()) for one in panels]
+        top = max(peaks) or 1.0  # where nothing was found about the body, all is black
+        bottom = _SHOWN * min((peak for peak in peaks if peak > 0), default=top)
         drawn = [titled(_coloured(one.values, bottom, top), one.title) for one in panels]
         row = in_grid(drawn, len(drawn))
         rows += [row, _bar(row.shape[1], drawn[0], bottom, top)]
