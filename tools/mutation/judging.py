@@ -207,7 +207,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-open-turns-are-sure",
         "judgement/acceptance.py",
-        "bool(turns.max() < _OPEN_TURN**2)",
+        "bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < _OPEN_TURN**2)",
         "True",
         "the turn about a line of features is called sure",
     ),
@@ -250,8 +250,8 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-too-few-coordinates-fix-a-pose",
         "judgement/acceptance.py",
-        "return judged.measurements >= int(free.sum())",
-        "return True",
+        "fixed = pose.measurements >= int(free.sum())",
+        "fixed = True",
         "a pose is told that the data do not fix",
     ),
     Mutant(
@@ -264,15 +264,15 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-anything-convinces",
         "judgement/acceptance.py",
-        "return share > rules.convincing and is_sure(judged, free, rules)",
-        "return is_sure(judged, free, rules)",
+        "return share > rules.convincing",
+        "return True",
         "a body that slipped by a step of its grid is not looked for elsewhere",
     ),
     Mutant(
         "judgement-a-covered-sensor-makes-doubt",
         "judgement/acceptance.py",
-        "if len(agreeing) > 1 else judged.coverage",
-        "if len(agreeing) > 99 else judged.coverage",
+        "if len(agreeing) > 1 else pose.coverage",
+        "if len(agreeing) > 99 else pose.coverage",
         "a covered camera makes every frame slow",
     ),
     Mutant(
@@ -310,8 +310,8 @@ _JUDGE = (
     Mutant(
         "judgement-most-turned-twin",
         "judgement/judge.py",
-        "alike[int(np.argmax(traces))]",
-        "alike[int(np.argmin(traces))]",
+        "nearest = int(np.argmax(traces))",
+        "nearest = int(np.argmin(traces))",
         "of poses that look the same the farthest is told",
     ),
     Mutant(

@@ -119,7 +119,7 @@ _DESIGN = (
         "markers on the back are counted",
     ),
     Mutant(
-        "design-mirror-images-are-alike",
+        "body-mirror-images-are-alike",
         "body/symmetry.py",
         "R = (U * proper[:, None]) @ Vt",
         "R = U @ Vt",

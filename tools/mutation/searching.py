@@ -274,8 +274,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/evidence.py",
-        "weights=visible.swapaxes(0, 1)",
-        "weights=shares.swapaxes(0, 1)",
+        '"weights": visible.astype(np.float64)',
+        '"weights": shares.astype(np.float64)',
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,9 +109,67 @@ class Verdict:
         return replace(self, status="ambiguous", doubt=doubt) if doubt else self
 
 
-def is_possible(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
-    """Whether a pose is worth telling by itself."""
-    return _is_fixed(judged, free) and judged.log_evidence > rules.possible
+class Checks(NamedTuple):
+    """What a pose is worth by itself, by some rules; each check holds only where those before do.
+
+    Attributes
+    ----------
+    rules : AcceptanceRules
+    is_fixed : bool
+        Whether what is met fixes a pose in the directions that are estimated.
+    is_possible : bool
+        Whether it is worth telling.
+    is_sure : bool
+        Whether it is believed, if no rival casts doubt on it.
+    convinces : bool
+        Whether, near its prediction, it needs no other to compare with.
+    """
+
+    rules: AcceptanceRules
+    is_fixed: bool = False
+    is_possible: bool = False
+    is_sure: bool = False
+    convinces: bool = False
+
+
+def assess(pose: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> Checks:
+    """Check a pose that is estimated in free directions (6,); once, and kept with the pose."""
+    known: list[Checks] = pose.checked
+    if known and known[0].rules is rules:
+        return known[0]
+    fixed = pose.measurements >= int(free.sum())
+    possible = fixed and pose.log_evidence > rules.possible
+    sure = possible and pose.log_evidence > rules.sure and _is_turned(pose, rules)
+    sure = sure and _is_recognised(pose, rules)
+    checks = Checks(rules, fixed, possible, sure, sure and _is_complete(pose, rules))
+    known[:] = [checks]
+    return checks
+
+
+def _is_turned(pose: ScoredPose, rules: AcceptanceRules) -> bool:
+    """Whether no wide sector of turns is left open, as ranges may."""
+    turn = 0.0 if pose.spread is None else 1.96 * float(pose.spread[3:].max())
+    return bool(turn < np.radians(rules.widest_turn_deg))
+
+
+def _is_recognised(pose: ScoredPose, rules: AcceptanceRules) -> bool:
+    """Whether enough of the body is met that another one cannot pass for it.
+
+    Three markers of another body may well lie as three of this one, where it was expected even.
+    """
+    in_view = int(np.count_nonzero(pose.matches.weights.any(axis=0)))
+    met = int(np.count_nonzero(pose.matches.met_by))
+    return met >= min(rules.majority * in_view, rules.enough)
+
+
+def _is_complete(pose: ScoredPose, rules: AcceptanceRules) -> bool:
+    """Whether so much is met that it could not be elsewhere.
+
+    Of two sensors or more that agree, others may be covered, blind or out of step.
+    """
+    agreeing = [share for share in pose.matches.coverage.tolist() if share >= rules.agreeing]
+    share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else pose.coverage
+    return share > rules.convincing
 
 
 def stands_out(
@@ -128,43 +187,11 @@ def stands_out(
     return ranked[0].log_evidence > max(rules.doubtful, float(rest) + rules.standing_out)
 
 
-def _is_fixed(judged: ScoredPose, free: NDArray[np.bool_]) -> bool:
-    return judged.measurements >= int(free.sum())
-
-
-def is_recognised(judged: ScoredPose, rules: AcceptanceRules) -> bool:
-    """Whether enough of the body is met that another one cannot pass for it.
-
-    Three markers of another body may well lie as three of this one, where it was expected even.
-    """
-    in_view = int(np.count_nonzero(judged.matches.weights.any(axis=0)))
-    met = int(np.count_nonzero(judged.matches.met_by))
-    return met >= min(rules.majority * in_view, rules.enough)
-
-
-def is_sure(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
-    """Whether a pose is believed, if no rival casts doubt on it."""
-    if not is_possible(judged, free, rules) or judged.log_evidence <= rules.sure:
-        return False
-    # no wide sector of turns is left open, as ranges may
-    turn = 0.0 if judged.spread is None else 1.96 * float(judged.spread[3:].max())
-    is_turned = bool(turn < np.radians(rules.widest_turn_deg))
-    return is_turned and is_recognised(judged, rules)
-
-
-def convinces(judged: ScoredPose, free: NDArray[np.bool_], rules: AcceptanceRules) -> bool:
-    """Whether a pose near its prediction needs no other to compare with."""
-    agreeing = [share for share in judged.matches.coverage.tolist() if share >= rules.agreeing]
-    # of two sensors or more that agree, others may be covered, blind or out of step
-    share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else judged.coverage
-    return share > rules.convincing and is_sure(judged, free, rules)
-
-
 def decide(
     ranked: Sequence[ScoredPose], free: NDArray[np.bool_], rules: AcceptanceRules
 ) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
-    told = (one for one in ranked if is_possible(one, free, rules))
+    told = (one for one in ranked if assess(one, free, rules).is_possible)
     best = ranked[0] if stands_out(ranked, free, rules) else next(told, None)
     if best is None:
         return Verdict("lost", None, [])
@@ -173,12 +200,12 @@ def decide(
     rivals = [weight for one, weight in zip(ranked, weights, strict=True) if one is not best]
     clear = max(rivals, default=0.0) < rules.rival
     # nor is a turn left open, as about the line that all features met lie on
-    turns = np.linalg.eigvalsh(best.covariance[3:, 3:])
-    clear = clear and is_sure(best, free, rules) and bool(turns.max() < _OPEN_TURN**2)
+    if clear := clear and assess(best, free, rules).is_sure:
+        clear = bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < _OPEN_TURN**2)
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
-        if one is best or (weight >= rules.listed and _is_fixed(one, free))
+        if one is best or (weight >= rules.listed and assess(one, free, rules).is_fixed)
     ]
     return Verdict("ok" if clear else "ambiguous", best, kept)
 

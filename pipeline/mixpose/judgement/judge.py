@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,8 @@ class ScoredPose:
     spread: Floats | None = None
     proposer: str = ""
     blurs: tuple[Mapping[str, float], ...] = ()
+    # what the rules of acceptance make of it, once they are asked
+    checked: list[Any] = field(default_factory=list, init=False, repr=False)
 
     @cached_property
     def used(self) -> Matches:

@@ -9,13 +9,14 @@ from functools import cached_property
 from mixpose.fit import Fit
 from mixpose.judgement import (
     APART,
+    Checks,
     ScoredPose,
     Verdict,
+    assess,
     contradict,
     decide,
     insert,
 )
-from mixpose.tracking.assess import NOTHING, Checks, assess
 from mixpose.tracking.claims import Claim, Unclaimed, claims_of
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start, likelihood_of
 from mixpose.tracking.proposers.look_alikes import reason
@@ -62,7 +63,7 @@ class Explanation:
     def checks(self) -> Checks:
         """What the best pose is worth by itself."""
         rules = self.tracked.rules.acceptance
-        return assess(self.ranked[0], self.frame.free, rules) if self.ranked else NOTHING
+        return assess(self.ranked[0], self.frame.free, rules) if self.ranked else Checks(rules)
 
     @property
     def is_sure(self) -> bool:

@@ -40,6 +40,8 @@ def _paired(seen: Matches, reach: float) -> Matches:
 
     `reach` is how far that may be, squared, in variances of C.
     """
+    if not seen.missed.any():
+        return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
     merged = seen.merged.copy()
     for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):

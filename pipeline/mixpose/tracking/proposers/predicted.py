@@ -6,8 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mixpose.judgement import ScoredPose
-from mixpose.tracking.assess import assess
+from mixpose.judgement import ScoredPose, assess
 from mixpose.tracking.likelihood import FrameData, Start
 
 
