@@ -54,7 +54,7 @@ def test_frames_that_would_show_the_geometry_count_from_the_first(
     for path in sorted(recording.glob("*0000.png")) + sorted(recording.glob("*0001.png")):
         path.unlink()
     report = report_on(recording / "session.toml", capsys, quick=True)
-    assert report.endswith("mixpose run --stop 5 shows\n")
+    assert report.endswith("mixpose run --stop 5 shows, as far as it can be seen\n")
 
 
 def test_corners_have_no_polarity(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:

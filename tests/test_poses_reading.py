@@ -53,8 +53,9 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert np.array_equal(back.symmetries["tracker"], symmetries["tracker"])
     (line,) = back.poses
     assert line.line == 2
+    apart = ("hypotheses", "proposer", "blurs", "doubt", "offsets", "guesses", "delays")
     for name, value in asdict(estimate).items():
-        if name not in ("hypotheses", "proposer", "doubt", "offsets", "guesses", "delays"):
+        if name not in apart:
             assert np.array_equal(np.asarray(asdict(line)[name]), np.asarray(value)), name
     assert np.array_equal(line.hypotheses[0].T_world_object, T)
     assert line.hypotheses[0].weight == 0.7
