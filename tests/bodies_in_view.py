@@ -10,8 +10,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
-from mixpose.records import Estimate, PointPattern
-from mixpose.rigid import Floats, from_rotation_vector, rotation_angle_deg, transform
+from mixpose.records import Estimate, Floats, PointPattern
+from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Scene, Tracker
 

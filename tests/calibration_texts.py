@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mixpose.rigid import Floats, from_parts, inverse
+from mixpose.records import Floats
+from mixpose.rigid import from_parts, inverse
 
 K1 = np.array([[810.5, 0, 640.25], [0, 805.0, 512.5], [0, 0, 1]])
 K2 = np.array([[795.25, 0, 630.5], [0, 799.5, 498.75], [0, 0, 1]])

@@ -21,7 +21,7 @@ GROUND = {"errors", "rigid", "records", "selection", "constants", "threads"} | {
 }
 MAY_IMPORT: dict[str, set[str]] = {
     "errors": set(),
-    "rigid": set(),
+    "rigid": {"records"},
     "records": set(),
     "selection": set(),
     "constants": set(),

@@ -14,7 +14,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.checking import look_alikes, noise_of, typical_poses, with_image_sizes
 from mixpose.extraction import ExtractOptions
 from mixpose.fit import EstimatorOptions
-from mixpose.rigid import Floats, from_parts, from_rotation_vector
+from mixpose.records import Floats
+from mixpose.rigid import from_parts, from_rotation_vector
 from mixpose.sensors import PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.session.setup import Unit

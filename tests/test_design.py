@@ -24,7 +24,8 @@ from mixpose.design.equality import scaled
 from mixpose.design.prediction import at_tip
 from mixpose.design.study import SHARE_OF_RADIUS
 from mixpose.executing import in_processes
-from mixpose.rigid import Floats, perturb, rotation_angle_deg, rotation_matrix, transform
+from mixpose.records import Floats
+from mixpose.rigid import perturb, rotation_angle_deg, rotation_matrix, transform
 from mixpose.sensors import ParallelBeam, PinholeCamera, RangeSensor, Sensor
 from mixpose.session import load_session
 from mixpose.session.marker_files import read_marker_file

@@ -14,12 +14,13 @@ from matches import Seen, scored
 from mixpose.cli.findings import Stretches
 from mixpose.judgement import AcceptanceRules, NoiseModel, contradict
 from mixpose.matching import Noise
-from mixpose.rigid import Floats
 from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 from faults import FAULTS, Fault, outcome, rewritten
+
+from mixpose.records import Floats
 
 RULES, MODEL = AcceptanceRules(), NoiseModel()
 QUIET = Noise(squares=0.01, degrees=100.0)  # offsets of 0.01 σ: far below what is put in below

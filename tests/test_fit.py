@@ -11,8 +11,8 @@ from mixpose.density import Observation
 from mixpose.fit import Climbed, EstimatorOptions, ScheduleRules, blur_schedule, fit_near
 from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
 from mixpose.objective import NormalPrior, View, matched_objective
-from mixpose.records import GridPattern
-from mixpose.rigid import Floats, perturb, twist_between
+from mixpose.records import Floats, GridPattern
+from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import ParallelBeam, PinholeCamera
 
 

@@ -14,8 +14,8 @@ from mixpose.judgement.expected_covariance import expected_covariance
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, errors_seen
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.optimise import Ascent, ascend
-from mixpose.records import PointPattern
-from mixpose.rigid import Floats, perturb, twist_between
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import PinholeCamera
 
 NOISE_PX = 0.2

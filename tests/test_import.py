@@ -12,7 +12,8 @@ from rounding import rounding
 
 from mixpose.errors import SessionError
 from mixpose.importing import gather, session_text
-from mixpose.rigid import Floats, from_parts, rotation_matrix
+from mixpose.records import Floats
+from mixpose.rigid import from_parts, rotation_matrix
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import Session, load_session
 from mixpose.session.setup import Unit

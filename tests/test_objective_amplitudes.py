@@ -9,8 +9,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import AmplitudesObjective, MatchedObjective, View, matched_objective
 from mixpose.objective.matched import FINE_STEPS
-from mixpose.records import GridPattern
-from mixpose.rigid import Floats, perturb
+from mixpose.records import Floats, GridPattern
+from mixpose.rigid import perturb
 from mixpose.sensors import ParallelBeam
 
 PLACES = np.array([[0.0, 0.0, 0.0], [4.0, 1.0, 3.0], [-12.0, 9.0, -5.0]])

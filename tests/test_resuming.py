@@ -21,13 +21,14 @@ from mixpose.cli import lines, main
 from mixpose.cli.lines import LineFile, note_path
 from mixpose.encoding import decode, encode
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats
 from mixpose.runner import Memory
 from mixpose.whole_files import appearing_whole
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
 from kills import one_round, without_latency
+
+from mixpose.records import Floats
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 BEAMS = SYNTHETIC / "parallel_beams" / "session.toml"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from session_lines import message_of, with_lines
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.marker_files import read_marker_file
 from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError

@@ -11,7 +11,7 @@ import pytest
 from rounding import rounding
 
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, load_session
 

@@ -12,8 +12,8 @@ from bodies_in_view import CAMERAS, OTHER, TOOL, at, body, off, scene_of, views_
 
 from mixpose.density import Observation
 from mixpose.judgement import Prior
-from mixpose.records import PointPattern
-from mixpose.rigid import Floats, from_rotation_vector, transform
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import from_rotation_vector, transform
 from mixpose.tracking import Companion, Rules, Scene, Track
 from mixpose.tracking.track import either
 

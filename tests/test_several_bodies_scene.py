@@ -22,8 +22,7 @@ from mixpose.poses.estimates import estimate_of
 from mixpose.poses.evaluate import evaluate
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import Estimate, PointPattern
-from mixpose.rigid import Floats
+from mixpose.records import Estimate, Floats, PointPattern
 from mixpose.search import SearchResult, search_frame
 from mixpose.tracking import Scene, SceneRules, Track
 from mixpose.tracking.claims import Claim, expected_owners, merged_spots, overlap, owners_of

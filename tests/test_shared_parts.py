@@ -18,7 +18,8 @@ from mixpose.body import (
     tolerance_of,
 )
 from mixpose.checking import shared_part_warnings
-from mixpose.rigid import Floats, from_rotation_vector, transform
+from mixpose.records import Floats
+from mixpose.rigid import from_rotation_vector, transform
 from mixpose.session import load_session
 
 FIVE = np.array([[0, 0, 0], [60, 5, 0], [-20, 50, 10], [11, -37, 41], [35, 30, -40.0]])

@@ -31,7 +31,7 @@ from mixpose.design import (
 from mixpose.design.equality import scaled
 from mixpose.design.summary import pooled
 from mixpose.executing import Executor, executor
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session import Session, load_session
 
 TWO_CAMERAS = Path(__file__).resolve().parents[1] / "data" / "synthetic" / "two_cameras"

@@ -33,8 +33,7 @@ from mixpose.body import Body
 from mixpose.density import Observation, Window, render
 from mixpose.frames import Source, pair
 from mixpose.poses.poseline import PoseLine
-from mixpose.records import FrameSet, GridPattern, Image, PointPattern
-from mixpose.rigid import Floats
+from mixpose.records import Floats, FrameSet, GridPattern, Image, PointPattern
 from mixpose.runner import observation_of
 from mixpose.sensors import FisheyeCamera, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-Floats = NDArray[np.float64]
+from mixpose.records import Floats
 
 TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density import Observation
 from mixpose.errors import SessionError
@@ -21,6 +20,7 @@ from mixpose.limits import MOST_DETECTIONS
 from mixpose.objective import View
 from mixpose.records import (
     Estimate,
+    Floats,
     FrameSet,
     GridPattern,
     Pattern,
@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from mixpose.sensors import Sensor
     from mixpose.session import SensorSetup, Session, Start
 
-Floats: TypeAlias = NDArray[np.float64]
 Watch: TypeAlias = Callable[[FrameSet, Sequence[View], Estimate], None]
 Starts: TypeAlias = Mapping[str, Floats]
 

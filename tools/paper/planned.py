@@ -8,7 +8,7 @@ import numpy as np
 
 from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.sensors import ParallelBeam
 from mixpose.session import SensorSetup, Session, Start
 from paper.systems import SCENARIOS, System, draw, pose

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 Spread: TypeAlias = Literal["gaussian", "uniform"]
 

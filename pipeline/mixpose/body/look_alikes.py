@@ -23,9 +23,8 @@ from scipy.spatial.distance import cdist
 from mixpose.body.features import PointFeature
 from mixpose.body.model import Body
 from mixpose.body.symmetry import SAME_NORMAL, congruent_triples, motions, widest_triple
+from mixpose.records import Floats
 from mixpose.rigid import from_parts, rotation_angle_deg, transform
-
-Floats: TypeAlias = NDArray[np.float64]
 
 ASIDE = "the body explains as much a step of its grid aside"
 

@@ -13,8 +13,7 @@ from scipy.special import ndtri
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
 from mixpose.body.symmetry import default_tolerance, grid_steps, keeps_normals, symmetries
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats
 
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
 

@@ -10,16 +10,13 @@ a feature within the tolerance are kept.
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from mixpose.records import Floats
 from mixpose.rigid import from_parts, transform
-
-Floats: TypeAlias = NDArray[np.float64]
 
 SAME_NORMAL = 0.99  # cosine
 _SAME_TURN = np.radians(1.0)

@@ -17,10 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.rules import CalibrationRules
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg
 
-Mask: TypeAlias = NDArray[np.bool_]
 Ints: TypeAlias = NDArray[np.intp]
 Seen: TypeAlias = Sequence[Mapping[int, Hypotheses]]
 """By frame, then by sensor."""

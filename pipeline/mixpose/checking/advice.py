@@ -13,8 +13,7 @@ from mixpose.errors import MixposeError
 from mixpose.extraction import METHODS, ExtractOptions
 from mixpose.fit import free_mask
 from mixpose.objective import View
-from mixpose.records import FrameSet, Image, PointPattern, RawFrame
-from mixpose.rigid import Floats
+from mixpose.records import Floats, FrameSet, Image, PointPattern, RawFrame
 from mixpose.runner import begin, observe
 from mixpose.session import SensorSetup, Session
 

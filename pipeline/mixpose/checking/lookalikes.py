@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,11 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
 from mixpose.objective import pose_jacobian
-from mixpose.rigid import Floats, perturb, rotation_angle_deg, transform
+from mixpose.records import Floats, Mask
+from mixpose.rigid import perturb, rotation_angle_deg, transform
 from mixpose.search.spread import spread_turns
 from mixpose.sensors import RangeSensor, Sensor
 from mixpose.session import SensorSetup
-
-Mask: TypeAlias = NDArray[np.bool_]
 
 NOISE_OF_SIGMA = 0.2
 """What centres of blobs and corners err by, of σ_ε; ranges err by σ_ε."""

@@ -9,9 +9,9 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.checking.typical import typical_poses
-from mixpose.rigid import Floats, inverse, rotation_angle_deg, transform
+from mixpose.records import Floats, Mask
+from mixpose.rigid import inverse, rotation_angle_deg, transform
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
-from mixpose.sensors.base import Mask
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.visible_spots import facing
 

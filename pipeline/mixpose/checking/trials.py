@@ -16,8 +16,8 @@ import numpy as np
 from mixpose.body import Body, PointFeature
 from mixpose.fit import free_mask
 from mixpose.objective import View
-from mixpose.records import PointPattern
-from mixpose.rigid import Floats, inverse
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import inverse
 from mixpose.runner import begin
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.central_pose import count_seen, pivot_of, places

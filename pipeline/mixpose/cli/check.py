@@ -37,7 +37,8 @@ from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source
 from mixpose.judgement import expected_covariance
-from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import open_sources
 from mixpose.session import ObjectSetup, SensorSetup, Session, load_session
 

@@ -20,7 +20,7 @@ from mixpose.errors import SessionError
 from mixpose.executing import Executor, in_processes, on_cluster
 from mixpose.pictures.signature import refuse_foreign, sign_figure
 from mixpose.poses.jsonl import read_poses
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session import Session, load_session
 from mixpose.whole_files import appearing_whole
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from mixpose.body import Body, PointFeature
 from mixpose.design.prediction import Plan
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
 
 ErrorOf: TypeAlias = Callable[[Plan], float]

@@ -15,7 +15,8 @@ import numpy as np
 from mixpose.design.prediction import Plan, Prediction, at_tip, predict
 from mixpose.design.written import plan_text
 from mixpose.executing import Executor, in_threads
-from mixpose.rigid import Floats, inverse, twist_between
+from mixpose.records import Floats
+from mixpose.rigid import inverse, twist_between
 from mixpose.runner import run
 from mixpose.session import Session, load_session
 from mixpose.simulation import SimulationOptions, simulate

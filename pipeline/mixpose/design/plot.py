@@ -9,7 +9,8 @@ import numpy as np
 
 from mixpose.design.study import Study
 from mixpose.errors import SessionError
-from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

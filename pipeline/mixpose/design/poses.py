@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.session import Session
 from mixpose.simulation.central_pose import central_pose, pivot_of
 

@@ -16,21 +16,18 @@ the target registration error of Fitzpatrick, West and Maurer (1998, equation 46
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.checking import noise_of
 from mixpose.fit import free_mask
 from mixpose.judgement import invert_information
 from mixpose.objective import pose_jacobian
-from mixpose.rigid import Floats, transform
+from mixpose.records import Floats, Mask
+from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
 from mixpose.session import Session
-
-Mask: TypeAlias = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

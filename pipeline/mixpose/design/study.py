@@ -16,7 +16,7 @@ from mixpose.design.equality import noise_to_equal, scaled
 from mixpose.design.prediction import Plan, at_tip, plan_of, predict
 from mixpose.design.summary import Summary, pooled, summarise
 from mixpose.executing import Executor
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session import SensorSetup, Session
 
 SHARE_OF_RADIUS = 0.1

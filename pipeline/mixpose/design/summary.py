@@ -8,7 +8,8 @@ import numpy as np
 
 from mixpose.checking import LookAlike, look_alikes
 from mixpose.design.prediction import Plan, Prediction, at_tip
-from mixpose.rigid import Floats, transform
+from mixpose.records import Floats
+from mixpose.rigid import transform
 from mixpose.session import SensorSetup
 
 _TRIED = 3  # poses at which others that look alike are searched for: a second each

@@ -12,7 +12,8 @@ from mixpose.design.confirmation import Confirmation
 from mixpose.design.prediction import Plan
 from mixpose.design.study import Equal, Study, System
 from mixpose.design.summary import Summary, Weakness, pooled
-from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.sensors import RangeSensor, Sensor
 
 _DEGREES = 180 / np.pi

@@ -11,7 +11,7 @@ import numpy as np
 from mixpose.body import Body, SegmentFeature
 from mixpose.design.prediction import Plan
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.sensors import (
     FisheyeCamera,
     ParallelBeam,

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.records import Floats
-
-Mask: TypeAlias = NDArray[np.bool_]
+from mixpose.records import Floats, Mask
 
 FEWEST = 6  # points of an ellipse: five always lie on a conic
 

@@ -24,18 +24,10 @@ from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.extraction.background import Grey
-from mixpose.extraction.conics import (
-    FEWEST,
-    Ellipse,
-    Ellipses,
-    Mask,
-    distances,
-    fit_conics,
-    turns,
-)
+from mixpose.extraction.conics import FEWEST, Ellipse, Ellipses, distances, fit_conics, turns
 from mixpose.extraction.contours import Contour
 from mixpose.extraction.sampling import sample, sample_each
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 
 # Directions in which the rim is looked for.
 DIRECTIONS = 72

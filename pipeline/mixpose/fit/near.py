@@ -42,10 +42,10 @@ from mixpose.objective import (
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
+from mixpose.records import Floats
 from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Motion
 
-Floats: TypeAlias = NDArray[np.float64]
 Blurs: TypeAlias = list[float]
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.calibration import CalibratedCamera, Rig, read_rigs
 from mixpose.session.marker_files import READERS, read_marker_file
 from mixpose.session.messages import BadKeyError, one_line

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from mixpose.importing.gather import Imported
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.calibration import CalibratedCamera
 
 _EXAMPLE_MM = [[0, 0, 0], [60, 0, 0], [0, 100, 0], [20, 30, 80]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -14,9 +13,7 @@ from mixpose.extraction.blobs import find_blobs
 from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.threshold import Foreground, above, foreground
 from mixpose.pictures.finding import Expectation, Finding
-from mixpose.records import GridPattern, Image, PointPattern
-
-Floats: TypeAlias = NDArray[np.float64]
+from mixpose.records import Floats, GridPattern, Image, PointPattern
 
 _NOTHING_NOISES = 4.0  # a place this little above the background holds nothing
 _NEAR_SIGMAS = 3.0  # how far around a predicted place its light is looked for

@@ -13,7 +13,6 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions
@@ -23,8 +22,8 @@ from mixpose.pictures.canvas import WHITE, Picture, line_height, words
 from mixpose.pictures.layout import in_grid, stacked
 from mixpose.pictures.overlay import Part
 from mixpose.pictures.stages import fitted, shown_box, titled
+from mixpose.records import Floats
 
-Floats: TypeAlias = NDArray[np.float64]
 Size: TypeAlias = tuple[int, int]
 Look: TypeAlias = Callable[[Floats], Floats]
 

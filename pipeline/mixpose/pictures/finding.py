@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.density import Observation
@@ -15,12 +13,9 @@ from mixpose.judgement import JudgementRules
 from mixpose.matching import AssociationRules, Matches, associate
 from mixpose.objective import View, matched_objective
 from mixpose.pictures.overlay import projected_features
-from mixpose.records import Estimate, PointPattern, RawFrame
+from mixpose.records import Estimate, Floats, Mask, PointPattern, RawFrame
 from mixpose.rigid import transform
 from mixpose.session import SensorSetup
-
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

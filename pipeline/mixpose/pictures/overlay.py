@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +22,9 @@ from mixpose.pictures.canvas import (
     stroke,
     words,
 )
-from mixpose.records import Status
+from mixpose.records import Floats, Status
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor, facing
-
-Floats: TypeAlias = NDArray[np.float64]
 
 STATUS_COLOURS: dict[Status, Colour] = {
     "ok": (90, 230, 70),

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
@@ -16,14 +15,13 @@ from mixpose.pictures.finding import Finding
 from mixpose.pictures.overlay import ellipse_95
 from mixpose.pictures.ranges import half_widths_95
 from mixpose.pictures.slices import Map, Slice
-from mixpose.records import Estimate, GridPattern, PointPattern
+from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import TWIST_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats: TypeAlias = NDArray[np.float64]
 
 _DPI = 100
 _MEASURED, _EXPECTED = "#1f6fb4", "#2a9134"

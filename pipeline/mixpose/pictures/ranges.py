@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,8 @@ from mixpose.pictures.overlay import (
     projected_covariances,
     projected_features,
 )
-from mixpose.records import GridPattern, Pattern, PointPattern, Status
+from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Status
 from mixpose.sensors import Sensor
-
-Floats: TypeAlias = NDArray[np.float64]
 
 BACKGROUND = 24  # grey level
 STRIP_SIZE = (960, 130)

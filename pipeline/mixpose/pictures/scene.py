@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, line_height, ring, stroke, words
@@ -17,8 +15,6 @@ from mixpose.pictures.overlay import BODY_COLOURS, FOUND, Part, caption, draw_po
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
 from mixpose.records import Estimate, FrameSet, GridPattern, PointPattern, RawFrame
 from mixpose.session import SensorSetup, Session
-
-Floats: TypeAlias = NDArray[np.float64]
 
 LARGEST = (1920, 1080)
 _MOST_ENLARGED = 2

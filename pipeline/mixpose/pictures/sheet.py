@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.objective import View
@@ -21,8 +19,6 @@ from mixpose.pictures.slices import objective_around
 from mixpose.pictures.stages import features_picture, pose_picture, threshold_picture
 from mixpose.records import Estimate
 from mixpose.session import Session
-
-Floats: TypeAlias = NDArray[np.float64]
 
 BODIES = "bodies.png"
 """The frames of all sensors with the poses of several bodies."""

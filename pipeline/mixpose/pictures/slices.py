@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View, build_objective, pose_jacobian
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-
-Floats: TypeAlias = NDArray[np.float64]
 
 _WIDE = 1.5  # widest blurs to either side of a slice
 _NARROW = 5.0  # finest blurs to either side of a map

@@ -35,10 +35,9 @@ from mixpose.pictures.overlay import (
     projected_features,
 )
 from mixpose.pictures.scene import backdrop
-from mixpose.records import Estimate, GridPattern, PointPattern
+from mixpose.records import Estimate, Floats, GridPattern, PointPattern
 from mixpose.rigid import transform
 
-Floats: TypeAlias = NDArray[np.float64]
 Size: TypeAlias = tuple[int, int]
 
 ABOVE: Colour = (0, 140, 255)

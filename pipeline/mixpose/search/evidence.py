@@ -11,10 +11,9 @@ from scipy.spatial import cKDTree
 from mixpose.judgement import odds_of, paid_by_count
 from mixpose.matching import Matches, crowding
 from mixpose.objective import Projected, project_body
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.search.detections import SensorDetections
 from mixpose.search.problem import SearchProblem
-from mixpose.search.triangulation import Indices
 
 
 def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:

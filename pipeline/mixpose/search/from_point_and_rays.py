@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.search.problem import Generator, SearchProblem
 from mixpose.search.spread import far_apart
 from mixpose.search.three_points import align_triples
-from mixpose.search.triangulation import Indices, TriangulatedPoints
+from mixpose.search.triangulation import TriangulatedPoints
 
 
 class _Places(NamedTuple):

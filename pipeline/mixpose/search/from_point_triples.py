@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mixpose.body import Body
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.search.problem import Generator, SearchProblem
 from mixpose.search.three_points import FIRST, SECOND, align_triples, gathered
-from mixpose.search.triangulation import Indices, TriangulatedPoints
+from mixpose.search.triangulation import TriangulatedPoints
 
 
 class FeatureTriangles(NamedTuple):

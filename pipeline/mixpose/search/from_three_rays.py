@@ -10,11 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.search.problem import Generator, SearchProblem
 from mixpose.search.spread import far_apart
 from mixpose.search.three_points import FIRST, SECOND, align_triples, depths, gathered
-from mixpose.search.triangulation import Indices
 from mixpose.sensors import Rays
 
 Triples: TypeAlias = tuple[Indices, Indices]  # (3, K) detections, and the features they may be

@@ -15,9 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts
-from mixpose.search.triangulation import Indices
 
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.sensors import Rays
-
-Indices: TypeAlias = NDArray[np.intp]
 
 
 @dataclass(frozen=True)

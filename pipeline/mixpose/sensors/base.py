@@ -12,16 +12,15 @@ Conventions
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol, Self, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mixpose.records import Floats, Mask
 
 if TYPE_CHECKING:
     from mixpose.sensors.rays import Rays
 
-Floats: TypeAlias = NDArray[np.float64]
-Mask: TypeAlias = NDArray[np.bool_]
 
 OUTSIDE = -1.0e6
 

@@ -11,7 +11,8 @@ from typing import Protocol
 
 import numpy as np
 
-from mixpose.sensors.base import OUTSIDE, Floats, Mask, Sensor
+from mixpose.records import Floats, Mask
+from mixpose.sensors.base import OUTSIDE, Sensor
 from mixpose.sensors.distortion import LensDistortion
 from mixpose.sensors.lateration import RangeSensor
 from mixpose.sensors.pinhole import NEAREST, PinholeCamera

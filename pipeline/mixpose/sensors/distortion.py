@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mixpose.sensors.base import Floats
+from mixpose.records import Floats
 
 ALLOWED_COUNTS = (0, 4, 5, 8, 12, 14)
 _COUNT = 14

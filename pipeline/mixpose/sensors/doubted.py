@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mixpose.rigid import Floats, inverse, perturb
+from mixpose.records import Floats
+from mixpose.rigid import inverse, perturb
 from mixpose.sensors.base import Sensor
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor

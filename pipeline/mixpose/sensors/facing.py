@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.sensors.base import Floats, Mask, Sensor
+from mixpose.records import Floats, Mask
+from mixpose.sensors.base import Sensor
 
 
 def facing(

@@ -8,7 +8,8 @@ from typing import Literal, Self
 import cv2
 import numpy as np
 
-from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.records import Floats, Mask
+from mixpose.sensors.base import hide, image_bounds, within
 from mixpose.sensors.rays import Rays, central_rays
 
 _WIDEST = np.pi / 2  # as cv2.fisheye, which divides by depth; points beside the camera are dropped

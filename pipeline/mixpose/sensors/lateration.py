@@ -7,7 +7,8 @@ from typing import Literal, Self
 
 import numpy as np
 
-from mixpose.sensors.base import Floats, Mask, hide, within
+from mixpose.records import Floats, Mask
+from mixpose.sensors.base import hide, within
 
 
 @dataclass(frozen=True, eq=False)

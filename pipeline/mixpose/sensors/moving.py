@@ -13,9 +13,10 @@ from typing import Literal, Self
 
 import numpy as np
 
+from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse, perturb
 from mixpose.sensors import batch
-from mixpose.sensors.base import Floats, Mask, Sensor
+from mixpose.sensors.base import Sensor
 from mixpose.sensors.rays import Rays
 
 

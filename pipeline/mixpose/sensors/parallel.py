@@ -7,8 +7,9 @@ from typing import Literal, Self
 
 import numpy as np
 
+from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
-from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.sensors.base import hide, image_bounds, within
 from mixpose.sensors.rays import Rays
 
 

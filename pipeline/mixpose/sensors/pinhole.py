@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mixpose.sensors.base import Floats, Mask, hide, image_bounds, within
+from mixpose.records import Floats, Mask
+from mixpose.sensors.base import hide, image_bounds, within
 from mixpose.sensors.distortion import LensDistortion
 from mixpose.sensors.rays import Rays, central_rays
 

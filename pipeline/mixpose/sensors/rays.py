@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.records import Floats
 from mixpose.rigid import inverse
-from mixpose.sensors.base import Floats
 
 if TYPE_CHECKING:
     from mixpose.sensors.fisheye import FisheyeCamera

@@ -8,7 +8,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from mixpose.limits import MOST_PIXELS
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.messages import BadKeyError, found
 
 RESOLUTION_FORM = "[width, height], two positive integers"

@@ -10,7 +10,7 @@ import numpy as np
 from mixpose.body import Body, Feature, Gravity, PointFeature, SegmentFeature
 from mixpose.body.features import SEGMENT_NODES
 from mixpose.limits import MOST_FEATURES
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.marker_files import read_marker_file
 from mixpose.session.markers import Markers

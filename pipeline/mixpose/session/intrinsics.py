@@ -7,7 +7,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import numbers
 from mixpose.session.messages import BadKeyError, found
 

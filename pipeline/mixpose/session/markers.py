@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import is_number
 from mixpose.session.messages import BadKeyError, found, in_file
 from mixpose.session.text_files import as_text, read_bytes

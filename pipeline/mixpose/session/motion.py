@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mixpose.rigid import Floats, from_parts, is_rigid, nearest_rigid
+from mixpose.records import Floats
+from mixpose.rigid import from_parts, is_rigid, nearest_rigid
 from mixpose.session.messages import BadKeyError, one_of
 from mixpose.session.schema_common import Placement
 

@@ -14,7 +14,8 @@ from pydantic import BeforeValidator, Field, PlainValidator
 from mixpose.body import Shape, Spread
 from mixpose.fit import SearchName
 from mixpose.objective import ObjectiveName
-from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.session.messages import one_of
 from mixpose.session.schema_common import ExtractTable, Placement, Positive, Table, Text
 from mixpose.session.schema_sensors import AnySensorTable

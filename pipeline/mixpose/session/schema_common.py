@@ -9,7 +9,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import LARGEST, SMALLEST
 from mixpose.session.values import (
     METHOD_ALLOWED,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import RESOLUTION_FORM
 from mixpose.session.arrays import resolution as resolution_of
 from mixpose.session.intrinsics import MATRIX_FORM

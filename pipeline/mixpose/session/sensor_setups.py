@@ -11,7 +11,8 @@ import numpy as np
 
 from mixpose.errors import SessionError
 from mixpose.extraction import ExtractOptions, check_options
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.sensors import (
     CalibrationError,
     FisheyeCamera,

@@ -9,8 +9,7 @@ from typing import Literal, TypeAlias
 from mixpose.body import Body
 from mixpose.extraction.options import ExtractOptions
 from mixpose.fit import EstimatorOptions
-from mixpose.records import label_of
-from mixpose.rigid import Floats
+from mixpose.records import Floats, label_of
 from mixpose.sensors import CalibrationError, Sensor
 
 Unit: TypeAlias = Literal["m", "cm", "mm", "um"]

@@ -9,7 +9,8 @@ from typing import Any, Literal
 from pydantic import GetCoreSchemaHandler
 from pydantic_core import core_schema
 
-from mixpose.rigid import TWIST_NAMES, Floats
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES
 from mixpose.session.arrays import is_number, numbers
 from mixpose.session.messages import BadKeyError, did_you_mean, found, one_of
 

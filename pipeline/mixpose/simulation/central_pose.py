@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 from mixpose.errors import SessionError
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.draws import Purpose, generator

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mixpose.rigid import TWIST_NAMES, Floats, from_parts, rotation_matrix
+from mixpose.records import Floats
+from mixpose.rigid import TWIST_NAMES, from_parts, rotation_matrix
 from mixpose.simulation.draws import Purpose, generator
 
 # A slow swing and a faster, smaller one on top of it, per axis.

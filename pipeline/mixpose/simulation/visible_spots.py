@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, SegmentFeature
 from mixpose.body.features import Feature, offsets
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import Sensor
-from mixpose.sensors.base import Mask
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.outlines import centroid, outline
 from mixpose.simulation.scenery import PoseAt, Scenery

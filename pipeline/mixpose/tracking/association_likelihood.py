@@ -23,8 +23,8 @@ from mixpose.judgement import Case, RememberedNoise, ScoredPose, judge, nearest_
 from mixpose.matching import Noise
 from mixpose.objective import NormalPrior, View
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend
-from mixpose.records import PointPattern
-from mixpose.rigid import Floats, perturb
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import perturb
 from mixpose.tracking.association_sum import AssociationTerm, sum_associations
 
 if TYPE_CHECKING:

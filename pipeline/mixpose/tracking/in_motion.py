@@ -23,8 +23,8 @@ from mixpose.judgement import ScoredPose, nearest_alike
 from mixpose.judgement.moments import inverses
 from mixpose.matching import Matches, associate, errors_seen
 from mixpose.objective import View
-from mixpose.records import DelaySeen
-from mixpose.rigid import Floats, perturb
+from mixpose.records import DelaySeen, Floats
+from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
 from mixpose.tracking.motion import Expected
 

@@ -26,7 +26,8 @@ from mixpose.judgement import (
 )
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.optimise import Ascent
-from mixpose.rigid import Floats, twist_between
+from mixpose.records import Floats
+from mixpose.rigid import twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.association_likelihood import AssociationLikelihood, are_associated

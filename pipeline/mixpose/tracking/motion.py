@@ -15,7 +15,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.sensors import Motion
 
 _ORDER = 4  # place, velocity, acceleration, jerk

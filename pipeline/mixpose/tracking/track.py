@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.judgement import Prior, RememberedNoise, nearest_alike
-from mixpose.rigid import Floats, inverse, perturb, twist_between
+from mixpose.records import Floats
+from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.in_motion import DelayEvidence
 from mixpose.tracking.motion import Course, MotionRules, RandomWalk

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View
-from mixpose.records import label_of
-from mixpose.rigid import Floats
+from mixpose.records import Floats, label_of
 from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import FrameData
 from mixpose.tracking.motion import per_kind

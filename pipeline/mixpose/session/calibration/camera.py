@@ -9,7 +9,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mixpose.rigid import Floats, from_parts
+from mixpose.records import Floats
+from mixpose.rigid import from_parts
 from mixpose.session.arrays import numbers
 from mixpose.session.calibration.content import Content
 from mixpose.session.intrinsics import CameraModel, Intrinsics

@@ -12,7 +12,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import LARGEST
 from mixpose.session.calibration.camera import (
     CalibratedCamera,

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from mixpose.rigid import Floats, inverse
+from mixpose.records import Floats
+from mixpose.rigid import inverse
 from mixpose.session.arrays import numbers
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group
 from mixpose.session.calibration.content import Content

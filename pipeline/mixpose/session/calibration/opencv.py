@@ -18,7 +18,8 @@ import cv2
 import numpy as np
 
 from mixpose.limits import MOST_OPENED
-from mixpose.rigid import Floats, inverse
+from mixpose.records import Floats
+from mixpose.rigid import inverse
 from mixpose.session.arrays import numbers
 from mixpose.session.calibration.camera import CalibratedCamera, Format, Group, motion_of
 from mixpose.session.calibration.content import Content

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.session.arrays import is_number
 from mixpose.session.markers import Markers
 from mixpose.session.messages import BadKeyError, found

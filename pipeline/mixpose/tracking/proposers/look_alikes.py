@@ -14,7 +14,7 @@ import numpy as np
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.judgement import ScoredPose
-from mixpose.rigid import Floats
+from mixpose.records import Floats
 from mixpose.tracking.likelihood import FrameData, Start
 
 
