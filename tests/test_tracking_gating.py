@@ -8,6 +8,7 @@ from detections import view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
+from mixpose.judgement import AcceptanceRules
 from mixpose.rigid import from_parts
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Expectation, Prediction, are_as_good, have_fewer, is_convincing
@@ -82,6 +83,6 @@ def test_a_covered_camera_does_not_count_where_two_others_agree() -> None:
         "1": SensorTally(7, 8),
         "2": SensorTally(1, 8),
     }
-    assert is_convincing(tallies, ["0", "1", "2"], 0.75)
+    assert is_convincing(tallies, ["0", "1", "2"], AcceptanceRules())
     # of 16 features 9 are met
-    assert not is_convincing(tallies, ["0", "2"], 0.75)
+    assert not is_convincing(tallies, ["0", "2"], AcceptanceRules())

@@ -39,8 +39,8 @@ class ErrorRules:
     )
     reach: float = constant(
         9.0,
-        "σ_ε around features within which detections count: at σ_ε they are drawn to 6, and the "
-        "pose moves by less than the rest",
+        "σ_ε around features within which detections count: at σ_ε they are drawn to 4.25 √2 = 6, "
+        "and the pose moves by less than the rest",
     )
     astray: float = constant(
         0.1, "chance that an offset within `met` is no noise: a spot cut, merged or another's"

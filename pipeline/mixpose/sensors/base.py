@@ -12,15 +12,12 @@ Conventions
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol, Self, runtime_checkable
+from typing import Literal, Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from mixpose.records import Floats, Mask
-
-if TYPE_CHECKING:
-    from mixpose.sensors.rays import Rays
-
+from mixpose.sensors.rays import Rays
 
 OUTSIDE = -1.0e6
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse
-
-if TYPE_CHECKING:
-    from mixpose.sensors.fisheye import FisheyeCamera
-    from mixpose.sensors.pinhole import PinholeCamera
 
 _WORST_ROUND_TRIP = 1.0  # px between a detection and its ray projected again
 
@@ -59,7 +55,25 @@ class Rays:
         )
 
 
-def central_rays(camera: PinholeCamera | FisheyeCamera, pixels: Floats, xy: Floats) -> Rays:
+class CentralCamera(Protocol):
+    """What rays through one centre ask of a camera."""
+
+    @property
+    def T_sensor_world(self) -> Floats:
+        """Where it stands (4, 4)."""
+        ...
+
+    @property
+    def camera_matrix(self) -> Floats:
+        """Its intrinsics (3, 3)."""
+        ...
+
+    def project(self, points_world: Floats) -> tuple[Floats, Mask]:
+        """Pixels (M, 2) of points (M, 3), and which it sees."""
+        ...
+
+
+def central_rays(camera: CentralCamera, pixels: Floats, xy: Floats) -> Rays:
     """Rays through the centre of projection, of normalised coordinates (M, 2) without distortion.
 
     Detections outside of what the lens model explains are left out.

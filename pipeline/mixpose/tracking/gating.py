@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
+from mixpose.judgement import AcceptanceRules
 from mixpose.objective import View, project_body
 from mixpose.records import PointPattern
 from mixpose.sensors import Sensor
@@ -81,12 +82,12 @@ class Expectation:
         }
 
 
-def is_convincing(tallies: Tallies, cameras: Iterable[str], share: float) -> bool:
+def is_convincing(tallies: Tallies, cameras: Iterable[str], rules: AcceptanceRules) -> bool:
     """Whether cameras met so much of the body that the next frame need not be seen whole."""
     some = [tallies[name] for name in cameras if name in tallies]
-    agreeing = [one for one in some if one.is_met]
+    agreeing = [one for one in some if one.is_met(rules.agreeing)]
     some = agreeing if len(agreeing) > 1 else some
-    return sum(one.met for one in some) > share * sum(one.in_view for one in some)
+    return sum(one.met for one in some) > rules.convincing * sum(one.in_view for one in some)
 
 
 def are_as_good(tallies: Tallies, before: Tallies) -> bool:
@@ -168,7 +169,7 @@ class WindowedScene:
         return all(
             not track.misses
             and not track.doubted
-            and is_convincing(track.tallies, expected.cameras, tracked.rules.acceptance.convincing)
+            and is_convincing(track.tallies, expected.cameras, tracked.rules.acceptance)
             for tracked, expected, track in bodies
         )
 

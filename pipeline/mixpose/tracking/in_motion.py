@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, nearest_alike
 from mixpose.judgement.moments import inverses
-from mixpose.matching import Matches, associate, errors_seen
+from mixpose.matching import ErrorRules, Matches, associate, errors_seen
 from mixpose.objective import View
-from mixpose.records import DelaySeen, Floats
+from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
 from mixpose.tracking.motion import Expected
@@ -35,8 +35,6 @@ ROUNDS = 6
 LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
 SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
 
-TYPICAL = 0.2  # residuals in σ_ε, as two features would say: what a frame alone is weighed by
-_TYPICAL_DEGREES = 4.0
 LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
 
 LONGEST_S = 1.0  # a clock that differs by more is not the same
@@ -118,7 +116,7 @@ def fit_in_motion(
         narrowest = rules.noise.errors.narrowest
         matches = associate(seen.finest, T, rules.association, narrowest)
         offsets = offsets_of(seen, matches, expected)
-        change = _change(offsets, motion.velocity, expected, data.free)
+        change = _change(offsets, motion.velocity, expected, data.free, rules.noise.errors)
         moved = float(np.abs(offsets.rows @ change * offsets.late).max(initial=0.0))
         T = np.asarray(perturb(T, offsets.followed(change, data.free)))
         motion = Motion(T, motion.velocity + change, expected.acceleration)
@@ -198,16 +196,19 @@ def _unsure_by(J: Floats, y: Floats, view: View, expected: Expected) -> float:
     return float(np.sqrt(squares)) / view.observation.sigma
 
 
-def _change(seen: Offsets, velocity: Floats, expected: Expected, free: NDArray[np.bool_]) -> Floats:
+def _change(
+    seen: Offsets, velocity: Floats, expected: Expected, free: Mask, errors: ErrorRules
+) -> Floats:
     """Change (6,) of the velocity by one Gauss-Newton step of it and the pose."""
+    typical, typical_degrees = errors.typical**2, errors.typical_degrees
     design, prior, known = seen.system(velocity, expected, free)
-    count, change, variance = int(free.sum()), np.zeros(6), TYPICAL**2
+    count, change, variance = int(free.sum()), np.zeros(6), typical
     for _ in range(2):  # the second time with the variance that the first leaves
         information = design.T @ design / variance + prior.T @ prior
         x = _inverse(information) @ (design.T @ seen.offsets / variance + prior.T @ known)
         rest = seen.offsets - design @ x
-        degrees = _TYPICAL_DEGREES + max(len(rest) - count, 0)
-        total = _TYPICAL_DEGREES * TYPICAL**2 + float(rest @ rest)
+        degrees = typical_degrees + max(len(rest) - count, 0)
+        total = typical_degrees * typical + float(rest @ rest)
         variance = max(total / degrees, LEAST_VARIANCE)
     change[free] = x[count : 2 * count]
     return change

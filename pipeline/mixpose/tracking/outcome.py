@@ -91,6 +91,7 @@ def followed(tracked: TrackedBody, data: FrameData, verdict: Verdict) -> Track:
     used = best.used
     met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
     tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
+    least = tracked.rules.acceptance.agreeing
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     return replace(
@@ -98,7 +99,7 @@ def followed(tracked: TrackedBody, data: FrameData, verdict: Verdict) -> Track:
         residuals=best.noise if is_ok else track.residuals,
         tallies=tallies,
         delays=track.delays.joined(data, best) if is_ok or late else track.delays,
-        agreed=track.agreed or sum(one.is_met for one in tallies.values()) > 1,
+        agreed=track.agreed or sum(one.is_met(least) for one in tallies.values()) > 1,
         known=is_known(data, best),
         believed=track.believed + is_ok,
         doubted=not is_ok,

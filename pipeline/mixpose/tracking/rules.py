@@ -89,11 +89,6 @@ class SceneRules:
         "σ_ε around expected features within which detections are the body's: they are met "
         "within 2.2, and a steady prediction errs by less than the rest",
     )
-    reach: float = constant(
-        9.0,
-        "σ_ε around features within which another's detection would pull: it is drawn to 5, "
-        "and the pose moves by the rest",
-    )
     rounds: int = constant(
         3, "times that detections are shared out again: neighbours' neighbours are settled by then"
     )

@@ -89,6 +89,10 @@ class Moment:
         """Frames without a pose after which a body is forgotten: no velocity is believed then."""
         return self.bodies[k].rules.motion.coasting
 
+    def reach(self, k: int) -> float:
+        """How far from features of body k, in σ_ε, detections pull."""
+        return self.bodies[k].rules.judgement.noise.errors.reach
+
     def has_twin(self, k: int) -> bool:
         """Whether there are bodies that are identical to one."""
         return sum(other.body is self.bodies[k].body for other in self.bodies) > 1
@@ -185,7 +189,7 @@ def _at_once(
         if len(some) > 1
         and len(frames[k].views) == len(moment.views)
         and moment.shared is not None
-        and not hides_near(moment.views, left[k], places[k], moment.rules.reach)
+        and not hides_near(moment.views, left[k], places[k], moment.reach(k))
     ]
     if alike and moment.shared is not None:
         begun = begun_together([frames[k] for k in alike], moment.shared)
@@ -199,7 +203,7 @@ def _is_touched(moment: Moment, k: int, one: Explanation, owners: Owners) -> boo
     if not is_changed(k, one.left, owners):
         return False
     places = moment.places(k, one.ranked[0].T_world_object)
-    return is_reached(k, moment.views, one.left, owners, places, moment.rules.reach)
+    return is_reached(k, moment.views, one.left, owners, places, moment.reach(k))
 
 
 def _on_the_rest(moment: Moment, shares: Shares, waiting: list[int]) -> Shares:

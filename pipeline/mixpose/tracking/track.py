@@ -45,10 +45,9 @@ class SensorTally(NamedTuple):
     met: int
     in_view: int
 
-    @property
-    def is_met(self) -> bool:
-        """Whether it met the body: at least half of it."""
-        return self.met >= 0.5 * self.in_view > 0
+    def is_met(self, share: float) -> bool:
+        """Whether it met at least a share of the body."""
+        return self.met >= share * self.in_view > 0
 
 
 @dataclass(frozen=True)
