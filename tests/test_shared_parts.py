@@ -27,9 +27,8 @@ MOTION = from_rotation_vector([0.4, -1.1, 0.7], [12.0, -30.0, 55.0])
 
 
 def parts_of(points: Floats, other: Floats, tolerance: float) -> tuple[LookAlike, ...]:
-    one, another = (
-        Body("body", tuple(PointFeature(point) for point in some)) for some in (points, other)
-    )
+    one = Body("body", tuple(map(PointFeature, points)))
+    another = one if other is points else Body("body", tuple(map(PointFeature, other)))
     return congruent_parts(one, another, tolerance)
 
 

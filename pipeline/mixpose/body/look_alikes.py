@@ -136,7 +136,6 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
     left out.  At most 60 features of each are compared: triples of more take minutes.
     """
     points, targets = body.means[:60], other.means[:60]
-    same = body is other or (points.shape == targets.shape and np.array_equal(points, targets))
     found: list[LookAlike] = []
     for triple in combinations(range(len(points)), FEWEST):
         base = list(triple)
@@ -145,7 +144,7 @@ def congruent_parts(body: Body, other: Body, tolerance: float) -> tuple[LookAlik
         images = congruent_triples(points[base], targets, 2 * tolerance)
         for image in images:
             pairs = set(zip(triple, image.tolist(), strict=True))
-            if same and all(i == j for i, j in pairs):
+            if body is other and all(i == j for i, j in pairs):
                 continue
             if any(pairs <= _pairs(known) for known in found):
                 continue
