@@ -181,12 +181,10 @@ def fit_near(
         return replace(Fit.of(ascent, views, [*levels, sigmas]), T_world_object=T, freed=is_freed)
     ascent = begun or _at_once(first, T_start, free, blur, rules) or descend(first, SHARP)
     climbed = climbed if climbed is not None and blur == 1 else []
-    for one in climbed:
-        if one.begins_at(ascent, rules):
-            return one.fit
+    if known_fit := next((one.fit for one in climbed if one.begins_at(ascent, rules)), None):
+        return known_fit
     known = np.zeros((2, len(views))) if noise is None else noise
-    levels.append(sigmas)
-    rest = known, beside, errors, association, rules, levels, blur
+    rest = known, beside, errors, association, rules, [*levels, sigmas], blur
     fit = _to_the_noise(ascent, finest, free, *rest)
     climbed.append(Climbed(ascent, fit))
     return fit

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from mixpose.matching.associate import associate, crowding
+from mixpose.matching.associate import associate
+from mixpose.matching.detections import crowding
 from mixpose.matching.errors import (
     ErrorRules,
     Noise,

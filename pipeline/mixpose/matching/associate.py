@@ -6,32 +6,18 @@ left of the density once the neighbours' share of it is taken off.
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import NamedTuple
-
 import numpy as np
 
-from mixpose.density import DRAWING, Observation, peak
+from mixpose.density import peak
+from mixpose.matching.detections import Detections, side_by_side, surroundings
 from mixpose.matching.matches import Matches
 from mixpose.matching.rules import AssociationRules
 from mixpose.objective import Match, MatchedObjective, in_image
-from mixpose.records import Floats, Indices, Mask, PointPattern
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
 
-_FAR = 1e12  # sensor units: where detections are filled up that a sensor does not have
 _ALIKE = 0.01  # of a height: features are told apart from a seventh of C's deviation on
-
-
-class _Detections(NamedTuple):
-    """Detections of L sensors side by side, M at most."""
-
-    points: Floats  # (L, M, 2)
-    number: Floats  # (L,)
-    crowd: Floats  # (L,) per m-th power of σ_ε, in the region of all
-    region: Floats  # (L, 1) what the side of a region counts at least, sensor units
-    is_grid: tuple[bool, ...]
-    is_flat: tuple[bool, ...]  # of one coordinate
 
 
 def associate(
@@ -51,7 +37,7 @@ def associate(
     match, views = objective.match(T_world_object[None]), objective.views
     at, y, seen, weights = match.at, match.at.y[:, 0], match.at.seen[:, 0], match.at.weights[:, 0]
     sigmas = np.array([view.observation.sigma for view in views])
-    detections = _side_by_side(tuple([view.observation for view in views]), rules)
+    detections = side_by_side(tuple([view.observation for view in views]), rules)
     product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
     energy, norm = objective.energies[:, 0], match.over.norm[:, 0]
     explained = np.minimum(np.maximum(product, 0.0) ** 2 / (energy * norm), 1.0)
@@ -63,24 +49,8 @@ def associate(
     if len(paired[0]):
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
         merged = np.bincount(paired[0], minlength=len(views)) // 2
-    if seen.all():
-        lower, upper = y.min(axis=1), y.max(axis=1)
-        hidden, blind = np.zeros(len(views)), None
-    else:
-        lower, upper, blind = _box(y, seen)
-        hidden = (at.faced[:, 0] & ~seen) @ objective.projection.body.nodes.weights
-    finest = np.maximum(narrowest, (upper - lower).max(axis=1) / (DRAWING.widest * sigmas))
-    finest = np.minimum(finest, 1.0)
-    if blind is not None:
-        finest[blind] = 1.0
-    missing = (seen & (shares == 0)).any(axis=1)
-    crowd, nearby = _around(lower, upper, sigmas, detections, missing, rules)
-    if missing.any():
-        nearby = np.where(missing, np.maximum(nearby - shares.sum(axis=1), 0.0), 0.0)
-    count = detections.number
-    if any(detections.is_grid):
-        count, crowd = _of_grids(objective, count, crowd, rules)
-        finest[list(detections.is_grid)] = 1.0
+    faced = at.faced[:, 0] & ~seen
+    around = surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
         dimensions=objective.projection.dimensions,
@@ -92,36 +62,13 @@ def associate(
         J=J,
         detections=by,
         explained=explained,
-        unseen=hidden,
+        unseen=(objective.projection.body.nodes.weights * faced).sum(axis=1),
         merged=merged,
-        count=count,
-        crowd=crowd,
-        unmatched_nearby=nearby,
-        finest=finest,
+        count=around.count,
+        crowd=around.crowd,
+        unmatched_nearby=around.unmatched,
+        finest=np.minimum(np.maximum(narrowest, around.finest), 1.0),
         by_calibration=_by_calibration(objective, T_world_object, sigmas),
-    )
-
-
-@lru_cache(maxsize=8)
-def _side_by_side(observations: tuple[Observation, ...], rules: AssociationRules) -> _Detections:
-    patterns = [one.pattern for one in observations]
-    points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
-    sigmas = np.array([one.sigma for one in observations])
-    side = np.full((len(points), max(map(len, points)), 2), _FAR)
-    crowd, region = np.zeros(len(points)), rules.min_region * sigmas
-    for k, some in enumerate(points):
-        m = some.shape[1]
-        side[k, : len(some), :m], side[k, : len(some), m:] = some, 0.0
-        if len(some):
-            extent = np.maximum(np.ptp(some, axis=0), region[k])
-            crowd[k] = len(some) / float(extent.prod()) * sigmas[k] ** m
-    return _Detections(
-        side,
-        np.array([float(len(some)) for some in points]),
-        crowd,
-        region[:, None],
-        tuple([one.cell is not None for one in observations]),
-        tuple([one.dimension == 1 for one in observations]),
     )
 
 
@@ -130,7 +77,7 @@ def _met(
     match: Match,
     T_world_object: Floats,
     product: Floats,
-    detections: _Detections,
+    detections: Detections,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Indices, Indices]:
     """Shares, offsets in sensor units, detections, and partners of features in merged pairs."""
@@ -166,7 +113,7 @@ def _spread(objective: MatchedObjective, J: Floats, T_world_object: Floats) -> F
 def _to_nearest(
     y: Floats,
     weights: Floats,
-    detections: _Detections,
+    detections: Detections,
     reach: Floats,
     is_open: Mask,
     rules: AssociationRules,
@@ -281,78 +228,6 @@ def _residuals(
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(height, rules.min_share * full)[:, None]
     return np.where(is_met, shares * weights, 0.0), np.where(is_met[:, None], offsets, 0.0)
-
-
-def _box(y: Floats, seen: Mask) -> tuple[Floats, Floats, Mask]:
-    """Corners (L, 2) of the box around the features in view, and which sensors have none."""
-    blind = ~seen.any(axis=1)
-    lower = np.where(seen[..., None], y, np.inf).min(axis=1)
-    upper = np.where(seen[..., None], y, -np.inf).max(axis=1)
-    lower[blind], upper[blind] = 0.0, 0.0
-    return lower, upper, np.asarray(blind)
-
-
-def _around(
-    lower: Floats,
-    upper: Floats,
-    sigmas: Floats,
-    detections: _Detections,
-    missing: Mask,
-    rules: AssociationRules,
-) -> tuple[Floats, Floats]:
-    """How dense detections (L,) are around the body, and how many lie there.
-
-    They are counted in its box, per m-th power of σ_ε, where they are denser than elsewhere; and,
-    where features are missing, in the box and as far around it as a grid may slip.
-    """
-    size = upper - lower
-    sides = np.maximum(size, detections.region)
-    middle, flat = (lower + upper) / 2, list(detections.is_flat)
-    away = np.abs(detections.points - middle[:, None])
-    inside = np.count_nonzero((away <= sides[:, None] / 2).all(axis=2), axis=1)
-    scaled = sides / sigmas[:, None]
-    if any(flat):
-        scaled[flat, 1] = 1.0
-    dense = inside / (scaled[:, 0] * scaled[:, 1]) if rules.crowded else 0.0
-    near = np.zeros(len(sides))
-    if missing.any():
-        half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
-        near += np.count_nonzero((away <= half[:, None]).all(axis=2), axis=1)
-        near[flat] = 0.0
-    return np.maximum(detections.crowd, dense), near
-
-
-def _of_grids(
-    objective: MatchedObjective, count: Floats, crowd: Floats, rules: AssociationRules
-) -> tuple[Floats, Floats]:
-    """The same of grey values: as many equal features as would give their energy."""
-    count, equal = count.copy(), (objective.tops / objective.energies)[:, 0]
-    for k, view in enumerate(objective.views):
-        if view.observation.cell is not None:
-            near, far = (corner / view.observation.sigma for corner in view.observation.extent)
-            count[k] = equal[k]
-            crowd[k] = equal[k] / float(np.maximum(far - near, rules.min_region).prod())
-    return count, crowd
-
-
-def crowding(points: Floats, lower: Floats, upper: Floats, smallest: float) -> Floats:
-    """Detections (H,) per unit of a sensor's coordinates, in all or in boxes where they are denser.
-
-    Parameters
-    ----------
-    points : (M, m) array
-        Of the detections.
-    lower, upper : (H, m) array
-        Boxes around the predicted features of H poses.
-    smallest : float
-        What the side of a region counts at least.
-    """
-    overall = len(points) / np.maximum(np.ptp(points, axis=0), smallest).prod()
-    sides = np.maximum(upper - lower, smallest)
-    middle = (lower + upper) / 2
-    away = np.abs(points - middle[:, None])
-    inside = (away <= sides[:, None] / 2).all(axis=2).sum(axis=1)
-    return np.asarray(np.maximum(overall, inside / sides.prod(axis=1)))
 
 
 def _by_calibration(
