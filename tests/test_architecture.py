@@ -52,8 +52,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "session": GROUND | {"sensors", "body", "extraction", "objective", "fit"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
-    | {"sensors", "body", "extraction", "objective", "search", "fit", "frames", "session"}
-    | {"simulation", "runner"},
+    | {"sensors", "body", "extraction", "objective", "optimise", "search", "fit", "frames"}
+    | {"session", "simulation", "runner"},
     "runner": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "matching", "tracking"}
     | {"frames", "session"},

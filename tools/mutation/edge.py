@@ -130,8 +130,8 @@ _CHECKING = (
     Mutant(
         "checking-mirrored-tilts-left-out",
         "checking/lookalikes.py",
-        "pose_jacobian(by_world, arms), visible",
-        "pose_jacobian(by_world, -arms), visible",
+        'np.einsum("lhkm,lhkmi->hi", weighted, J)',
+        '-np.einsum("lhkm,lhkmi->hi", weighted, J)',
         "look-alikes are not found, as the steps turn the wrong way",
     ),
     Mutant(
