@@ -1,8 +1,11 @@
-"""Rows of the ablation that name a kind of look-alike switch off that kind and no other."""
+"""Rows of the ablation really switch off what they name."""
 
 from __future__ import annotations
 
+import os
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +20,10 @@ from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers.look_alikes import look_alikes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+from ablated.cases import Case, all_on, loose_start_case, room_case, search_case
+from ablated.recordings import DEFORMED, real_cases, simulated_cases, synthetic_cases
 from ablated.switches import SWITCHES
+from benchmarks.search_cases import rows_named
 
 SQUARE = np.array([[-40, -40, 0], [40, -40, 0], [40, 40, 0], [-40, 40, 0], [9, 70, 0.0]])
 BODY = Body("square", tuple(PointFeature(point) for point in SQUARE))
@@ -45,3 +51,101 @@ def test_a_row_switches_off_the_kind_of_look_alike_that_it_names(
     ]
     assert (len(wide), len(starts) - len(wide)) == (tilts, turns)
     assert ("mirrored" in tracker.rules.look_alikes.kinds) == (name != "no mirror image")
+
+
+# Where what a row switches off matters; rows of look-alikes stand above.
+SHOWN_BY = {
+    "no multistart": "a loose start, 60 false",
+    "no searched": "2 parallel 6/0/0",
+    "static clutter searched alike": "enters among 10 lamps",
+    "no merged_pair": "fast",
+    "no narrowed": "flat, one camera",
+    "no without_sensor": "a knocked camera",
+    "nothing merged": "fast",
+    "misses free": "1 pinhole 5/0/5",
+    "unseen free": "1 pinhole 8/2/5",
+    "clutter even": "1 pinhole 5/0/5",
+    "payment by volume": "1 pinhole 5/0/5",
+    "prior flat": "a loose start, 60 false",
+    "no velocity": "two_cameras",
+    "noise: no memory": "two_cameras",
+    "noise: no outdone": "flat, one camera",
+    "noise: no typical": "two_cameras",
+    "noise: no offsets before they are seen": "two_cameras",
+    "noise: nothing lasts": "a camera slightly turned",
+    "blurs end at σ_ε": "fast",
+    "no F enlargement": "two_cameras",
+    "late sensors taken as in time": "real_room",
+    "features equally bright": "range_profiles",
+    "no freed features": DEFORMED,
+    "blurs always": "two_cameras",
+    "blurs never": "fast",
+    "not looked elsewhere": "fast board",
+    "rivals not counted": "flat and small",
+    "nothing doubtful told": "1 pinhole 8/3/5",
+}
+SHOWN_BY_REAL = {"no fusion of ranges": "uwb_trolley", "any turn sure": "uwb_trolley"}
+FRAMES, TRIALS = 12, 2
+
+
+@pytest.fixture(scope="module")
+def case_named(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Case]:
+    """Cases of the ablation, each made once and cut to a few frames."""
+    made: dict[str, Case] = {}
+
+    def case(name: str) -> Case:
+        if name not in made:
+            made[name] = _made(name, tmp_path_factory.mktemp("cases"))
+        return made[name]
+
+    return case
+
+
+def _made(name: str, folder: Path) -> Case:
+    for row in rows_named([]):
+        if row.name == name:
+            return search_case(row, TRIALS)
+    if name.startswith("a loose start"):
+        return loose_start_case(TRIALS)
+    if name.startswith("enters"):
+        return room_case(1)
+    (case,) = [*synthetic_cases([name]), *simulated_cases(folder, [name])]
+    cut = [replace(one, frames=one.frames[:FRAMES]) for one in case.recordings]
+    return replace(case, recordings=cut)
+
+
+def _told(case: Case, change: Callable[[Tracker], Tracker]) -> list[tuple[object, ...]]:
+    """All that is told of each frame."""
+    told: list[tuple[object, ...]] = []
+    for recording in case.recordings:
+        tracker = change(recording.tracker)
+        track = tracker.begin()
+        for frame in recording.frames:
+            track, found = tracker.advance(track, frame.number, frame.time_s, frame.views)
+            poses = [np.asarray(one.T_world_object).tobytes() for one in found.hypotheses]
+            best = np.asarray(found.T_world_object), np.asarray(found.covariance)
+            weights = [one.weight for one in found.hypotheses]
+            told.append((found.status, *(one.tobytes() for one in best), poses, weights))
+    return told
+
+
+@pytest.mark.parametrize("name", SHOWN_BY)
+def test_a_row_changes_poses_or_what_is_told_of_them(
+    name: str, case_named: Callable[[str], Case]
+) -> None:
+    (switch,) = (one for one in SWITCHES if one.name == name)
+    case = case_named(SHOWN_BY[name])
+    assert _told(case, switch.change) != _told(case, all_on)
+
+
+@pytest.mark.skipif("MIXPOSE_RECORDINGS" not in os.environ, reason="no real recordings here")
+@pytest.mark.parametrize("name", SHOWN_BY_REAL)
+def test_a_row_changes_what_is_told_of_real_ranges(name: str) -> None:
+    (switch,) = (one for one in SWITCHES if one.name == name)
+    (case,) = real_cases(Path(os.environ["MIXPOSE_RECORDINGS"]), [SHOWN_BY_REAL[name]])
+    assert _told(case, switch.change) != _told(case, all_on)
+
+
+def test_every_row_is_shown_to_switch_something_off() -> None:
+    shown = {"no congruent features", "no other tilt", "no mirror image"}
+    assert {one.name for one in SWITCHES} == {*shown, *SHOWN_BY, *SHOWN_BY_REAL}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,6 +61,7 @@ MADE = (
     Source("one_camera_video/session.toml", "truth.jsonl", 1.0, 5.0, frames=30),
     Source("parallel_beams/session.toml", "truth.jsonl", 1.0, 2.0, frames=6),
     Source("range_profiles/session.toml", "truth.jsonl", 2.0, 4.0, frames=6),
+    Source("real_room/session.toml", "truth.jsonl", 0.5, 2.0, frames=20),
 )
 
 BOARD = [[25.0 * i, 25.0 * j, 0.0] for i in range(6) for j in range(4)]
@@ -99,27 +100,35 @@ SIMULATED = (
     Simulated("a knocked camera", MARKERS, 3, 1000.0,
               SimulationOptions(20, seed=7, hidden=0.1, clutter=2, pixel_noise=0.3),
               knocked_deg=2.0),
+    Simulated("a camera slightly turned", MARKERS, 3, 1000.0,
+              SimulationOptions(20, seed=9, hidden=0.1, clutter=2, pixel_noise=0.3),
+              knocked_deg=0.1),
     Simulated("spots that touch", MARKERS, 2, 9000.0,
               SimulationOptions(15, seed=5, noise=1.0, spot_sigma=2.0), (3.0, 10.0)),
 )  # fmt: skip
 
 
-def synthetic_cases() -> Iterator[Case]:
-    """The recordings of the repository."""
+DEFORMED = "deformed, grey values"
+
+
+def synthetic_cases(names: Collection[str] = ()) -> Iterator[Case]:
+    """The recordings of the repository: those of some names, or all."""
     for source in MADE:
-        yield _case(SYNTHETIC, source)
+        if not names or source.session.split("/")[0] in names:
+            yield _case(SYNTHETIC, source)
 
 
-def real_cases(folder: Path) -> Iterator[Case]:
-    """Real recordings; those that are not in the folder are left out."""
+def real_cases(folder: Path, names: Collection[str] = ()) -> Iterator[Case]:
+    """Real recordings, of some names or all; those that are not in the folder are left out."""
     for source in REAL:
-        if (folder / source.session).exists():
+        is_named = not names or source.session.split("/")[0] in names
+        if is_named and (folder / source.session).exists():
             yield _case(folder, source)
 
 
-def simulated_cases(folder: Path) -> Iterator[Case]:
-    """Recordings made now, in a folder that is empty."""
-    for one in SIMULATED:
+def simulated_cases(folder: Path, names: Collection[str] = ()) -> Iterator[Case]:
+    """Recordings made now, in a folder that is empty: those of some names, or all."""
+    for one in (each for each in SIMULATED if not names or each.name in names):
         plain, made = folder / f"{one.name}.toml", folder / one.name
         plain.write_text(_session_text(one), encoding="utf-8")
         simulate(load_session(plain), made, one.options)
@@ -127,6 +136,19 @@ def simulated_cases(folder: Path) -> Iterator[Case]:
             (made / "session.toml").write_text(_session_text(one, one.knocked_deg))
         source = Source(f"{one.name}/session.toml", "truth.jsonl", *one.limits)
         yield replace(_case(folder, source), name=one.name)
+    if not names or DEFORMED in names:
+        yield _deformed_case(folder)
+
+
+def _deformed_case(folder: Path) -> Case:
+    """Grey values of a body whose features are elsewhere in each frame."""
+    name = DEFORMED
+    text = (SYNTHETIC / "parallel_beams" / "session.toml").read_text(encoding="utf-8")
+    plain, made = folder / f"{name}.toml", folder / name
+    plain.write_text(text.replace("points = [", "sigma = 4.0\npoints = [", 1), encoding="utf-8")
+    simulate(load_session(plain), made, SimulationOptions(8, seed=8, deform=True))
+    source = Source(f"{name}/session.toml", "truth.jsonl", 5.0, 10.0)
+    return replace(_case(folder, source), name=name)
 
 
 def _session_text(one: Simulated, knocked_deg: float = 0.0) -> str:

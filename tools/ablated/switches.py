@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from mixpose.judgement import DetectionModel
-from mixpose.tracking import Rules, Tracker
+from mixpose.objective import View
+from mixpose.tracking import Rules, Track, Tracker
+from mixpose.tracking.likelihood import FrameData
 from mixpose.tracking.proposers import Proposer, Refinement
 from mixpose.tracking.proposers.merged_pair import merged_pair
 from mixpose.tracking.proposers.multistart import multistart
@@ -82,6 +84,21 @@ def free_misses(tracker: Tracker) -> Tracker:
     return replace(tracker, rules=replace(tracker.rules, judgement=judgement))
 
 
+class AtOneMoment(Tracker):
+    """Sensors are taken to see the body at the common time, all rows at once."""
+
+    def data(
+        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
+    ) -> FrameData:
+        """A frame, and what is known before it."""
+        views = [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        return super().data(track, frame, time_s, views)
+
+
+def at_one_moment(tracker: Tracker) -> Tracker:
+    return AtOneMoment(**{field.name: getattr(tracker, field.name) for field in fields(tracker)})
+
+
 def unfused(tracker: Tracker) -> Tracker:
     return replace(tracker, options=replace(tracker.options, fuse=False))
 
@@ -111,6 +128,9 @@ SWITCHES = (
     Switch("noise: nothing lasts", ruled("judgement.noise.bias", deviation=0.0)),
     Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
+    Switch("late sensors taken as in time", at_one_moment),
+    Switch("features equally bright", ruled("fit.misfit", unlike=0.0)),
+    Switch("no freed features", ruled("fit.misfit", rounding=NEVER)),
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),
     Switch("not looked elsewhere", ruled("acceptance", convincing=0.0)),
