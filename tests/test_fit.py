@@ -8,7 +8,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import Climbed, EstimatorOptions, ScheduleRules, blur_schedule, fit_near
+from mixpose.fit import EstimatorOptions, Fit, ScheduleRules, blur_schedule, fit_near
 from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
 from mixpose.objective import NormalPrior, View, matched_objective
 from mixpose.records import Floats, GridPattern
@@ -74,7 +74,7 @@ def test_a_start_twenty_pixels_off_is_corrected(pinhole_cameras: list[PinholeCam
 def test_a_start_that_leads_where_another_did_is_given_the_very_same_fit(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    views, climbed = detect(pinhole_cameras, EIGHT, TRUTH), list[Climbed]()
+    views, climbed = detect(pinhole_cameras, EIGHT, TRUTH), list[Fit]()
     far = perturb(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0]))  # at another maximum
     first, again, elsewhere = (
         fit_near(

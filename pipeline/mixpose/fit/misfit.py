@@ -11,9 +11,9 @@ coordinates are normal with one unknown variance; see *A body that does not fit*
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,11 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.objective import pose_jacobian
+from mixpose.objective import BodyProjection
 from mixpose.optimise import NewtonOptions, Quadratic, ascend
-from mixpose.records import Floats
-from mixpose.rigid import perturb, transform
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import perturb
 from mixpose.sensors import Sensor
-
-Labels: TypeAlias = tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,6 @@ class MisfitRules:
     believed: float = constant(
         0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
     )
-    rounding: float = constant(1 / 512, "of a height: what a body may leave at its features")
     unlike: float = constant(
         0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
     )
@@ -52,10 +49,6 @@ class SensorDensity:
     variance: float  # 2σ², that of a feature in the matched density, in squared sensor units
     cell_variance: float  # of the noise of a cell, times the size of a cell
     extent: tuple[Floats, Floats]  # smallest and largest coordinates (m,) of the density's cells
-    same: float = constant(1e-9, "of a height: features nearer than 1e-4 of √2 σ have one")
-    steps: int = constant(
-        30, "peaks two widths apart, the least, draw each other by 0.4 of a step: 0.4³⁰ = 1e-12"
-    )
 
     def left(self, y: Floats) -> tuple[Floats, Floats]:
         """What features (n, m), each of its own height (n,), leave of the density's gradient.
@@ -65,7 +58,8 @@ class SensorDensity:
         away = (y[:, None] - y) / np.sqrt(self.variance)
         bells = np.exp(-0.5 * (away * away).sum(axis=2))
         here = self.density(y).astype(np.float64)
-        heights = np.linalg.solve(bells + self.same * np.eye(len(y)), here[:, 0])
+        # features nearer than 1e-4 of √2 σ have one height
+        heights = np.linalg.solve(bells + 1e-9 * np.eye(len(y)), here[:, 0])
         slopes = -((bells * heights)[..., None] * away).sum(axis=1)
         return np.sqrt(self.variance) * here[:, 1:] - slopes, heights
 
@@ -88,8 +82,8 @@ def misfit(
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
         rest, heights = sensor.left(sensor.geometry.project(points_world)[0])
-        noise = np.hypot(sensor.noise(), rules.rounding * float(heights.mean()))
-        statistic += float((rest * rest).sum()) / noise**2
+        # drawing rounds heights to 1/512
+        statistic += float((rest**2).sum() / (sensor.noise() ** 2 + (heights.mean() / 512) ** 2))
         freedom += rest.size
     if freedom <= 0 or statistic < float(chdtri(freedom, 1 - rules.believed)):
         return 1.0
@@ -109,115 +103,96 @@ def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
     if len(order) < count:
         return None
     y = grid[peaks][order[:count]]
-    for _ in range(sensor.steps):
+    for _ in range(30):  # peaks two widths apart, the least, draw each other by 0.4 of a step
         rest, own = sensor.left(y)
         if own.min() <= 0:
             return None
         y = y + np.sqrt(sensor.variance) * rest / own[:, None]
-    height = float(own.mean())
     chance = sensor.noise() * np.sqrt(2 * np.log(heights.size))
     others = heights[peaks][order[count:]].max(initial=chance)
-    return y if others < 0.5 * height < sensor.density(y)[:, 0].min() else None
-
-
-class Matched(NamedTuple):
-    """A pose, the place of each feature per sensor, and the sum of squares."""
-
-    T: Floats
-    labels: Labels
-    squares: float
-
-
-@dataclass(frozen=True)
-class Matching:
-    """Features (n, 3), and places (n, m) per sensor that are theirs in unknown order."""
-
-    densities: Sequence[SensorDensity]
-    points: Floats
-    places: Sequence[Floats]
-    free: NDArray[np.bool_]
-
-    def offsets(self, T: Floats, labels: Labels) -> tuple[Floats, Floats]:
-        """Places less projections (Σnm,) in units of √2 σ, and Jacobians (Σnm, 6) of these."""
-        rests, jacobians = [], []
-        for sensor, place, own in zip(self.densities, self.places, labels, strict=True):
-            y, by_world, _ = sensor.geometry.linearise(transform(T, self.points))
-            arms = self.points @ T[:3, :3].T
-            scale = 1 / np.sqrt(sensor.variance)
-            rests.append(scale * (place[list(own)] - y).ravel())
-            jacobians.append(scale * pose_jacobian(by_world, arms).reshape(-1, 6))
-        return np.concatenate(rests), np.concatenate(jacobians)
-
-    def nearest(self, T: Floats) -> Labels:
-        """The place of each feature, per sensor, with the least sum of squares at a pose."""
-        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - as above
-
-        labels = []
-        for sensor, place in zip(self.densities, self.places, strict=True):
-            y, _ = sensor.geometry.project(transform(T, self.points))
-            costs = ((y[:, None] - place) ** 2).sum(axis=2)
-            labels.append(tuple(linear_sum_assignment(costs)[1].tolist()))
-        return tuple(labels)
-
-    def fit(self, T: Floats) -> Matched:
-        """What is reached from a pose (4, 4)."""
-        labels, tried = self.nearest(T), set[Labels]()
-        while labels not in tried:
-            tried.add(labels)
-            term = LabelledPlaces(self, labels)
-            found = ascend(term, T[None], perturb, self.free, NewtonOptions(60, tolerance=1e-13))
-            T = found.states[0]
-            last, labels = labels, self.nearest(T)
-        return Matched(T, last, -float(found.values[0]))
-
-    def swapped(self, best: Matched) -> list[float]:
-        """Sums of squares, to first order, once two features of a sensor change their places."""
-        Q, _ = np.linalg.qr(self.offsets(best.T, best.labels)[1][:, self.free])
-        squares = []
-        for k, own in enumerate(best.labels):
-            for i, j in combinations(range(len(own)), 2):
-                other = list(own)
-                other[i], other[j] = own[j], own[i]
-                labels = (*best.labels[:k], tuple(other), *best.labels[k + 1 :])
-                rest, _ = self.offsets(best.T, labels)
-                squares.append(float(rest @ rest) - float(np.sum((rest @ Q) ** 2)))
-        return squares
+    return y if others < 0.5 * own.mean() < sensor.density(y)[:, 0].min() else None
 
 
 @dataclass(frozen=True)
 class LabelledPlaces:
     """Minus the sum of squares between features and the places that are taken for theirs."""
 
-    matching: Matching
-    labels: Labels
+    projection: BodyProjection
+    places: Floats  # (L, n, 2) in unknown order
+    scales: Floats  # (L,) 1 / √2 σ
+    labels: Indices  # (L, n), the place of each feature
+
+    def offsets(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Places less projections (H, 2Ln), in units of √2 σ, and Jacobians (H, 2Ln, 6)."""
+        at, H = self.projection.project(poses), len(poses)
+        taken = np.take_along_axis(self.places, self.labels[..., None], axis=1)
+        scales = self.scales[:, None, None, None]
+        offsets, J = scales * (taken[:, None] - at.y), scales[..., None] * at.J
+        return offsets.swapaxes(0, 1).reshape(H, -1), J.swapaxes(0, 1).reshape(H, -1, 6)
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
-        pairs = [self.matching.offsets(T, self.labels) for T in poses]
-        models = [(-float(rest @ rest), 2 * rest @ J, 2 * J.T @ J) for rest, J in pairs]
-        return Quadratic(*map(np.array, zip(*models, strict=True)))
+        offsets, J = self.offsets(poses)
+        gradient = 2 * (offsets[:, None] @ J)[:, 0]
+        return Quadratic(-(offsets**2).sum(axis=1), gradient, 2 * J.swapaxes(1, 2) @ J)
+
+    def nearest(self, T: Floats) -> Indices:
+        """The labels with the least sum of squares at a pose (4, 4)."""
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - as above
+
+        y = self.projection.project(T[None]).y[:, 0]
+        costs = ((y[:, :, None] - self.places[:, None]) ** 2).sum(axis=3)
+        labels = [linear_sum_assignment(cost)[1] for cost in costs]
+        return np.array(labels)
+
+    def fitted(self, T: Floats, free: Mask) -> tuple[float, Floats, LabelledPlaces]:
+        """The sum of squares that is reached from a pose, where, and with which labels."""
+        term, tried = replace(self, labels=self.nearest(T)), set[bytes]()
+        while (key := term.labels.tobytes()) not in tried:
+            tried.add(key)
+            last = term
+            end = ascend(term, T[None], perturb, free, NewtonOptions(60, tolerance=1e-13))
+            T = end.states[0]
+            term = replace(self, labels=self.nearest(T))
+        return -float(end.values[0]), T, last
+
+    def exchanged(self, T: Floats, free: Mask) -> list[float]:
+        """Sums of squares, to first order, once two features of a sensor change their places."""
+        Q, _ = np.linalg.qr(self.offsets(T[None])[1][0][:, free])
+        squares = []
+        for k, (i, j) in (
+            (k, pair)
+            for k, own in enumerate(self.labels)
+            for pair in combinations(range(len(own)), 2)
+        ):
+            labels = self.labels.copy()
+            labels[k, [i, j]] = labels[k, [j, i]]
+            rest = replace(self, labels=labels).offsets(T[None])[0][0]
+            squares.append(float(rest @ rest) - float(np.sum((rest @ Q) ** 2)))
+        return squares
 
 
 def fit_freed(
-    densities: Sequence[SensorDensity],
-    points: Floats,
-    starts: Floats,
-    free: NDArray[np.bool_],
+    projection: BodyProjection, densities: Sequence[SensorDensity], starts: Floats, free: Mask
 ) -> Floats | None:
     """Fit the pose to freed features by least squares; None where no place is surely whose.
 
-    The features (n, 3), all of one weight, are seen by all sensors; correspondences are sought from
+    The features, all of one weight, are seen by all sensors; correspondences are sought from
     starts (H, 4, 4), which may change in free directions (6,).
     """
-    coordinates = sum(sensor.geometry.dimension for sensor in densities)
-    redundant = coordinates * len(points) - int(free.sum())
-    found = [own_peaks(sensor, len(points)) for sensor in densities]
-    places = [one for one in found if one is not None]
-    if redundant <= 0 or len(places) < len(densities):
-        return None
-    matching = Matching(densities, points, places, free)
-    fitted = sorted((matching.fit(T) for T in starts), key=lambda one: one.squares)
-    best = fitted[0]
-    rivals = {one.labels: one.squares for one in fitted if one.labels != best.labels}
-    others = np.array([*rivals.values(), *matching.swapped(best)])
-    return best.T if ((others / best.squares) ** (-0.5 * redundant)).sum() < 1 else None
+    count = len(projection.body)
+    redundant = int(projection.dimensions.sum()) * count - int(free.sum())
+    places = np.zeros((len(densities), count, 2))
+    for k, density in enumerate(densities):
+        y = own_peaks(density, count) if redundant > 0 else None
+        if y is None:
+            return None
+        places[k, :, : y.shape[1]] = y
+    scales = 1 / np.sqrt([sensor.variance for sensor in densities])
+    term = LabelledPlaces(projection, places, scales, np.zeros(places.shape[:2], np.intp))
+    ends = sorted((term.fitted(T, free) for T in starts), key=lambda end: end[0])
+    least, T_best, best = ends[0]
+    rivals = {end.labels.tobytes(): squares for squares, _, end in ends}
+    del rivals[best.labels.tobytes()]
+    others = np.array([*rivals.values(), *best.exchanged(T_best, free)])
+    return T_best if ((others / least) ** (-0.5 * redundant)).sum() < 1 else None

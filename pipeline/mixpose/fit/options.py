@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.objective import ObjectiveName
+from mixpose.records import Mask
 from mixpose.rigid import TWIST_NAMES
 
 SearchName: TypeAlias = Literal["thorough", "live"]
@@ -17,34 +17,19 @@ SearchName: TypeAlias = Literal["thorough", "live"]
 
 @dataclass(frozen=True)
 class EstimatorOptions:
-    """The keys of ``[estimator]`` in a session file.
-
-    Attributes
-    ----------
-    objective : {"matched", "paper", "independent"}
-    free : tuple of str
-        World directions that are estimated, of `mixpose.rigid.TWIST_NAMES`; the rest stay where
-        the start has them.
-    samples : int
-        R, samples per feature where q is integrated by sampling.
-    seed : int
-    fuse : bool
-        Whether frames of single ranges take the pose before them as a prior.
-    search : {"thorough", "live"} or None
-        How long a frame is searched where no prediction convinces; None: live for cameras and
-        streams.
-    """
+    """The keys of ``[estimator]`` in a session file."""
 
     objective: ObjectiveName = "matched"
-    free: tuple[str, ...] = TWIST_NAMES
-    samples: int = 1000
+    free: tuple[str, ...] = TWIST_NAMES  # world directions that are estimated
+    samples: int = 1000  # R per feature, where q is integrated by sampling
     seed: int = 0
-    fuse: bool = True
+    fuse: bool = True  # whether frames of single ranges take the pose before them as a prior
+    # how long a frame is searched where no prediction convinces; None: live for cameras and streams
     search: SearchName | None = None
 
 
 @lru_cache
-def free_mask(options: EstimatorOptions) -> NDArray[np.bool_]:
+def free_mask(options: EstimatorOptions) -> Mask:
     """Which of the six directions are estimated, not to be written to."""
     mask = np.array([name in options.free for name in TWIST_NAMES])
     mask.flags.writeable = False

@@ -2,9 +2,9 @@
 
 Under white noise half of the energy ⟨g, h⟩² / ⟨h, h⟩ that a pose explains, over the noise of a
 cell, is the log-likelihood with the amplitude at its best; the Gaussian prior of the start comes on
-top.
-Under heavy noise the sum has several maxima: they are sought from the maximum of the objective, and
-from the points of the cubature rule of third degree, which has mean and covariance of the prior.
+top.  Under heavy noise the sum has several maxima: they are sought from the maximum of the
+objective, and from the points of the cubature rule of third degree, which has mean and covariance
+of the prior.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from mixpose.constants import constant
 from mixpose.fit.misfit import MisfitRules, SensorDensity, fit_freed, misfit
 from mixpose.objective import (
     AmplitudesObjective,
@@ -28,24 +26,12 @@ from mixpose.objective import (
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import NewtonOptions, Sum, Term, ascend
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 from mixpose.rigid import perturb, transform
 
-
-@dataclass(frozen=True)
-class ProbableRules:
-    """How closely the most probable pose is sought."""
-
-    nats: float = constant(
-        1e-6,
-        "gains of log-likelihood that do not matter: 0.001 standard deviations; and shares "
-        "of the energy: a part in a thousand of heights, which drawing may be off by",
-    )
-    rough: float = constant(1e-2, "nats where it is asked which of several maxima is highest")
-    rounds: int = constant(3, "of noise and pose by turns: the noise holds to a part in a hundred")
-
-
-_RULES = ProbableRules()
+NATS = 1e-6
+"""Gains of log-likelihood that do not matter: 0.001 standard deviations; and shares of the energy:
+a part in a thousand of heights, which drawing may be off by."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +72,10 @@ def likelihood_at(
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
 
-def cell_variances(energies: Floats, shares: Floats, cells: NDArray[np.intp]) -> Floats:
+def cell_variances(energies: Floats, shares: Floats, cells: Indices) -> Floats:
     """Variance of a cell's noise times its size (L,): the unexplained of energies, over cells."""
     # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
     return np.asarray(np.maximum(1 - shares, 1e-9) * energies / cells)
-
-
-def _cells(objective: MatchedObjective) -> NDArray[np.intp]:
-    return np.array([view.observation.cells for view in objective.views])
 
 
 def most_probable(
@@ -104,11 +86,11 @@ def most_probable(
     likelihood = likelihood_at(objective, T, misfit)
     if not likelihood.is_alone:
         starts = np.concatenate([T[None], prior.points()])
-        T = _climbed(likelihood.objective, prior, starts, _RULES.rough)
-        likelihood = likelihood_at(objective, T, misfit)
-    T = _climbed(likelihood.objective, prior, T[None], _RULES.nats)
-    # once more with the noise that the maximum leaves
-    return _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], _RULES.nats)
+        # roughly: it is asked which of several maxima is highest
+        T = _climbed(likelihood.objective, prior, starts, 1e4 * NATS)
+    for _ in range(2):  # the second time with the noise that the maximum leaves
+        T = _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], NATS)
+    return T
 
 
 def believed(
@@ -121,41 +103,26 @@ def believed(
 
     Or the fit to freed features of a body that does not fit, and whether it is that.
     """
-    body = objective.projection.body
-    points = body.nodes.points
+    projection, body = objective.projection, objective.projection.body
     T = most_probable(objective, T_world_object, prior)
     T_unlike, noises = with_amplitudes(objective, T, prior, rules)
-    if not objective.projection.project(T[None]).seen.all() or len(points) != len(body):
+    if not projection.project(T[None]).seen.all() or len(body.nodes.points) != len(body):
         return T_unlike, False
     densities = _densities(objective, noises)
-    ratio = misfit(densities, transform(T_unlike, points), int(prior.free.sum()), rules)
+    points = transform(T_unlike, body.nodes.points)
+    ratio = misfit(densities, points, int(prior.free.sum()), rules)
     if ratio == 1:
         return T_unlike, False
     sigmas = [view.observation.sigma for view in objective.views]
     # to look for peaks everywhere
     rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
     starts = np.concatenate([T[None], prior.points()])
-    T_freed = fit_freed(_densities(rough, noises), points, starts, prior.free)
+    T_freed = fit_freed(projection, _densities(rough, noises), starts, prior.free)
     if T_freed is not None:
         return T_freed, True
     # what is left at features is no noise of cells: in a body that does not fit it is as large
     T = most_probable(objective, T, prior, ratio)
     return with_amplitudes(objective, T, prior, rules, ratio)[0], False
-
-
-def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
-    """The densities that an objective has drawn."""
-
-    def sampled(sensor: int, y: Floats) -> Floats:
-        padded = np.zeros((len(objective.views), 1, len(y), 2))
-        padded[sensor, 0, :, : y.shape[1]] = y
-        return objective.atlas.look_up(padded)[sensor, 0, :, : 1 + y.shape[1]]
-
-    variances, views = objective.variances[:, 0].tolist(), objective.views
-    return [
-        SensorDensity(view.sensor, partial(sampled, k), v, noise, view.observation.extent)
-        for k, (view, v, noise) in enumerate(zip(views, variances, noises.tolist(), strict=True))
-    ]
 
 
 def with_amplitudes(
@@ -171,17 +138,36 @@ def with_amplitudes(
     """
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
     noise, cells = equal, _cells(objective)
-    smallest = _RULES.nats * objective.energies[:, 0] / cells
-    for _ in range(_RULES.rounds):
+    smallest = NATS * objective.energies[:, 0] / cells
+    for _ in range(3):  # noise and pose by turns: the noise holds to a part in a hundred
         unlike = AmplitudesObjective(objective, noise, rules.unlike)
         noise = np.maximum(unlike.unexplained(T) / cells, smallest)
-        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], _RULES.nats)
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], NATS)
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
     if gain < float(chdtri(freedom, 1 - rules.believed)):
         return T_world_object, equal
     return T, noise
+
+
+def _cells(objective: MatchedObjective) -> Indices:
+    return np.array([view.observation.cells for view in objective.views])
+
+
+def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
+    """The densities that an objective has drawn."""
+
+    def sampled(sensor: int, y: Floats) -> Floats:
+        padded = np.zeros((len(objective.views), 1, len(y), 2))
+        padded[sensor, 0, :, : y.shape[1]] = y
+        return objective.atlas.look_up(padded)[sensor, 0, :, : 1 + y.shape[1]]
+
+    each = zip(objective.views, objective.variances[:, 0].tolist(), noises.tolist(), strict=True)
+    return [
+        SensorDensity(view.sensor, partial(sampled, k), variance, noise, view.observation.extent)
+        for k, (view, variance, noise) in enumerate(each)
+    ]
 
 
 def _climbed(likelihood: Term, prior: NormalPrior, starts: Floats, nats: float) -> Floats:

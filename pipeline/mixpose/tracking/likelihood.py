@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
-from mixpose.fit import Climbed, EstimatorOptions, Fit, fit_near, free_mask
+from mixpose.fit import EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
     Case,
     Prior,
@@ -206,7 +206,7 @@ class MatchedLikelihood:
     """Matched densities of all sensors."""
 
     data: FrameData
-    climbed: dict[frozenset[str], list[Climbed]] = field(default_factory=dict)  # by those left out
+    climbed: dict[frozenset[str], list[Fit]] = field(default_factory=dict)  # by those left out
 
     @property
     def knows_detections(self) -> bool:
