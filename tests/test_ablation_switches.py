@@ -14,7 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.proposers.look_alikes import look_alikes
+from mixpose.tracking.proposers import look_alikes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 from ablated.switches import SWITCHES

@@ -8,12 +8,8 @@ from typing import Any
 
 from mixpose.judgement import DetectionModel
 from mixpose.tracking import Rules, Tracker
-from mixpose.tracking.proposers import Proposer, Refinement
-from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.multistart import multistart
-from mixpose.tracking.proposers.narrowed import narrowed
-from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.without_sensor import without_sensor
+from mixpose.tracking.proposers import Proposer, multistart, searched
+from mixpose.tracking.refinements import Refinement, merged_pair, narrowed, without_sensor
 
 FREE = 0.0
 NEVER = float("inf")
