@@ -8,7 +8,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import EstimatorOptions, Fit, ScheduleRules, blur_schedule, fit_near
+from mixpose.fit import EstimatorOptions, Fit, FitRules, blur_schedule, fit_near
 from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
 from mixpose.objective import NormalPrior, View, matched_objective
 from mixpose.records import Floats, GridPattern
@@ -55,7 +55,7 @@ def test_no_blur_is_wider_than_a_tenth_of_what_is_seen(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     views = detect(pinhole_cameras, EIGHT, TRUTH)
-    levels = blur_schedule(views, EIGHT, TRUTH, np.repeat([1e3, 3.0], 3), ScheduleRules())
+    levels = blur_schedule(views, EIGHT, TRUTH, np.repeat([1e3, 3.0], 3), FitRules())
     for view, widest in zip(views, levels[0], strict=True):
         lower, upper = view.observation.extent
         assert widest == pytest.approx(0.1 * (upper - lower).max())

@@ -23,7 +23,7 @@ _NEAR = (
     ),
     Mutant(
         "fit-blurs-wider-than-the-picture",
-        "fit/near.py",
+        "fit/options.py",
         "widest: float = constant(\n        0.1,",
         "widest: float = constant(\n        10.0,",
         "descents begin where everything is one blob",

@@ -228,7 +228,7 @@ _GATING = (
 _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-any-clutter",
-        "tracking/association_sum.py",
+        "tracking/associations.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
@@ -236,7 +236,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-missed-for-free",
-        "tracking/association_sum.py",
+        "tracking/associations.py",
         "missed = expected * np.log(1 - probability) +",
         "missed = 0 * expected +",
         "poses whose tags have no range are as good as those that meet all",
@@ -322,7 +322,7 @@ _STATIC = (
     ),
     Mutant(
         "tracking-what-stands-still-is-never-found",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "return among_moving + candidates",
         "return among_moving or candidates[:0]",
         "a body that stands still is not looked for",

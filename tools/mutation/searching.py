@@ -11,7 +11,7 @@ _STARTS = "test_tracking_starts.py"
 _PROPOSALS = (
     Mutant(
         "tracking-other-tilt-never-tried",
-        "tracking/proposers/look_alikes.py",
+        "tracking/proposers.py",
         "        for T in _tilted(data, best):",
         "        for T in []:",
         "a flat body followed at the wrong tilt stays there",
@@ -19,7 +19,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-tilt-of-cameras-that-see-nothing",
-        "tracking/proposers/look_alikes.py",
+        "tracking/proposers.py",
         "views = [view for view in views if view.name in met]",
         "views = list(views)",
         "a flat body that one of several cameras meets stays at the wrong tilt",
@@ -27,7 +27,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-starts-that-lead-to-nothing",
-        "tracking/proposers/multistart.py",
+        "tracking/proposers.py",
         "[values[order] > data.rules.fit.near * len(data.views)]",
         "",
         "where a prediction fails in clutter a frame takes half a second",
@@ -35,7 +35,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-search-ranks-by-default-rules",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "rules=data.rules.judgement,",
         "",
         "poses are searched for by other rules than they are judged by",
@@ -43,7 +43,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-no-sensor-left-out",
-        "tracking/proposers/without_sensor.py",
+        "tracking/refinements.py",
         "return names if np.count_nonzero(agreeing & ~apart) >= 2 else []",
         "return []",
         "a camera that was bumped bends the pose",
@@ -51,7 +51,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-another-sensor-left-out",
-        "tracking/proposers/without_sensor.py",
+        "tracking/refinements.py",
         "names = [seen.names[k] for k in np.flatnonzero(apart)]",
         "names = [seen.names[k - 1] for k in np.flatnonzero(apart)]",
         "of three cameras a sound one is left out",
@@ -59,7 +59,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
-        "tracking/proposers/without_sensor.py",
+        "tracking/refinements.py",
         "if not likelihood.knows_detections or len(data.views) < 3:",
         "if not likelihood.knows_detections or len(data.views) < 99:",
         "a camera that was bumped bends the pose",
@@ -99,7 +99,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-merged-pairs-never-mended",
-        "tracking/proposers/merged_pair.py",
+        "tracking/refinements.py",
         "return [] if at is judged else",
         "return [] if at is not judged else",
         "two features seen as one bend the pose",
@@ -115,7 +115,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
-        "tracking/proposers/narrowed.py",
+        "tracking/refinements.py",
         "> np.count_nonzero(met, axis=1) / 2",
         "> np.count_nonzero(met, axis=1)",
         "of sensors that are out of step the one that is right by itself is believed",
@@ -123,7 +123,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-slips-never-looked-for",
-        "tracking/proposers/look_alikes.py",
+        "tracking/proposers.py",
         "yield Start(poses[1 + k], data.close, T_moved=moved)",
         "yield Start(poses[0], data.close, T_moved=moved)",
         "a chessboard is followed a square off",
@@ -131,7 +131,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-slips-along-the-world",
-        "tracking/proposers/look_alikes.py",
+        "tracking/proposers.py",
         "(T @ one.T_body_other for one in alike)",
         "(one.T_body_other @ T for one in alike)",
         "a chessboard that is turned is followed a square off",
@@ -147,7 +147,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-one-branch-followed",
-        "tracking/proposers/predicted.py",
+        "tracking/proposers.py",
         "[*data.predictions, *beside]",
         "[*data.predictions[:1], *beside]",
         "of two possible poses one is forgotten",
@@ -155,7 +155,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-search-of-one-seed",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "seed=data.options.seed,",
         "seed=0,",
         "the seed of a session does nothing",
@@ -163,7 +163,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-live-search-is-thorough",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "budget = data.rules.live if live else data.rules.search",
         "budget = data.rules.search",
         "a live search takes as long as a thorough one",
@@ -171,7 +171,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-live-search-begins-anew",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "state = data.track.search if live else SearchState()",
         "state = SearchState()",
         "a live search tries the same guesses in every frame",
@@ -187,7 +187,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-starts-of-one-seed",
-        "tracking/proposers/multistart.py",
+        "tracking/proposers.py",
         "default_rng(data.options.seed)",
         "default_rng(0)",
         "the seed of a session does nothing",
@@ -195,7 +195,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-starts-side-by-side",
-        "tracking/proposers/multistart.py",
+        "tracking/proposers.py",
         "/ scale) > 1.0 for other in kept):",
         "/ scale) > 0.0 for other in kept):",
         "several starts are about the same",
@@ -203,7 +203,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-least-promising-starts",
-        "tracking/proposers/multistart.py",
+        "tracking/proposers.py",
         "for k in np.argsort(scores)[::-1]:",
         "for k in np.argsort(scores):",
         "starts are where nothing is seen",
@@ -211,7 +211,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-starts-within-a-sigma",
-        "tracking/proposers/multistart.py",
+        "tracking/proposers.py",
         "(2 * cube - 1) * np.sqrt(3) * uncertainty",
         "(2 * cube - 1) / np.sqrt(3) * uncertainty",
         "starts are drawn from less than the uncertainty",
@@ -219,7 +219,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-never-in-doubt",
-        "tracking/proposers/predicted.py",
+        "tracking/proposers.py",
         "(checks.is_sure and _is_met_as_before(data, ranked[0]))",
         "_is_met_as_before(data, ranked[0])",
         "where a prediction fails nothing else is tried",

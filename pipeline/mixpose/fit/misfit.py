@@ -12,32 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from mixpose.constants import constant
 from mixpose.density import peak
+from mixpose.fit.options import FitRules
 from mixpose.objective import BodyProjection
 from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Sensor
-
-
-@dataclass(frozen=True)
-class MisfitRules:
-    """When a body does not fit."""
-
-    believed: float = constant(
-        0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
-    )
-    unlike: float = constant(
-        0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
-    )
 
 
 @dataclass(frozen=True)
@@ -51,10 +39,7 @@ class SensorDensity:
     extent: tuple[Floats, Floats]  # smallest and largest coordinates (m,) of the density's cells
 
     def left(self, y: Floats) -> tuple[Floats, Floats]:
-        """What features (n, m), each of its own height (n,), leave of the density's gradient.
-
-        Gradients (n, m) times √2 σ, which have the noise of the values.
-        """
+        """What features (n, m) leave of the gradient (n, m) times √2 σ, and their heights (n,)."""
         away = (y[:, None] - y) / np.sqrt(self.variance)
         bells = np.exp(-0.5 * (away * away).sum(axis=2))
         here = self.density(y).astype(np.float64)
@@ -69,19 +54,15 @@ class SensorDensity:
 
 
 def misfit(
-    densities: Sequence[SensorDensity],
-    points_world: Floats,
-    unknowns: int,
-    rules: MisfitRules = MisfitRules(),
+    densities: Sequence[SensorDensity], points: Floats, unknowns: int, rules: FitRules = FitRules()
 ) -> float:
     """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
 
-    Each feature's height was fitted, and `unknowns` numbers of the pose, to exact densities at
-    `points_world` (n, 3).
+    Each feature's height was fitted, and some unknowns of the pose, to densities at points (n, 3).
     """
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
-        rest, heights = sensor.left(sensor.geometry.project(points_world)[0])
+        rest, heights = sensor.left(sensor.geometry.project(points)[0])
         # drawing rounds heights to 1/512
         statistic += float((rest**2).sum() / (sensor.noise() ** 2 + (heights.mean() / 512) ** 2))
         freedom += rest.size
@@ -142,8 +123,7 @@ class LabelledPlaces:
 
         y = self.projection.project(T[None]).y[:, 0]
         costs = ((y[:, :, None] - self.places[:, None]) ** 2).sum(axis=3)
-        labels = [linear_sum_assignment(cost)[1] for cost in costs]
-        return np.array(labels)
+        return np.array([linear_sum_assignment(cost)[1] for cost in costs])
 
     def fitted(self, T: Floats, free: Mask) -> tuple[float, Floats, LabelledPlaces]:
         """The sum of squares that is reached from a pose, where, and with which labels."""
@@ -159,12 +139,9 @@ class LabelledPlaces:
     def exchanged(self, T: Floats, free: Mask) -> list[float]:
         """Sums of squares, to first order, once two features of a sensor change their places."""
         Q, _ = np.linalg.qr(self.offsets(T[None])[1][0][:, free])
+        count, n = self.labels.shape
         squares = []
-        for k, (i, j) in (
-            (k, pair)
-            for k, own in enumerate(self.labels)
-            for pair in combinations(range(len(own)), 2)
-        ):
+        for k, (i, j) in product(range(count), combinations(range(n), 2)):
             labels = self.labels.copy()
             labels[k, [i, j]] = labels[k, [j, i]]
             rest = replace(self, labels=labels).offsets(T[None])[0][0]

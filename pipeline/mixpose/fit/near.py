@@ -11,14 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.constants import constant
-from mixpose.fit.misfit import MisfitRules
-from mixpose.fit.options import EstimatorOptions, free_mask
+from mixpose.fit.options import EstimatorOptions, FitRules, free_mask
 from mixpose.fit.prior import believed, has_likelihood
 from mixpose.matching import (
     AssociationRules,
@@ -46,41 +43,8 @@ from mixpose.sensors import Motion
 
 COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
 # what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
-SHARP = NewtonOptions(
-    iterations=40, tolerance=1e-6, value_error=value_error(STEPS_PER_SIGMA), remaining=5e-7
-)
+SHARP = replace(COARSE, iterations=40, tolerance=1e-6, remaining=5e-7)
 FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
-
-
-@dataclass(frozen=True)
-class ScheduleRules:
-    """How blurs follow one another."""
-
-    ratio: float = constant(
-        1.8, "blur from level to level: below 2, a peak lies in the basin of the next level's"
-    )
-    widest: float = constant(
-        0.1, "of the observed extent: with wider blurs everything is one blob (design study)"
-    )
-
-
-@dataclass(frozen=True)
-class FitRules:
-    """How a fit begins and ends."""
-
-    schedule: ScheduleRules = ScheduleRules()
-    misfit: MisfitRules = MisfitRules()
-    narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
-    moved: float = constant(
-        0.5,
-        "standard deviations by which narrower blurs have to move the pose: where all offsets are "
-        "normal they do so, too, as they are 5 % less efficient in six directions",
-    )
-    near: float = constant(
-        0.1,
-        "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
-        "on average; below, it descends through the blurs",
-    )
 
 
 @dataclass(frozen=True)
@@ -108,8 +72,7 @@ class Fit:
 
     def begins_at(self, other: Ascent) -> bool:
         """Whether another ascent ended where this fit's first did, so that it leads to the same."""
-        if self.first is None:
-            return False
+        assert self.first is not None
         away = twist_between(self.first.states[0], other.states[0])
         # what two ascents leave to be gained at one place: 0.003 σ_ε
         same = 10 * SHARP.tolerance * abs(float(other.values[0]))
@@ -121,11 +84,11 @@ def blur_schedule(
     body: Body,
     T_world_object: Floats,
     uncertainty: Floats,
-    rules: ScheduleRules = ScheduleRules(),
+    rules: FitRules = FitRules(),
 ) -> list[list[float]]:
     """Standard deviations of a feature per level and view, from coarse to σ_ε.
 
-    The coarsest blur is the root mean square by which features may be off at a start (4, 4) with
+    The coarsest is by how much features may be off (root mean square) at a start (4, 4) with
     standard deviations (6,).
     """
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
@@ -151,7 +114,7 @@ def fit_near(
     *,
     finest: MatchedObjective | None = None,  # at σ_ε, where it is at hand
     begun: Ascent | None = None,  # from the start, on that, where it is at hand
-    climbed: list[Fit] | None = None,  # to the same views with the same noise
+    climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
     blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
     noise: Floats | None = None,  # (2, L) squares in σ_ε² and degrees of freedom before; None: 0
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
@@ -159,50 +122,44 @@ def fit_near(
     association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
-    """Descend from coarse blurs to the detections' noise and climb the objective at each.
-
-    Where the ascent at σ_ε ends where that of one of the `climbed` did, the very same fit is
-    returned; else the fit is added to them.
-    """
-    free = free_mask(options)
-    sigmas, wider = [view.observation.sigma for view in views], list[list[float]]()
+    """Climb the objective from coarse blurs to the noise; the very fit that begins alike, if any."""
+    free, sigmas = free_mask(options), [view.observation.sigma for view in views]
+    levels: list[list[float]] = []
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
-        """The ascent at one blur after the other."""
-        spread, states = np.where(free, uncertainty, 0.0), T_start[None]
-        wider[:] = blur_schedule(views, body, T_start, spread, rules.schedule)
-        build = partial(build_objective, options.objective, views, body, samples)
-        narrowest = wider.pop()
-        for level in wider:
-            states = ascend(build(level, states[0]), states, perturb, free, COARSE).states
-        return ascend(last or build(narrowest, states[0]), states, perturb, free, newton)
+        states, spread = T_start[None], np.where(free, uncertainty, 0.0)
+        for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
+            levels.append(level)
+            at = build_objective(options.objective, views, body, samples, level, states[0])
+            states = ascend(at, states, perturb, free, COARSE).states
+        end = last or build_objective(options.objective, views, body, samples, sigmas, states[0])
+        return ascend(end, states, perturb, free, newton)
 
     if options.objective != "matched":
-        return Fit.of(descended(None, FINE), views, [*wider, sigmas])
+        return Fit.of(descended(None, FINE), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
     if has_likelihood(views):
-        fit = Fit.of(descended(finest, FINE), views, [*wider, sigmas])
+        fit = Fit.of(descended(finest, FINE), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
-        T, is_freed = believed(finest, fit.T_world_object, prior, rules.misfit)
+        T, is_freed = believed(finest, fit.T_world_object, prior, rules)
         return replace(fit, T_world_object=T, freed=is_freed)
     level = [blur * sigma for sigma in sigmas]
     first = finest if blur == 1 else matched_objective(views, body, level)
-    ascent = begun or _at_once(first, T_start, free, rules.near if blur == 1 else -np.inf)
-    ascent = ascent or descended(first, SHARP)
-    climbed = climbed if climbed is not None and blur == 1 else []
-    if known := next((one for one in climbed if one.begins_at(ascent)), None):
-        return known
-    before = np.zeros((2, len(views))) if noise is None else noise
-    rest = finest, free, before, beside, errors, association, rules
-    fit = _to_the_noise(ascent, [*wider, level], blur, *rest)
-    climbed.append(replace(fit, first=ascent))
-    return climbed[-1]
+    least = rules.near if blur == 1 else -np.inf
+    ascent = begun or _at_once(first, T_start, free, least) or descended(first, SHARP)
+    known = climbed if climbed is not None and blur == 1 else []
+    for fit in known:
+        if fit.begins_at(ascent):
+            return fit
+    rest = finest, free, noise, beside, errors, association, rules
+    known.append(_to_the_noise(ascent, [*levels, level], blur, *rest))
+    return known[-1]
 
 
 def fit_together(
     objectives: Sequence[MatchedObjective],  # on the same densities
     starts: Sequence[Floats],  # (4, 4) each
-    free: Mask,  # (6,)
+    free: Mask,
     rules: FitRules = FitRules(),
 ) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
@@ -240,7 +197,7 @@ def _to_the_noise(
     blur: float,
     finest: MatchedObjective,
     free: Mask,
-    before: Floats,
+    known: Floats | None,
     beside: float,
     errors: ErrorRules,
     association: AssociationRules,
@@ -249,10 +206,11 @@ def _to_the_noise(
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
     sigmas = np.array([view.observation.sigma for view in finest.views])
     blurs, count = np.full(len(sigmas), blur), int(free.sum())
-    likeliest, best = -np.inf, None
+    before = np.zeros((2, len(sigmas))) if known is None else known
+    first, likeliest, best = ascent, -np.inf, None
     while True:
-        matches = associate(finest, ascent.states[0], association, errors.narrowest)
-        fit, wide = replace(Fit.of(ascent, finest.views, levels), matches=matches), matches
+        matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
+        fit = replace(Fit.of(ascent, finest.views, levels), matches=matches, first=first)
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
             wide = replace(matches, finest=least)
@@ -262,7 +220,7 @@ def _to_the_noise(
         # offsets of a bent pose hide how small the noise is
         variances = np.minimum(noise.variances, (noise.before / errors.blur) ** 2)
         end = np.minimum(np.minimum(noise.blurs, noise.before), blurs)
-        narrower = np.maximum(end, blurs / rules.schedule.ratio)
+        narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
         if best is None:

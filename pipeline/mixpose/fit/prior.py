@@ -16,7 +16,8 @@ from functools import partial
 import numpy as np
 from scipy.special import chdtri
 
-from mixpose.fit.misfit import MisfitRules, SensorDensity, fit_freed, misfit
+from mixpose.fit.misfit import SensorDensity, fit_freed, misfit
+from mixpose.fit.options import FitRules
 from mixpose.objective import (
     AmplitudesObjective,
     MatchedObjective,
@@ -44,10 +45,9 @@ class Likelihood:
 
     @property
     def is_alone(self) -> bool:
-        """Whether no other pose can be as likely.
+        """Whether no other pose can be as likely: it explains more than half of each density.
 
-        The shares of one density that orthogonal predictions explain sum to 1 at the most
-        (Bessel's inequality): a pose that explains more than half of each is alone.
+        Shares that orthogonal predictions explain sum to 1 at the most (Bessel's inequality).
         """
         return bool(self.shares.min() > 0.5)
 
@@ -62,8 +62,7 @@ def likelihood_at(
 ) -> Likelihood:
     """The log-likelihood; what an objective at σ_ε leaves at a pose (4, 4) is taken for noise.
 
-    `misfit` is a factor on the variance of the noise: χ² per degree of freedom of a body that does
-    not fit.
+    `misfit`, χ² per degree of freedom of a body that does not fit, is a factor on its variance.
     """
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
@@ -97,7 +96,7 @@ def believed(
     objective: MatchedObjective,
     T_world_object: Floats,
     prior: NormalPrior,
-    rules: MisfitRules = MisfitRules(),
+    rules: FitRules = FitRules(),
 ) -> tuple[Floats, bool]:
     """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
 
@@ -129,13 +128,10 @@ def with_amplitudes(
     objective: MatchedObjective,
     T_world_object: Floats,
     prior: NormalPrior,
-    rules: MisfitRules,
+    rules: FitRules,
     misfit: float = 1.0,
 ) -> tuple[Floats, Floats]:
-    """The most probable pose near the one of equally bright features, and the noise (L,) of cells.
-
-    The same pose where they are equally bright; `misfit` as `likelihood_at` has it.
-    """
+    """The most probable pose near that of equally bright features, and the noise (L,) of cells."""
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
     noise, cells = equal, _cells(objective)
     smallest = NATS * objective.energies[:, 0] / cells
@@ -146,9 +142,8 @@ def with_amplitudes(
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
-    if gain < float(chdtri(freedom, 1 - rules.believed)):
-        return T_world_object, equal
-    return T, noise
+    is_equal = gain < float(chdtri(freedom, 1 - rules.believed))
+    return (T_world_object, equal) if is_equal else (T, noise)
 
 
 def _cells(objective: MatchedObjective) -> Indices:
