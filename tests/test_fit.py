@@ -9,7 +9,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit, FitRules, blur_schedule, fit_near
-from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
+from mixpose.fit.probable import Likelihood, likelihood_at, most_probable
 from mixpose.objective import NormalPrior, View, matched_objective
 from mixpose.records import Floats, GridPattern
 from mixpose.rigid import perturb, twist_between

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import peak
-from mixpose.fit.misfit import LabelledPlaces, SensorDensity, fit_freed, misfit, own_peaks
+from mixpose.fit.probable import LabelledPlaces, SensorDensity, fit_freed, misfit, own_peaks
 from mixpose.objective import BodyProjection
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.sensors import ParallelBeam

@@ -16,7 +16,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.fit.options import EstimatorOptions, FitRules, free_mask
-from mixpose.fit.prior import believed, has_likelihood
+from mixpose.fit.probable import believed, has_likelihood
 from mixpose.matching import (
     AssociationRules,
     ErrorRules,
@@ -122,7 +122,7 @@ def fit_near(
     association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
-    """Climb the objective from coarse blurs to the noise; the very fit that begins alike, if any."""
+    """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
     free, sigmas = free_mask(options), [view.observation.sigma for view in views]
     levels: list[list[float]] = []
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -28,13 +28,17 @@ class EstimatorOptions:
     # how long a frame is searched where no prediction convinces; None: live for cameras and streams
     search: SearchName | None = None
 
+    @cached_property
+    def mask(self) -> Mask:
+        """As `free_mask` has it."""
+        mask = np.array([name in self.free for name in TWIST_NAMES])
+        mask.flags.writeable = False
+        return mask
 
-@lru_cache
+
 def free_mask(options: EstimatorOptions) -> Mask:
     """Which of the six directions are estimated, not to be written to."""
-    mask = np.array([name in options.free for name in TWIST_NAMES])
-    mask.flags.writeable = False
-    return mask
+    return options.mask
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
 """Ranges whose features overlap: the likelihood of a pose over all associations.
 
-In one coordinate the features of a body lie close together against their errors, and what a range
-belongs to remains in doubt whatever the pose.  With n features in view and M detections of one
-sensor, every association λ gives each feature at most one detection and each detection at most one
-feature,
+What a range belongs to remains in doubt whatever the pose.  With n features in view and M
+detections of one sensor, every association λ gives each feature at most one detection and the
+reverse,
 
     L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
 
@@ -32,15 +31,9 @@ from mixpose.rigid import perturb
 class RangeRules:
     """What is believed of single ranges."""
 
-    max_features: int = constant(
-        8, "of a body, up to which associations are summed: their subsets double with each"
-    )
-    stated_degrees: float = constant(
-        20.0, "degrees of freedom that σ_ε counts as, where residuals say otherwise"
-    )
-    min_information: float = constant(
-        0.02, "of the information of known labels: what a pose has in any direction"
-    )
+    max_features: int = constant(8, "of a body: the subsets that are summed double with each")
+    stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
+    min_information: float = constant(0.02, "of that of known labels, which any direction has")
 
 
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
@@ -109,8 +102,8 @@ def sum_associations(
 def _summed(odds: Floats) -> tuple[Floats, Floats]:
     """Sum over associations (H,) and how probable each pair is (H, n, M), of odds (H, n, M).
 
-    Exact: from the first detection to the last, the odds of each subset of features being taken by
-    the detections so far; and the same backwards.
+    From the first detection to the last, the odds of each subset of features being taken so far;
+    and the same backwards.
     """
     count, n, M = odds.shape
     subsets = np.arange(2**n)
@@ -135,10 +128,7 @@ def _summed(odds: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class AssociationTerm:
-    """Logarithm of the likelihood over all associations; as `sum_associations` has it.
-
-    Second derivatives in free directions (6,) are differences of gradients.
-    """
+    """Logarithm of `sum_associations`, whose second derivatives are differences of gradients."""
 
     views: Sequence[View]
     body: Body

@@ -17,7 +17,7 @@ from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
 from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
-from mixpose.tracking.motion import Course, Expected, RandomWalk, at_rest, per_kind
+from mixpose.tracking.motion import Course, Expected, RandomWalk, per_kind
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Prediction, Track, either, nearest_branch
 
@@ -56,15 +56,15 @@ class Frame:
         """Directions that are estimated."""
         return free_mask(self.options)
 
+    @cached_property
+    def is_timed(self) -> bool:
+        """Whether any view is seen at another moment than the common time."""
+        return any(view.delay or view.readout or view.unsure is not None for view in self.views)
+
     @property
     def sigmas(self) -> list[float]:
         """σ_ε of each view."""
         return [view.observation.sigma for view in self.views]
-
-    @property
-    def elapsed(self) -> float | None:
-        """Seconds since the last pose, where they are known."""
-        return self.track.seconds_until(self.time_s)
 
     @cached_property
     def noise(self) -> Floats:
@@ -95,11 +95,11 @@ class Frame:
 
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
-        misses = self.track.misses
+        misses, rules = self.track.misses, self.rules.motion
         own = self._prior(T_world_object, self.predictions, misses)
         if self.beside is None:
             return own
-        return either(own, self._prior(T_world_object, [self.beside], 0), misses, self.rules.motion)
+        return either(own, self._prior(T_world_object, [self.beside], 0), misses, rules)
 
     def _prior(self, T_world_object: Floats, some: Sequence[Prediction], misses: int) -> Prior:
         """Density of a pose by predictions, or now and then anywhere."""
@@ -135,22 +135,21 @@ class Frame:
 
     def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
         """The velocity that the frames before let expect of a pose, or near it."""
-        elapsed, rules = self.elapsed, self.rules.course
-        rest = at_rest(self.body, rules)
+        elapsed, rules = self.track.seconds_until(self.time_s), self.rules.course
+        # where nothing was seen before: rest, give or take what hands can do
+        rest = Expected(np.zeros(6), np.zeros(6), per_kind(self.body, rules.fastest), np.zeros(6))
         branch = nearest_branch(self.track, T_world_object, self.body)
         if branch is None or not elapsed:
             return rest
         T = nearest_alike(T_world_object, self.body, branch.T_world_object)
         moved = twist_between(branch.T_world_object, T)
-        if branch.course is not None and elapsed <= rules.longest_s:
-            expected = branch.course.expected(moved if is_there else None, elapsed, rules)
-            is_far = (np.abs(expected.velocity) > rest.deviation).any()
-            return rest if is_far else expected
-        if branch.course is not None or branch.velocity is None:
+        if branch.course is None and branch.velocity is not None:  # by the last two steps alone
+            velocity = moved / elapsed + (moved / elapsed - branch.velocity) / 2
+            return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
+        if branch.course is None or elapsed > rules.longest_s:
             return rest
-        # by the last two steps alone
-        velocity = moved / elapsed + (moved / elapsed - branch.velocity) / 2
-        return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
+        expected = branch.course.expected(moved if is_there else None, elapsed, rules)
+        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected
 
 
 def given(frame: Frame, T_world_object: Floats) -> float:
@@ -159,9 +158,9 @@ def given(frame: Frame, T_world_object: Floats) -> float:
         return 0.0
     projection = frame.finest.projection
     at = projection.project(T_world_object[None])
-    spreads = frame.body.node_spreads(T_world_object)
-    each = zip(at.J[:, 0], projection.dimensions.tolist(), strict=True)
-    variances = np.array([in_image(spreads, J[:, :m]) for J, m in each]) * at.seen[:, 0]
+    # per coordinate, of which each sensor has two in J
+    each = (2 / projection.dimensions)[:, None] * at.seen[:, 0]
+    variances = each * in_image(frame.body.node_spreads(T_world_object), at.J[:, 0])
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 

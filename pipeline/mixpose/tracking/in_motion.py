@@ -1,12 +1,9 @@
 """Sensors that see a moving body at moments of their own: late, or row after row.
 
-A pose and a velocity are estimated together, by the objective and by what the frame's residuals and
-the poses before say of it.  Both are the maximum of one likelihood, sought in turns: a Gauss-Newton
-step of both gives the velocity, with which the objective is climbed again.
-
-With velocity v, a feature that is seen t seconds after the common time moves by J δ + t J δv when
-the pose changes by δ and the velocity by δv.  A sensor that is later than it says by τ has offsets
-J v τ more.
+A pose and a velocity are the maximum of one likelihood, sought in turns: a Gauss-Newton step of
+both gives the velocity, with which the objective is climbed again.  A feature that is seen t
+seconds after the common time moves by J δ + t J δv when the pose changes by δ and the velocity v
+by δv.  A sensor that is later than it says by τ has offsets J v τ more.
 """
 
 from __future__ import annotations
@@ -49,13 +46,13 @@ class Offsets(NamedTuple):
         own = self.sensor[:, None] == np.array(sensors, int)
         return np.where(own, (self.rows @ velocity)[:, None], 0.0)
 
-    def system(
-        self, velocity: Floats, expected: Expected, free: Mask
+    def least_squares(
+        self, velocity: Floats, expected: Expected, free: Mask, variance: float
     ) -> tuple[Floats, Floats, Floats]:
-        """Derivatives by all unknowns, and what is known of these: rows and right sides.
+        """All unknowns by a Gauss-Newton step, their covariance, and offsets (K,) that are left.
 
         The unknowns are the pose, the velocity, the estimated delays, and of each delay the way of
-        the body in it at a velocity other than this.  What is known has standard deviation one.
+        the body in it at a velocity other than this.
         """
         rows, fast = self.rows[:, free], expected.deviation[free]
         count, late = len(fast), np.array([deviation for _, deviation in self.unsure])
@@ -63,18 +60,16 @@ class Offsets(NamedTuple):
         ways = [rows * (self.sensor == k)[:, None] for k in sensors]
         by_delay = self.by_delay(velocity, sensors)
         design = np.hstack([rows, rows * self.late[:, None], by_delay, *ways])
-        # the velocity less what is expected of the pose after its step, and the delays
+        # what is known, with standard deviation one: the velocity less what is expected of the pose
+        # after its step, and the delays
         prior = np.eye(design.shape[1])[count:]
         prior[:count, :count] = -np.diag(expected.gain[free])
         prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
         known = np.zeros(len(prior))
         known[:count] = (expected.velocity - velocity)[free] / fast
-        return design, prior, known
-
-
-def is_timed(views: Sequence[View]) -> bool:
-    """Whether any view is seen at another moment than the common time."""
-    return any(view.delay or view.readout or view.unsure is not None for view in views)
+        covariance = inverses((design.T @ design / variance + prior.T @ prior)[None])[0]
+        x = covariance @ (design.T @ self.offsets / variance + prior.T @ known)
+        return x, covariance, self.offsets - design @ x
 
 
 def gauss_newton(J: Floats, offsets: Floats, free: Mask) -> Floats:
@@ -89,7 +84,6 @@ def fit_in_motion(
 ) -> Fit:
     """Climb to the most likely pose and velocity near a start.
 
-    The pose is climbed to as if the velocity were known, then steps of both are taken in turns.
     `climb` takes a frame as of the common time, a pose (4, 4), and how far features may be off, in
     σ_ε, to the best pose near it.
     """
@@ -99,7 +93,10 @@ def fit_in_motion(
     for _ in range(6):
         seen = frame.in_motion(motion)
         if moved > LINEAR:
-            fit = climb(seen, T, _in_view(seen, T, expected))
+            at, views = seen.finest.projection.project(T[None]), (frame.still or frame).views
+            J, there = at.J[:, 0] / np.array(seen.sigmas)[:, None, None, None], at.seen[:, 0]
+            late = _seconds(views, at.y[:, 0], there)
+            fit = climb(seen, T, _unsure_by(J, late, there, views, expected))
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         expected = frame.expected(T)
         matches = associate(seen.finest, T, rules.association, errors.narrowest)
@@ -125,9 +122,8 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     scale = float(np.trace(alone @ covariance[inner])) / max(count, 1)
     if not np.isfinite(scale) or scale <= 0:
         return judged
-    design, prior, _ = met.system(motion.velocity, expected, free)
-    together = _inverse(design.T @ design / scale + prior.T @ prior)[:count, :count]
-    extra = together - scale * _inverse(alone)
+    _, together, _ = met.least_squares(motion.velocity, expected, free, scale)
+    extra = together[:count, :count] - scale * inverses(alone[None])[0]
     values, vectors = np.linalg.eigh((extra + extra.T) / 2)
     covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
     return replace(judged, covariance=covariance)
@@ -161,13 +157,6 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
     )
 
 
-def _in_view(frame: Frame, T_world_object: Floats, expected: Expected) -> float:
-    """How far features in view may be off by velocity and delay, in σ_ε of their sensor."""
-    at, views = frame.finest.projection.project(T_world_object[None]), (frame.still or frame).views
-    J, seen = at.J[:, 0] / np.array(frame.sigmas)[:, None, None, None], at.seen[:, 0]
-    return _unsure_by(J, _seconds(views, at.y[:, 0], seen), seen, views, expected)
-
-
 def _seconds(views: Sequence[View], y: Floats, seen: Mask) -> Floats:
     """Seconds (L, n) after the common time at which features at places (L, n, 2) are seen."""
     each = zip(views, y, strict=True)
@@ -180,10 +169,8 @@ def _unsure_by(
 ) -> float:
     """How far features may be off by velocity and delay, in σ_ε; J (L, n, 2, 6) in σ_ε."""
     delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
-    ways = np.hypot(
-        late[..., None] * expected.deviation,
-        delays * np.hypot(expected.velocity, expected.deviation),
-    )
+    speed = np.hypot(expected.velocity, expected.deviation)
+    ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
     squares = ((J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
     return float(np.sqrt(squares.max(initial=0.0, where=seen)))
 
@@ -192,33 +179,21 @@ def _change(
     met: Offsets, velocity: Floats, expected: Expected, free: Mask, errors: ErrorRules
 ) -> Floats:
     """Change (6,) of the velocity by one Gauss-Newton step of it and the pose."""
-    typical, typical_degrees = errors.typical**2, errors.typical_degrees
-    design, prior, known = met.system(velocity, expected, free)
-    count, change, variance = int(free.sum()), np.zeros(6), typical
+    variance, count, change = errors.typical**2, int(free.sum()), np.zeros(6)
     for _ in range(2):  # the second time with the variance that the first leaves
-        information = design.T @ design / variance + prior.T @ prior
-        x = _inverse(information) @ (design.T @ met.offsets / variance + prior.T @ known)
-        rest = met.offsets - design @ x
-        degrees = typical_degrees + max(len(rest) - count, 0)
-        total = typical_degrees * typical + float(rest @ rest)
+        x, _, rest = met.least_squares(velocity, expected, free, variance)
+        total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
+        degrees = errors.typical_degrees + max(len(rest) - count, 0)
         variance = max(total / degrees, LEAST_VARIANCE)
     change[free] = x[count : 2 * count]
     return change
 
 
-def _inverse(information: Floats) -> Floats:
-    """Inverse of one information matrix; large where it is open."""
-    return np.asarray(inverses(information[None])[0])
-
-
 def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
-    """What is known of delays after a frame, whose best pose is known as well as its features say.
-
-    Only every third frame is asked where nobody wants to know.
-    """
+    """What is known of delays after a frame with a best pose."""
     before, used = frame.track.delays, best.used
-    is_asked = frame.frame % SOME_FRAMES == 0 or is_timed(frame.views)
-    if len(used.names) < 2 or not frame.elapsed or not is_asked:
+    is_asked = frame.frame % SOME_FRAMES == 0 or frame.is_timed
+    if len(used.names) < 2 or not frame.track.seconds_until(frame.time_s) or not is_asked:
         return before
     expected = frame.expected(best.T_world_object)
     own = {name: k for k, name in enumerate(used.names)}

@@ -1,8 +1,7 @@
 """What one frame says of a pose: how to fit it near a start, and how to judge it.
 
-Chosen once per frame: matched densities, or, for single ranges of small bodies, the likelihood
-over all associations of ranges and features.  The matched objective asks how well densities agree;
-where errors are as large as distances of features that wastes information.
+Matched densities, or, for single ranges of small bodies, the sum over all associations: where
+errors are as large as distances of features, densities waste information.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from mixpose.tracking.associations import (
     sum_associations,
 )
 from mixpose.tracking.frame import Frame, given
-from mixpose.tracking.in_motion import fit_in_motion, is_timed, with_motion_unknown
+from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.track import Prediction
 
 
@@ -59,7 +58,7 @@ class MatchedLikelihood:
         frame, known = self.frame.without(start.left_out), self.frame.begun
         if known is not None and known.fit and start.prediction is frame.predictions[0]:
             return known.fit
-        timed, model = is_timed(frame.views), frame.rules.judgement
+        timed, model = frame.is_timed, frame.rules.judgement
         climbed = self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, start.T_world_object) if self.knows_detections else 0.0
 
@@ -92,7 +91,7 @@ class MatchedLikelihood:
         if begun is not None and fit is begun.fit and begun.judged is not None:
             return begun.judged
         T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
-        if is_timed(frame.views):
+        if frame.is_timed:
             motion = motion or frame.expected(T).at(T)
             frame = frame.in_motion(motion)
         prior = frame.prior(T if start.T_moved is None else start.T_moved)
@@ -106,8 +105,7 @@ class MatchedLikelihood:
 class AssociationLikelihood:
     """All associations of single ranges with the features of a small body.
 
-    The pose of a frame before is a normal prior, as wide as it was uncertain and as the body may
-    have moved since.
+    The pose of a frame before is a normal prior, widened as the body may have moved since.
     """
 
     knows_detections = False
@@ -118,23 +116,18 @@ class AssociationLikelihood:
 
     def fit(self, start: Start) -> Fit:
         """Climb the posterior, at first with ranges that err as far as the prior may."""
-        T, frame, prior, widths = (
-            start.T_world_object,
-            self.frame,
-            self._prior(start),
-            [self._noise],
-        )
-        if prior is None:  # matched densities lead from starts of which nothing is known
+        T, frame, known, widths = start.T_world_object, self.frame, start.prediction, [self._noise]
+        if known is None or not known.is_prior:  # nothing is known: matched densities lead there
             T = MatchedLikelihood(frame).fit(start).T_world_object
             T = nearest_alike(T, frame.body, frame.T_reference)
         else:
-            uncertainty = np.where(frame.free, prior.uncertainty, 0.0)
+            uncertainty = np.where(frame.free, known.uncertainty, 0.0)
             levels = blur_schedule(frame.views, frame.body, T, uncertainty)
             ratios = [max(np.divide(level, frame.sigmas).tolist()) for level in levels]
             widths = [ratio for ratio in ratios if ratio > self._noise] + widths
         states, options = T[None], NewtonOptions(tolerance=1e-7)
         for width in widths:
-            end = ascend(self._posterior(prior, width), states, perturb, frame.free, options)
+            end = ascend(self._posterior(start, width), states, perturb, frame.free, options)
             states = end.states
         return Fit.of(end, frame.views, np.outer(widths, frame.sigmas).tolist())
 
@@ -147,17 +140,14 @@ class AssociationLikelihood:
         degrees = max(float(found.met[0]) - count, 0.0)
         squares = float(found.squares[0]) if degrees else 0.0
         remembered = model.noise.memory * before.of(("",)) + [[squares], [degrees]]
-        # a direction that the data leave open is as uncertain as anywhere; the posterior holds
-        # the prediction already
-        posterior = self._posterior(self._prior(start), self._noise)
-        information = self._definite(posterior.linearise(T[None]))
+        # a direction that all of it leaves open is as uncertain as anywhere
+        information = self._definite(self._posterior(start, self._noise).linearise(T[None]))
         information += np.diag(1 / frame.anywhere.spread[free] ** 2)
         covariance = np.zeros((6, 6))
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-        covariance *= model.noise.enlargement(
-            count, rules.ranges.stated_degrees + before.total.degrees
-        )
+        degrees = rules.ranges.stated_degrees + before.total.degrees
+        covariance *= model.noise.enlargement(count, degrees)
         log_density = frame.prior(T).log_density
         return replace(
             judge(Case(frame.finest, T), free, model),
@@ -167,18 +157,13 @@ class AssociationLikelihood:
             spread=np.sqrt(np.diag(covariance)),
         )
 
-    def _prior(self, start: Start) -> NormalPrior | None:
-        """What frames before said of a start as surely as this one will."""
-        expected = start.prediction
-        if expected is None or not expected.is_prior:
-            return None
-        return NormalPrior(expected.T_world_object, expected.uncertainty, self.frame.free)
-
-    def _posterior(self, prior: NormalPrior | None, noise: float) -> Term:
-        """Likelihood and prior, with ranges that err by so much, in σ_ε."""
-        frame, detection = self.frame, self.frame.rules.judgement.detection
-        term = AssociationTerm(frame.views, frame.body, frame.free, noise, detection)
-        return term if prior is None else Sum((term, prior))
+    def _posterior(self, start: Start, noise: float) -> Sum:
+        """Likelihood and prior, of ranges that err by so much in σ_ε."""
+        frame, known, detection = self.frame, start.prediction, self.frame.rules.judgement.detection
+        terms: list[Term] = [AssociationTerm(frame.views, frame.body, frame.free, noise, detection)]
+        if known is not None and known.is_prior:
+            terms.append(NormalPrior(known.T_world_object, known.uncertainty, frame.free))
+        return Sum(tuple(terms))
 
     def _definite(self, here: Quadratic) -> Floats:
         """Minus the Hessian (k, k) where definite; in directions where not, next to nothing."""

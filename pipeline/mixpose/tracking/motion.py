@@ -27,44 +27,32 @@ class MotionRules:
 
     coasting: int = constant(5, "frames for which a velocity is believed without a pose")
     steady: Scale = constant(
-        (0.03, 1.0),
-        "radii (1.7° at the rim) and degrees, least uncertainty of a prediction: hand-held bodies "
-        "change their speed by as much",
+        (0.03, 1.0), "least uncertainty of a prediction: hand-held bodies change speed by as much"
     )
     unsteady: float = constant(5.0, "times as wide where no velocity is known yet")
     known_from: float = constant(
-        3.0,
-        "degrees of freedom of a prediction's error: its size is that of one change of motion, in "
-        "three directions",
+        3.0, "degrees of freedom of a prediction's error: one change of motion, in three directions"
     )
     widening: float = constant(1.5, "of the uncertainty, per frame without a pose")
     widest: float = constant(4.0, "the most it widens by, but for a tenth per further frame")
     unknown: Scale = constant(
         (1.0, 30.0),
-        "radii and degrees from one frame to the next, before any motion was seen (ranges); of a "
-        "body about where it was beside another one, which counts as `known_from` frames",
+        "from one frame to the next, before any motion was seen (ranges); of a body about where it "
+        "was beside another one, which counts as `known_from` frames",
     )
-    guess_weight: float = constant(
-        0.2, "of a displacement that was seen: what the guess before it counts"
-    )
+    guess_weight: float = constant(0.2, "of a displacement seen: what the guess before it counts")
     recall: float = constant(0.95, "per frame, of displacements before: 20 frames count")
     other_kind: float = constant(
         0.25, "least share of squared displacements by turns in those by shifts, and the reverse"
     )
     persistence: float = constant(
-        1.5, "of the mean square: steps that follow each other are alike (radio ranges)"
+        1.5, "of the mean square: steps that follow each other are alike, so that errors add up"
     )
-    surprise: float = constant(
-        0.02, "chance per frame that the body is somewhere else than predicted"
-    )
+    surprise: float = constant(0.02, "chance per frame that the body is somewhere else")
     beside: float = constant(
-        0.5,
-        "weight of where another body lets a lost one be expected, against its own track: nobody "
-        "knows how often they part; a wrong one costs half of the odds",
+        0.5, "weight of where another body lets a lost one be expected: a wrong one costs half"
     )
-    start: Scale = constant(
-        (0.1, 5.0), "radii (6° at the rim) and degrees, uncertainty of a [start] that states none"
-    )
+    start: Scale = constant((0.1, 5.0), "uncertainty of a [start] that states none: 6° at the rim")
 
 
 @dataclass(frozen=True)
@@ -72,9 +60,7 @@ class CourseRules:
     """What is believed of a velocity before the frame is seen."""
 
     fastest: Scale = constant(
-        (5.0, 180.0),
-        "radii of the body and degrees per second, where no velocity is known: half a metre for a "
-        "hand's, and its wave",
+        (5.0, 180.0), "per second, where no velocity is known: half a metre for a hand's, its wave"
     )
     quickest: float = constant(
         5.0, "per second: by which derivatives are larger from one to the next, hands at 0.8 Hz"
@@ -85,9 +71,7 @@ class CourseRules:
         "filter to the most sudden (3 Hz and a radius wide), and how many there are",
     )
     memory: float = constant(0.9, "per frame, of how well each foretold the poses: 10 count")
-    lost: float = constant(
-        50.0, "squared deviations of a pose from what was foretold: it begins anew"
-    )
+    lost: float = constant(50.0, "squared deviations from what was foretold: it begins anew")
     longest_s: float = constant(0.5, "without a pose, after which nothing is foretold")
 
 
@@ -113,24 +97,19 @@ class RandomWalk:
     def joined(self, moved: Floats, radius: float, elapsed: float) -> RandomWalk:
         """Add a displacement (6,) of a body of some radius to what is remembered.
 
-        A body whose features shift by some length may also turn them by half of it, and the
-        other way round: a turn is not unlikely for not having been seen so far.
+        A turn is not unlikely for not having been seen so far: features that shift may turn, too.
         """
         lever = np.repeat([1.0, radius], 3)
         squares = ((moved * lever) ** 2).reshape(2, 3)
         # of the lengths and of the angles, the mean of those that are not zero
         means = squares.sum(axis=1) / np.maximum(np.count_nonzero(squares, axis=1), 1)
-        shares = np.repeat(means, 3)
-        other = np.roll(shares, 3)
+        shares, other = np.repeat(means, 3), np.repeat(means[::-1], 3)
         rate = np.maximum(shares, self.rules.other_kind * other) / lever**2 / elapsed
         recall = self.rules.recall
         return RandomWalk(recall * self.rates + rate, recall * self.count + 1, self.rules)
 
     def variance(self, elapsed: float) -> Floats:
-        """Variance (6,) of the displacement in a time, wider than the mean square.
-
-        Steps that follow each other are alike, so that errors of prediction add up.
-        """
+        """Variance (6,) of the displacement in a time."""
         return np.asarray(self.rules.persistence * self.rates / self.count * elapsed)
 
 
@@ -145,11 +124,6 @@ class Expected(NamedTuple):
     def at(self, T_world_object: Floats) -> Motion:
         """How a body moves at that pose."""
         return Motion(T_world_object, self.velocity, self.acceleration)
-
-
-def at_rest(body: Body, rules: CourseRules) -> Expected:
-    """What is expected where nothing was seen before: rest, give or take what hands can do."""
-    return Expected(np.zeros(6), np.zeros(6), per_kind(body, rules.fastest), np.zeros(6))
 
 
 @dataclass(frozen=True)

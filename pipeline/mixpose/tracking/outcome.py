@@ -14,7 +14,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.search import SearchState
 from mixpose.tracking.frame import Frame, follow
-from mixpose.tracking.in_motion import delays_after, is_timed
+from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.recognition import is_known
 from mixpose.tracking.track import Branch, SensorTally, Track
 from mixpose.tracking.tracked_body import TrackedBody
@@ -88,7 +88,7 @@ def followed(tracked: TrackedBody, data: Frame, verdict: Verdict) -> Track:
         belief = weight * float(expit(one.log_evidence))
         spread = one.spread if tracked.options.fuse else None
         momentary = np.diagonal(one.covariance - one.persistent)
-        deviation = np.sqrt(momentary) if is_timed(data.views) else None
+        deviation = np.sqrt(momentary) if data.is_timed else None
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
     met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))

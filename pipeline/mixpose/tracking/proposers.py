@@ -42,8 +42,8 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
-    Of a body that was followed for some frames it is enough, however much of it is hidden, that no
-    more is missed all at once: what slips by a step of its grid, or turns over, meets less.
+    Of a body that was followed for some frames it is enough that no more is missed all at once:
+    what slips by a step of its grid, or turns over, meets less.
     """
     if not ranked:
         return True
@@ -59,10 +59,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """The most promising poses around the first prediction, until something convinces.
-
-    The coarsest blurs of one descent may lead astray.
-    """
+    """Promising poses around the first prediction, where the coarsest blurs may lead astray."""
     if not frame.predictions or not is_doubtful(frame, ranked):
         return
     first, rules = frame.predictions[0], frame.rules.proposals
@@ -82,10 +79,7 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 
 def starts_around(frame: Frame, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
-    """The most promising poses (4, 4) around a guess, best first, none close to another.
-
-    Standard deviations (6,) of the guess are zero for directions that are not free.
-    """
+    """The most promising poses (4, 4) around a guess, uncertain by (6,), none close to another."""
     rules = frame.rules.proposals
     sigmas = blur_schedule(frame.views, frame.body, T_guess, uncertainty / rules.narrowing)[0]
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
@@ -117,10 +111,9 @@ def starts_at(frame: Frame, candidates: Sequence[Candidate]) -> Iterable[Start]:
 
 
 def candidates_of(frame: Frame) -> list[Candidate]:
-    """What the search finds, the most evident first; with a budget, as far as that reaches.
+    """What the search finds, the most evident first, as far as the budget reaches.
 
-    Detections that stayed where they are while the body was lost are left out at first, for half
-    of the budget.
+    Detections that stayed where they are while the body was lost are left out at first.
     """
     live = frame.options.search == "live"
     budget = frame.rules.live if live else frame.rules.search
@@ -149,10 +142,9 @@ def candidates_of(frame: Frame) -> list[Candidate]:
 def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Poses at which the body looks the same, or nearly so, as at the best pose of the frame.
 
-    What is met there may lie like other features of the body: a chessboard of which a rim is
-    hidden explains what is seen a step of its grid off, too, and one tag of a block every other,
-    turned any way.  A flat body that is small in an image looks almost the same tilted the other
-    way.  All of them move alike; the sum of evidence tells which is right, or that none can tell.
+    What is met there may lie like other features: a chessboard of which a rim is hidden explains
+    what is seen a step of its grid off, too.  A flat body that is small in an image looks almost
+    the same tilted the other way.  The sum of evidence tells which is right, or that none can.
     """
     kinds = frame.rules.look_alikes.kinds
     best = None
@@ -163,10 +155,9 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
         best = ranked[0]
         yield from _as_evident(frame, best)
     if ranked and "tilted" in kinds:
-        best = ranked[0]
         close = frame.start_uncertainty / frame.rules.proposals.narrowing
-        for T in _tilted(frame, best):
-            yield Start(T, close, T_moved=_moves_alike(frame, best.T_world_object))
+        for T in _tilted(frame, ranked[0]):
+            yield Start(T, close, T_moved=_moves_alike(frame, ranked[0].T_world_object))
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
@@ -191,11 +182,7 @@ def met_features(judged: ScoredPose) -> frozenset[int]:
 
 
 def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
-    """The pose, where the frame before left open which of its look-alikes is right.
-
-    Motion does not tell: it says less of where a body's origin goes the farther that is from its
-    middle.
-    """
+    """The pose, where the frame before left open which look-alike is right: they move alike."""
     return T_world_object if len(frame.track.branches) > 1 else None
 
 
@@ -212,8 +199,7 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     """The best pose moved, where as much is met and motion does not tell against it.
 
-    Each feature counts as much as any other evidence: what motion says against a pose must be made
-    up for by features that it meets more.
+    What motion says against a pose must be made up for by features that it meets more.
     """
     alike = _congruent(frame, best)
     if not alike:

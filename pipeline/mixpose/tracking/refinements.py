@@ -29,10 +29,7 @@ class Refinement(Protocol):
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """The pose fitted without the sensors that disagree with two others or more.
-
-    They are out of step, or bumped; what is left out counts as missed in the evidence.
-    """
+    """The pose fitted without the sensors that disagree with two others or more."""
     if not likelihood.knows_detections or len(frame.views) < 3 or judged.left_out:
         return
     rules = frame.rules
@@ -62,11 +59,7 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
 
 
 def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """Least squares with two features that run into each other in their middle.
-
-    Their one detection pulls at both and bends the pose, or is taken for one of them while the
-    other seems hidden.
-    """
+    """Least squares with the middle of two features that run into each other in one detection."""
     if not likelihood.knows_detections:
         return []
     at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
@@ -112,8 +105,7 @@ def _paired(seen: Matches, reach: float) -> Matches:
 def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """The predictions at narrow blurs, where residuals are larger than chance makes them.
 
-    Spots that are cut, or run into another's, are off by a share of σ_ε: too little for the blur
-    that a fit begins with to leave them out.  Narrow blurs hold on to the detections that agree.
+    Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
     if not judged.is_unlike or not likelihood.knows_detections:
         return

@@ -14,7 +14,6 @@ from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View
 from mixpose.records import Floats, label_of
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, Proposer
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
@@ -124,7 +123,7 @@ class TrackedBody:
             frame=frame,
             time_s=time_s,
         )
-        if predictions and is_timed(views):
+        if predictions and data.is_timed:
             T = predictions[0].T_world_object
             return data.in_motion(data.expected(T).at(T))
         return data
