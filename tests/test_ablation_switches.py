@@ -17,7 +17,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.proposers.look_alikes import look_alikes
+from mixpose.tracking.proposers import look_alikes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 from ablated.cases import Case, all_on, loose_start_case, room_case, search_case
@@ -77,7 +77,7 @@ SHOWN_BY = {
     "no F enlargement": "two_cameras",
     "late sensors taken as in time": "real_room",
     "features equally bright": "range_profiles",
-    "no freed features": DEFORMED,
+    "misfit taken for noise": DEFORMED,
     "blurs always": "two_cameras",
     "blurs never": "fast",
     "not looked elsewhere": "fast board",

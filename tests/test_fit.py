@@ -8,8 +8,8 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, interpolation_bound, rand
 
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
-from mixpose.fit import Climbed, EstimatorOptions, ScheduleRules, blur_schedule, fit_near
-from mixpose.fit.prior import Likelihood, likelihood_at, most_probable
+from mixpose.fit import EstimatorOptions, Fit, FitRules, blur_schedule, fit_near
+from mixpose.fit.probable import Likelihood, likelihood_at, most_probable
 from mixpose.objective import NormalPrior, View, matched_objective
 from mixpose.records import Floats, GridPattern
 from mixpose.rigid import perturb, twist_between
@@ -55,7 +55,7 @@ def test_no_blur_is_wider_than_a_tenth_of_what_is_seen(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     views = detect(pinhole_cameras, EIGHT, TRUTH)
-    levels = blur_schedule(views, EIGHT, TRUTH, np.repeat([1e3, 3.0], 3), ScheduleRules())
+    levels = blur_schedule(views, EIGHT, TRUTH, np.repeat([1e3, 3.0], 3), FitRules())
     for view, widest in zip(views, levels[0], strict=True):
         lower, upper = view.observation.extent
         assert widest == pytest.approx(0.1 * (upper - lower).max())
@@ -74,7 +74,7 @@ def test_a_start_twenty_pixels_off_is_corrected(pinhole_cameras: list[PinholeCam
 def test_a_start_that_leads_where_another_did_is_given_the_very_same_fit(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    views, climbed = detect(pinhole_cameras, EIGHT, TRUTH), list[Climbed]()
+    views, climbed = detect(pinhole_cameras, EIGHT, TRUTH), list[Fit]()
     far = perturb(TRUTH, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0]))  # at another maximum
     first, again, elsewhere = (
         fit_near(

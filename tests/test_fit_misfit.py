@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mixpose.body import Body, PointFeature
 from mixpose.density import peak
-from mixpose.fit.misfit import Matching, SensorDensity, fit_freed, misfit, own_peaks
+from mixpose.fit.probable import LabelledPlaces, SensorDensity, fit_freed, misfit, own_peaks
+from mixpose.objective import BodyProjection
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.sensors import ParallelBeam
 
@@ -52,6 +54,10 @@ def seen(sensor: ParallelBeam, centres: Floats, noise: float = 1e-6) -> SensorDe
     cell = (noise * top / len(centres)) ** 2 / top
     extent = np.zeros(2), np.full(2, 200.0)
     return SensorDensity(sensor, gaussians(centres), VARIANCE, cell, extent)
+
+
+def projection(points: Floats = POINTS) -> BodyProjection:
+    return BodyProjection(BEAMS, Body("body", tuple(PointFeature(point) for point in points)))
 
 
 def projected(points: Floats = POINTS) -> list[Floats]:
@@ -123,18 +129,17 @@ def test_a_feature_that_is_half_as_high_as_the_others_has_no_peak_of_its_own() -
 
 def test_places_go_to_the_features_nearest_to_them() -> None:
     order = [3, 1, 5, 0, 2, 4]
-    places = [y[order] for y in projected()]
-    found = [seen(one, y) for one, y in zip(BEAMS, projected(), strict=True)]
-    labels = Matching(found, POINTS, places, FREE).nearest(np.eye(4))
+    places = np.array([y[order] for y in projected()])
+    unknown = LabelledPlaces(projection(), places, np.ones(2), np.zeros((2, 6), np.intp))
     # feature i is at the place that holds it
-    assert labels == (tuple(np.argsort(order).tolist()),) * 2
+    assert unknown.nearest(np.eye(4)).tolist() == [np.argsort(order).tolist()] * 2
 
 
 def test_a_deformed_body_is_fitted_to_its_features_by_least_squares() -> None:
     places = deformed(1.0)
     found = [seen(one, y) for one, y in zip(BEAMS, places, strict=True)]
     start = perturb(np.eye(4), np.array([2.0, -1.0, 1.0, 0.02, 0.03, -0.02]))
-    T = fit_freed(found, POINTS, start[None], FREE)
+    T = fit_freed(projection(), found, start[None], FREE)
     assert T is not None
     # no step lowers the sum of squares of 2 · 6 distances
     at = sum_of_squares(T, places)
@@ -160,4 +165,4 @@ def test_places_that_might_be_each_others_free_nothing() -> None:
     found = [seen(one, y) for one, y in zip(BEAMS, places, strict=True)]
     assert own_peaks(found[0], 6) is not None
     assert own_peaks(found[1], 6) is not None
-    assert fit_freed(found, points, np.eye(4)[None], FREE) is None
+    assert fit_freed(projection(points), found, np.eye(4)[None], FREE) is None

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mixpose.fit import prior as prior_module
-from mixpose.fit.prior import cell_variances, most_probable
+from mixpose.fit import probable
+from mixpose.fit.probable import cell_variances, most_probable
 from mixpose.objective import MatchedObjective, NormalPrior
 from mixpose.optimise import Quadratic
 from mixpose.rigid import perturb, twist_between
@@ -74,7 +74,7 @@ def most_probable_of(monkeypatch: pytest.MonkeyPatch) -> MostProbable:
     """The most probable pose of a likelihood that is given, not drawn."""
 
     def maximise(toy: Toy, T: Floats, prior: NormalPrior) -> Floats:
-        monkeypatch.setattr(prior_module, "likelihood_at", lambda *_: Drawn(toy))
+        monkeypatch.setattr(probable, "likelihood_at", lambda *_: Drawn(toy))
         return most_probable(cast(MatchedObjective, None), T, prior)
 
     return maximise

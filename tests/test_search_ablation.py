@@ -23,8 +23,8 @@ from ablated.switches import SWITCHES, Switch
 from benchmarks.search_cases import Row
 
 from mixpose.search import Candidate
-from mixpose.tracking.likelihood import FrameData
-from mixpose.tracking.proposers.searched import candidates_of
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.proposers import candidates_of
 from mixpose.tracking.static_clutter import StaticClutter
 
 CHANGES = {switch.name: switch.change for switch in SWITCHES}
@@ -55,9 +55,9 @@ def test_what_is_remembered_of_a_search_is_no_other_rules(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A row that changes what poses are ranked by searches again; one that does not need not."""
-    searches: list[FrameData] = []
+    searches: list[Frame] = []
 
-    def counting(data: FrameData) -> list[Candidate]:
+    def counting(data: Frame) -> list[Candidate]:
         searches.append(data)
         return candidates_of(data)
 

@@ -22,7 +22,7 @@ from mixpose.search.evidence import evidence
 from mixpose.search.problem import SearchProblem
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.proposers.searched import candidates_of
+from mixpose.tracking.proposers import candidates_of
 
 Floats = NDArray[np.float64]
 

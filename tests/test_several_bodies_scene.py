@@ -183,7 +183,7 @@ def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
         return search_frame(views, body, **options)
 
     # the module: its package has a function of the same name
-    searched = import_module("mixpose.tracking.proposers.searched")
+    searched = import_module("mixpose.tracking.proposers")
     monkeypatch.setattr(searched, "search_frame", search)
     tool, other = body("tool", TOOL), body("other", OTHER)
     scene = scene_of(tool, other)

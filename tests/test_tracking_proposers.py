@@ -26,11 +26,10 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
-from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS
-from mixpose.tracking.proposers.look_alikes import look_alikes
-from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.narrowed import narrowed
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.proposers import PROPOSERS, look_alikes
+from mixpose.tracking.refinements import REFINEMENTS, merged_pair, narrowed
 
 Floats = NDArray[np.float64]
 
@@ -88,8 +87,8 @@ def test_a_proposer_of_ones_own_is_a_function_that_yields_starts(
     elsewhere = from_rotation_vector([1.4, -2.0, 0.7], [80.0, 20.0, -30.0])
     views = detect(pinhole_cameras, EIGHT, elsewhere, noise=0.1, false=3, hidden=1)
 
-    def told(data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
-        return [] if ranked else [Start(perturb(elsewhere, np.full(6, 0.01)), data.close)]
+    def told(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+        return [] if ranked else [Start(perturb(elsewhere, np.full(6, 0.01)), frame.close)]
 
     tracker = replace(Tracker.create(EIGHT, EstimatorOptions()), proposers=(told,))
     estimate = first_frame(tracker, views)

@@ -25,12 +25,14 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import RangeSensor
 from mixpose.tracking import Rules, Tracker
-from mixpose.tracking.association_likelihood import (
+from mixpose.tracking.associations import (
+    AssociationTerm,
     RangeRules,
+    _summed,
     are_associated,
     noise_ratio,
+    sum_associations,
 )
-from mixpose.tracking.association_sum import AssociationTerm, _summed, sum_associations
 from mixpose.tracking.likelihood import Start, likelihood_of
 
 Floats = NDArray[np.float64]

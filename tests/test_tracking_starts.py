@@ -32,12 +32,17 @@ from mixpose.rigid import (
 from mixpose.search import SearchBudget, SearchReport, SearchResult, SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import ASIDE, Rules, Track, Tracker
-from mixpose.tracking.likelihood import FrameData, Start, likelihood_of
-from mixpose.tracking.proposers.look_alikes import look_alikes
-from mixpose.tracking.proposers.multistart import multistart, starts_around
-from mixpose.tracking.proposers.predicted import is_doubtful, predicted
-from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.without_sensor import disagreeing
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.proposers import (
+    is_doubtful,
+    look_alikes,
+    multistart,
+    predicted,
+    searched,
+    starts_around,
+)
+from mixpose.tracking.refinements import disagreeing
 from mixpose.tracking.track import Branch, SensorTally
 
 Floats = NDArray[np.float64]
@@ -52,7 +57,7 @@ def sensor(name: str, met: float, off: float = 0.1, unmatched: float = 0.0) -> S
     return Seen(np.zeros((8, 2, 6)), name, 1.5 * off, shares, sigma=1.5, unmatched_nearby=unmatched)
 
 
-def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> FrameData:
+def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None) -> Frame:
     return tracker.data(track or tracker.begin(), 1, None, views)
 
 
@@ -77,7 +82,7 @@ def shifted(T: Floats, step: Floats) -> Floats:
     return np.asarray(T @ T_object_aside)
 
 
-def judged_here(data: FrameData, T: Floats) -> ScoredPose:
+def judged_here(data: Frame, T: Floats) -> ScoredPose:
     likelihood, start = likelihood_of(data), Start(T)
     return likelihood.judge(likelihood.fit(start), start)
 
@@ -134,7 +139,7 @@ def test_the_search_is_told_what_the_session_says(
     assert asked["state"] == (before if live else SearchState())
     assert asked["free"].tolist() == [True, True, False, False, False, True]
     np.testing.assert_allclose(asked["T_reference"], TRUTH)
-    assert data.log.state == stopped
+    assert data.searches[-1][1] == stopped
 
 
 def test_a_live_search_goes_on_in_the_next_frame_where_it_stopped(

@@ -26,8 +26,9 @@ from mixpose.rigid import perturb, transform, twist_between
 from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Prediction, Track, Tracker, predict
+from mixpose.tracking.frame import follow
 from mixpose.tracking.motion import MotionRules, RandomWalk
-from mixpose.tracking.track import Branch, Found, follow
+from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def moved(frame: float) -> Floats:
 
 def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> Track:
     data = Tracker.create(EIGHT, EstimatorOptions()).data(track, frame, time_s, [])
-    return follow(data, [Found(T, 1.0 / len(places)) for T in places])
+    return follow(data, [Branch(T, 1.0 / len(places)) for T in places])
 
 
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
@@ -146,7 +147,7 @@ def test_a_velocity_is_per_second() -> None:
     assert track.branches[0].velocity == pytest.approx([100.0, 0, 0, 0, 0, 0])
     # it moved by 5 more than expected: as much may happen again, in any direction
     assert track.branches[0].uncertainty[:3] == pytest.approx([5.0] * 3)
-    least = RULES.steady_distance * EIGHT.radius
+    least = RULES.steady[0] * EIGHT.radius
     steady = followed(track, [moved(5)], 3, 0.3)
     assert steady.branches[0].uncertainty[:3] == pytest.approx([least] * 3)
 

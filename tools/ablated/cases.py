@@ -19,9 +19,9 @@ from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate, SearchState
 from mixpose.tracking import Tracker
-from mixpose.tracking.likelihood import FrameData, Start
-from mixpose.tracking.proposers.predicted import is_doubtful
-from mixpose.tracking.proposers.searched import candidates_of, searched, starts_at
+from mixpose.tracking import frame as tracked
+from mixpose.tracking.likelihood import Start
+from mixpose.tracking.proposers import candidates_of, is_doubtful, searched, starts_at
 from mixpose.tracking.static_clutter import StaticRules
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -100,11 +100,11 @@ class RememberedSearch:
         self.unspent_s = 0.0
         self._found: dict[tuple[object, ...], tuple[float, list[Candidate], object]] = {}
 
-    def __call__(self, data: FrameData, ranked: list[ScoredPose]) -> Iterable[Start]:
+    def __call__(self, frame: tracked.Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
         """Starts, as `searched` gives them."""
-        return starts_at(data, self._candidates(data)) if is_doubtful(data, ranked) else []
+        return starts_at(frame, self._candidates(frame)) if is_doubtful(frame, ranked) else []
 
-    def _candidates(self, data: FrameData) -> list[Candidate]:
+    def _candidates(self, data: tracked.Frame) -> list[Candidate]:
         if data.track.clutter.places or data.track.search != SearchState():
             return candidates_of(data)  # depends on the frames before
         T = None if data.T_reference is None else data.T_reference.tobytes()

@@ -9,13 +9,9 @@ from typing import Any
 from mixpose.judgement import DetectionModel
 from mixpose.objective import View
 from mixpose.tracking import Rules, Track, Tracker
-from mixpose.tracking.likelihood import FrameData
-from mixpose.tracking.proposers import Proposer, Refinement
-from mixpose.tracking.proposers.merged_pair import merged_pair
-from mixpose.tracking.proposers.multistart import multistart
-from mixpose.tracking.proposers.narrowed import narrowed
-from mixpose.tracking.proposers.searched import searched
-from mixpose.tracking.proposers.without_sensor import without_sensor
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.proposers import Proposer, multistart, searched
+from mixpose.tracking.refinements import Refinement, merged_pair, narrowed, without_sensor
 
 FREE = 0.0
 NEVER = float("inf")
@@ -87,9 +83,7 @@ def free_misses(tracker: Tracker) -> Tracker:
 class AtOneMoment(Tracker):
     """Sensors are taken to see the body at the common time, all rows at once."""
 
-    def data(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> FrameData:
+    def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
         """A frame, and what is known before it."""
         views = [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
         return super().data(track, frame, time_s, views)
@@ -129,8 +123,8 @@ SWITCHES = (
     Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("late sensors taken as in time", at_one_moment),
-    Switch("features equally bright", ruled("fit.misfit", unlike=0.0)),
-    Switch("no freed features", ruled("fit.misfit", rounding=NEVER)),
+    Switch("features equally bright", ruled("fit", unlike=0.0)),
+    Switch("misfit taken for noise", ruled("fit", believed=1.0)),
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),
     Switch("not looked elsewhere", ruled("acceptance", convincing=0.0)),

@@ -13,7 +13,7 @@ _TRACK = "test_tracking_track.py"
 _PREDICTION = (
     Mutant(
         "tracking-errors-over-a-gap-count-for-one-frame",
-        "tracking/track.py",
+        "tracking/frame.py",
         "np.abs(change / (1 + track.misses))",
         "np.abs(change / 1)",
         "after a gap a body may be anywhere in the next frame",
@@ -27,7 +27,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-prior-as-wide-as-the-world",
-        "tracking/likelihood.py",
+        "tracking/frame.py",
         "return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])",
         "return Prior(float(np.logaddexp.reduce(terms)), anywhere.spread)",
         "a pose near its prediction that meets one feature has high evidence",
@@ -59,7 +59,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-never-surprised",
-        "tracking/likelihood.py",
+        "tracking/frame.py",
         "surprise = min(rules.surprise * (1 + misses), 1.0)",
         "surprise = 1e-300",
         "a body that was carried elsewhere is never believed there",
@@ -67,7 +67,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-as-surprised-after-misses",
-        "tracking/likelihood.py",
+        "tracking/frame.py",
         "surprise = min(rules.surprise * (1 + misses), 1.0)",
         "surprise = min(rules.surprise, 1.0)",
         "after an occlusion the body is believed where it was",
@@ -75,7 +75,7 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-prediction-of-one-symmetric-pose",
-        "tracking/likelihood.py",
+        "tracking/frame.py",
         "T = nearest_alike(T_world_object, self.body, one.T_world_object)",
         "T = T_world_object",
         "a pose that looks as predicted counts as unexpected",
@@ -91,9 +91,9 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-velocity-per-pair-of-frames",
-        "tracking/track.py",
-        "velocity = moved / elapsed",
-        "velocity = moved",
+        "tracking/frame.py",
+        "velocity = moved / elapsed\n                last",
+        "velocity = moved\n                last",
         "velocities depend on the rate of frames",
         (_TRACK,),
     ),
@@ -107,17 +107,17 @@ _PREDICTION = (
     ),
     Mutant(
         "tracking-sudden-motion-goes-unnoticed",
-        "tracking/track.py",
-        "uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), rules.steady(body))",
-        "uncertainty = rules.steady(body)",
+        "tracking/frame.py",
+        "np.maximum(np.repeat(change.max(axis=1), 3), per_kind(body, steady))",
+        "per_kind(body, steady)",
         "a body that changes its speed is expected as surely as a steady one",
         (_TRACK,),
     ),
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "return min(track.branches, key=away, default=None)",
-        "return max(track.branches, key=away, default=None)",
+        "int(np.argmin(np.linalg.norm(twists, axis=1)))",
+        "int(np.argmax(np.linalg.norm(twists, axis=1)))",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),
@@ -142,7 +142,7 @@ _MOTION = (
     ),
     Mutant(
         "tracking-delays-of-the-other-sign",
-        "tracking/likelihood.py",
+        "tracking/frame.py",
         "replace(view, sensor=in_motion(view.sensor, motion, view.delay, view.readout))",
         "replace(view, sensor=in_motion(view.sensor, motion, -view.delay, view.readout))",
         "sensors are put twice as far out of step",
@@ -150,7 +150,7 @@ _MOTION = (
     ),
     Mutant(
         "tracking-clocks-with-nothing-in-common-believed",
-        "tracking/in_motion.py",
+        "tracking/track.py",
         "if all(abs(view.delay) <= longest for view in applied):",
         "if all(abs(view.delay) <= 1e99 for view in applied):",
         "sensors of clocks that began at different times are moved away",
@@ -228,7 +228,7 @@ _GATING = (
 _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-any-clutter",
-        "tracking/association_sum.py",
+        "tracking/associations.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
@@ -236,7 +236,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-missed-for-free",
-        "tracking/association_sum.py",
+        "tracking/associations.py",
         "missed = expected * np.log(1 - probability) +",
         "missed = 0 * expected +",
         "poses whose tags have no range are as good as those that meet all",
@@ -244,7 +244,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-noise-never-learnt",
-        "tracking/association_likelihood.py",
+        "tracking/associations.py",
         "return max(1.0, float(np.sqrt(stated.variance)))",
         "return 1.0",
         "ranges that err by more than said are believed",
@@ -252,16 +252,16 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-open-directions-unbounded",
-        "tracking/association_likelihood.py",
-        "information += np.diag(1 / data.anywhere.spread[free] ** 2)",
+        "tracking/likelihood.py",
+        "information += np.diag(1 / frame.anywhere.spread[free] ** 2)",
         "information += 0",
         "directions that ranges leave open have no bound",
         (_RANGES,),
     ),
     Mutant(
         "tracking-ranges-covariance-not-enlarged",
-        "tracking/association_likelihood.py",
-        "covariance *= model.judgement.noise.enlargement(count, degrees)",
+        "tracking/likelihood.py",
+        "covariance *= model.noise.enlargement(count, degrees)",
         "covariance *= 1.0",
         "covariances of ranges are too small at first",
         (_RANGES,),
@@ -322,7 +322,7 @@ _STATIC = (
     ),
     Mutant(
         "tracking-what-stands-still-is-never-found",
-        "tracking/proposers/searched.py",
+        "tracking/proposers.py",
         "return among_moving + candidates",
         "return among_moving or candidates[:0]",
         "a body that stands still is not looked for",

@@ -28,7 +28,7 @@ from mixpose.poses.jsonl import ResumePoint
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
-from mixpose.tracking.proposers.predicted import predicted
+from mixpose.tracking.proposers import predicted
 
 SWITCH_S = 1e-4
 """After so long a thread that has decoded a frame is let on; Python's own 5 ms is a whole frame."""

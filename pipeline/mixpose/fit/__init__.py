@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from mixpose.fit.blur_schedule import ScheduleRules, blur_schedule
-from mixpose.fit.near import Climbed, Fit, FitRules, fit_near, fit_together
-from mixpose.fit.options import EstimatorOptions, SearchName, free_mask
-
-__all__ = [
-    "Climbed",
-    "EstimatorOptions",
-    "Fit",
-    "FitRules",
-    "ScheduleRules",
-    "SearchName",
-    "blur_schedule",
-    "fit_near",
-    "fit_together",
-    "free_mask",
-]
+from mixpose.fit.near import (
+    Fit as Fit,
+    blur_schedule as blur_schedule,
+    fit_near as fit_near,
+    fit_together as fit_together,
+)
+from mixpose.fit.options import (
+    EstimatorOptions as EstimatorOptions,
+    FitRules as FitRules,
+    SearchName as SearchName,
+    free_mask as free_mask,
+)

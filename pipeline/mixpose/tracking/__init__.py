@@ -10,10 +10,9 @@ from mixpose.tracking.gating import (
     have_fewer,
     is_convincing,
 )
-from mixpose.tracking.in_motion import UNKNOWN_S
 from mixpose.tracking.rules import Rules, SceneRules
 from mixpose.tracking.scene import Outcome, Scene
-from mixpose.tracking.track import Companion, Prediction, Track, predict
+from mixpose.tracking.track import UNKNOWN_S, Companion, Prediction, Track, predict
 from mixpose.tracking.tracked_body import TrackedBody
 from mixpose.tracking.tracker import Tracker, estimate_pose
 

@@ -15,7 +15,7 @@ import numpy as np
 from mixpose.body import like_features, tolerance_of
 from mixpose.judgement import ScoredPose
 from mixpose.tracking.explain import Explanation, explain_by
-from mixpose.tracking.proposers.look_alikes import met_features
+from mixpose.tracking.proposers import met_features
 from mixpose.tracking.tracked_body import TrackedBody
 
 

@@ -18,8 +18,9 @@ from mixpose.judgement import (
     insert,
 )
 from mixpose.tracking.claims import Claim, Unclaimed, claims_of
-from mixpose.tracking.likelihood import FrameData, Likelihood, Start, likelihood_of
-from mixpose.tracking.proposers.look_alikes import reason
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Likelihood, Start, likelihood_of
+from mixpose.tracking.proposers import reason
 from mixpose.tracking.recognition import (
     ALONE,
     MIRRORED,
@@ -38,7 +39,7 @@ class Explanation:
     Attributes
     ----------
     tracked : TrackedBody
-    frame : FrameData
+    frame : Frame
     left : Unclaimed
         What `frame` has of all that was seen.
     ranked : tuple of ScoredPose
@@ -52,7 +53,7 @@ class Explanation:
     """
 
     tracked: TrackedBody
-    frame: FrameData
+    frame: Frame
     left: Unclaimed
     ranked: tuple[ScoredPose, ...] = ()
     tried: int = 0
@@ -88,7 +89,7 @@ class Explanation:
 
 def explain(
     tracked: TrackedBody,
-    frame: FrameData,
+    frame: Frame,
     left: Unclaimed,
     before: Explanation | None = None,
     *,
@@ -99,7 +100,7 @@ def explain(
     Parameters
     ----------
     tracked : TrackedBody
-    frame : FrameData
+    frame : Frame
     left : Unclaimed
         The views of `frame`.
     before : Explanation or None
@@ -140,7 +141,7 @@ def explain(
 
 def explain_by(
     tracked: TrackedBody,
-    frame: FrameData,
+    frame: Frame,
     left: Unclaimed,
     poses: Sequence[ScoredPose],
     *,

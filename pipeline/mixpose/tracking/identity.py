@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.records import Floats
 from mixpose.tracking.explain import Explanation
-from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.frame import Frame
 
 _EVEN = float(np.log(0.5))  # odds of an exchange where nobody knows, against the likelier way
 
@@ -65,7 +65,7 @@ def _likelihoods(
     known: Sequence[int],
     finders: Sequence[int],
     found: Mapping[int, Floats],
-    data: Mapping[int, FrameData],
+    data: Mapping[int, Frame],
 ) -> Floats:
     """Log density of each pose (columns) for each body that was known (rows), where it counts.
 
@@ -83,7 +83,7 @@ def _likelihoods(
     return likely
 
 
-def _surprise(data: FrameData) -> float:
+def _surprise(data: Frame) -> float:
     """Log density of a pose that is where nothing was predicted."""
     chance = min(data.rules.motion.surprise * (1 + data.track.misses), 1.0)
     return float(np.log(chance)) + data.anywhere.log_density

@@ -9,7 +9,7 @@ depends on the frame's pose, and nothing of the pose itself: that is estimated f
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -18,62 +18,66 @@ from mixpose.constants import constant
 from mixpose.records import Floats
 from mixpose.sensors import Motion
 
-_ORDER = 4  # place, velocity, acceleration, jerk
-_FACTORIAL = np.array([1.0, 1.0, 2.0, 6.0])
-_KINDS = np.repeat([0, 1], 3)  # coordinates are lengths or angles
+Scale: TypeAlias = tuple[float, float]  # radii of the body, and degrees
 
 
 @dataclass(frozen=True)
 class MotionRules:
-    """What is believed of motion before it is seen."""
+    """What is believed of motion from frame to frame before it is seen."""
 
     coasting: int = constant(5, "frames for which a velocity is believed without a pose")
-    steady_rotation_deg: float = constant(
-        1.0, "least uncertainty of a prediction: hand-held bodies change their speed by as much"
+    steady: Scale = constant(
+        (0.03, 1.0), "least uncertainty of a prediction: hand-held bodies change speed by as much"
     )
-    steady_distance: float = constant(0.03, "the same, of the body's radius: 1.7° at the rim")
     unsteady: float = constant(5.0, "times as wide where no velocity is known yet")
     known_from: float = constant(
-        3.0,
-        "degrees of freedom of a prediction's error: its size is that of one change of motion, in "
-        "three directions",
+        3.0, "degrees of freedom of a prediction's error: one change of motion, in three directions"
     )
     widening: float = constant(1.5, "of the uncertainty, per frame without a pose")
     widest: float = constant(4.0, "the most it widens by, but for a tenth per further frame")
-    unknown_rotation_deg: float = constant(
-        30.0,
+    unknown: Scale = constant(
+        (1.0, 30.0),
         "from one frame to the next, before any motion was seen (ranges); of a body about where it "
         "was beside another one, which counts as `known_from` frames",
     )
-    unknown_distance: float = constant(1.0, "the same, of the body's radius")
-    guess_weight: float = constant(
-        0.2, "of a displacement that was seen: what the guess before it counts"
-    )
+    guess_weight: float = constant(0.2, "of a displacement seen: what the guess before it counts")
     recall: float = constant(0.95, "per frame, of displacements before: 20 frames count")
     other_kind: float = constant(
         0.25, "least share of squared displacements by turns in those by shifts, and the reverse"
     )
     persistence: float = constant(
-        1.5, "of the mean square: steps that follow each other are alike (radio ranges)"
+        1.5, "of the mean square: steps that follow each other are alike, so that errors add up"
     )
-    surprise: float = constant(
-        0.02, "chance per frame that the body is somewhere else than predicted"
-    )
+    surprise: float = constant(0.02, "chance per frame that the body is somewhere else")
     beside: float = constant(
-        0.5,
-        "weight of where another body lets a lost one be expected, against its own track: nobody "
-        "knows how often they part; a wrong one costs half of the odds",
+        0.5, "weight of where another body lets a lost one be expected: a wrong one costs half"
     )
-    start_rotation_deg: float = constant(5.0, "uncertainty of a [start] that states none")
-    start_distance: float = constant(0.1, "the same, of the body's radius: 6° at the rim")
+    start: Scale = constant((0.1, 5.0), "uncertainty of a [start] that states none: 6° at the rim")
 
-    def steady(self, body: Body) -> Floats:
-        """Least standard deviations (6,) of a prediction."""
-        return per_kind(body, self.steady_distance, self.steady_rotation_deg)
 
-    def guess(self, body: Body) -> Floats:
-        """Standard deviations (6,) of where a body is next, before any motion was seen."""
-        return per_kind(body, self.unknown_distance, self.unknown_rotation_deg)
+@dataclass(frozen=True)
+class CourseRules:
+    """What is believed of a velocity before the frame is seen."""
+
+    fastest: Scale = constant(
+        (5.0, 180.0), "per second, where no velocity is known: half a metre for a hand's, its wave"
+    )
+    quickest: float = constant(
+        5.0, "per second: by which derivatives are larger from one to the next, hands at 0.8 Hz"
+    )
+    sudden: tuple[float, float, int] = constant(
+        (-2.0, 9.0, 9),
+        "powers of ten of the change of jerk, squared radii or radians per s⁷, from the steadiest "
+        "filter to the most sudden (3 Hz and a radius wide), and how many there are",
+    )
+    memory: float = constant(0.9, "per frame, of how well each foretold the poses: 10 count")
+    lost: float = constant(50.0, "squared deviations from what was foretold: it begins anew")
+    longest_s: float = constant(0.5, "without a pose, after which nothing is foretold")
+
+
+def per_kind(body: Body, scale: Scale) -> Floats:
+    """Lengths, in radii of a body, and angles for all directions alike (6,)."""
+    return np.repeat([scale[0] * body.radius, np.radians(scale[1])], 3)
 
 
 @dataclass(frozen=True)
@@ -87,60 +91,26 @@ class RandomWalk:
     @classmethod
     def unknown(cls, body: Body, elapsed: float, rules: MotionRules) -> RandomWalk:
         """A guess that is wide enough for most."""
-        step = rules.guess(body)
-        return cls(rules.guess_weight * step**2 / max(elapsed, 1e-9), rules.guess_weight, rules)
+        squares = rules.guess_weight * per_kind(body, rules.unknown) ** 2
+        return cls(squares / max(elapsed, 1e-9), rules.guess_weight, rules)
 
     def joined(self, moved: Floats, radius: float, elapsed: float) -> RandomWalk:
         """Add a displacement (6,) of a body of some radius to what is remembered.
 
-        A body whose features shift by some length may also turn them by half of it, and
-        the other way round: a turn is not unlikely for not having been seen so far.
+        A turn is not unlikely for not having been seen so far: features that shift may turn, too.
         """
         lever = np.repeat([1.0, radius], 3)
         squares = ((moved * lever) ** 2).reshape(2, 3)
         # of the lengths and of the angles, the mean of those that are not zero
         means = squares.sum(axis=1) / np.maximum(np.count_nonzero(squares, axis=1), 1)
-        shares = np.repeat(means, 3)
-        other = np.roll(shares, 3)
+        shares, other = np.repeat(means, 3), np.repeat(means[::-1], 3)
         rate = np.maximum(shares, self.rules.other_kind * other) / lever**2 / elapsed
         recall = self.rules.recall
         return RandomWalk(recall * self.rates + rate, recall * self.count + 1, self.rules)
 
     def variance(self, elapsed: float) -> Floats:
-        """Variance (6,) of the displacement in a time.
-
-        Steps that follow each other are alike, so that errors of prediction add up: it is wider
-        than the mean square.
-        """
+        """Variance (6,) of the displacement in a time."""
         return np.asarray(self.rules.persistence * self.rates / self.count * elapsed)
-
-
-def per_kind(body: Body, radii: float, degrees: float) -> Floats:
-    """Lengths, in radii of a body, and angles for all directions alike (6,)."""
-    return np.repeat([radii * body.radius, np.radians(degrees)], 3)
-
-
-@dataclass(frozen=True)
-class CourseRules:
-    """What is believed of a velocity before the frame is seen."""
-
-    fastest: float = constant(
-        5.0, "radii of the body per second, where no velocity is known: half a metre for a hand's"
-    )
-    fastest_deg: float = constant(180.0, "the same, of its turns: a hand's wave")
-    quickest: float = constant(
-        5.0, "per second: by which derivatives are larger from one to the next, hands at 0.8 Hz"
-    )
-    steadiest: float = constant(
-        -2.0, "power of ten of the least change of jerk, squared radii or radians per s⁷"
-    )
-    most_sudden: float = constant(9.0, "the same of the largest: 3 Hz and a radius wide")
-    filters: int = constant(9, "from the steadiest to the most sudden motion")
-    memory: float = constant(0.9, "per frame, of how well each foretold the poses: 10 count")
-    lost: float = constant(
-        50.0, "squared deviations of a pose from what was foretold: it begins anew"
-    )
-    longest_s: float = constant(0.5, "without a pose, after which nothing is foretold")
 
 
 class Expected(NamedTuple):
@@ -148,18 +118,12 @@ class Expected(NamedTuple):
 
     velocity: Floats  # (6,), twist per second
     gain: Floats  # (6,), more per second for a pose farther on; 0 where none was seen before
-    deviation: Floats  # (6,), of the velocity
+    deviation: Floats  # (6,), standard deviation
     acceleration: Floats  # (6,), per second more
 
     def at(self, T_world_object: Floats) -> Motion:
         """How a body moves at that pose."""
         return Motion(T_world_object, self.velocity, self.acceleration)
-
-
-def unknown(body: Body, rules: CourseRules) -> Expected:
-    """What is expected where nothing was seen before: rest, give or take what hands can do."""
-    deviation = per_kind(body, rules.fastest, rules.fastest_deg)
-    return Expected(np.zeros(6), np.zeros(6), deviation, np.zeros(6))
 
 
 @dataclass(frozen=True)
@@ -174,17 +138,16 @@ class Course:
     @classmethod
     def begun(cls, deviation: Floats, body: Body, rules: CourseRules) -> Course:
         """A course of one pose with standard deviations (6,)."""
-        count = rules.filters
-        fastest = unknown(body, rules).deviation
-        spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(_ORDER - 1))], 1)
-        covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(_ORDER), (count, 6, 4, 4))
+        count, fastest = rules.sudden[2], per_kind(body, rules.fastest)
+        spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(3))], axis=1)
+        covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(4), (count, 6, 4, 4))
         return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), body)
 
     def expected(self, moved: Floats | None, elapsed: float, rules: CourseRules) -> Expected:
         """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
         means, covariances = self._foretold(elapsed, rules)
-        each = (self.log_likelihoods.argmax(axis=0)[_KINDS], np.arange(6))
-        mean, covariance = means[each], covariances[each]
+        likeliest = self.log_likelihoods.argmax(axis=0).repeat(3), np.arange(6)
+        mean, covariance = means[likeliest], covariances[likeliest]
         moved = mean[:, 0] if moved is None else moved
         gains = covariance[:, 1:3, 0] / covariance[:, :1, 0]
         rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
@@ -215,14 +178,11 @@ class Course:
 
     def _foretold(self, elapsed: float, rules: CourseRules) -> tuple[Floats, Floats]:
         """Means and covariances of all filters some seconds later."""
-        n, t = _ORDER - 1, elapsed
-        i, j = np.indices((_ORDER, _ORDER))
-        on = np.maximum(j - i, 0)
-        F = np.where(j >= i, t**on / _FACTORIAL[on], 0.0)
+        i, j = np.indices((4, 4))
+        factorial, on, ahead = np.array([1.0, 1.0, 2.0, 6.0]), np.maximum(j - i, 0), 7 - i - j
+        F = np.where(j >= i, elapsed**on / factorial[on], 0.0)
         # of white noise in the derivative of the jerk
-        ahead = 2 * n + 1 - i - j
-        Q = t**ahead / (ahead * _FACTORIAL[n - i] * _FACTORIAL[n - j])
-        powers = 10 ** np.linspace(rules.steadiest, rules.most_sudden, rules.filters)
-        units = np.where(_KINDS == 0, self.body.radius**2, 1.0)
-        noise = powers[:, None, None, None] * units[:, None, None] * Q
+        Q = elapsed**ahead / (ahead * factorial[3 - i] * factorial[3 - j])
+        units = np.repeat([self.body.radius**2, 1.0], 3)
+        noise = 10 ** np.linspace(*rules.sudden)[:, None, None, None] * units[:, None, None] * Q
         return self.means @ F.T, F @ self.covariances @ F.T + noise

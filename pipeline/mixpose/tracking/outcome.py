@@ -12,16 +12,17 @@ from mixpose.body import Body
 from mixpose.judgement import APART, ScoredPose, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
-from mixpose.tracking.in_motion import is_timed
-from mixpose.tracking.likelihood import FrameData
+from mixpose.search import SearchState
+from mixpose.tracking.frame import Frame, follow
+from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.recognition import is_known
-from mixpose.tracking.track import Found, SensorTally, Track, follow
+from mixpose.tracking.track import Branch, SensorTally, Track
 from mixpose.tracking.tracked_body import TrackedBody
 
 
 def estimate_of(
     tracked: TrackedBody,
-    data: FrameData,
+    data: Frame,
     views: Sequence[View],
     verdict: Verdict,
     ranked: Sequence[ScoredPose],
@@ -52,7 +53,7 @@ def estimate_of(
         instance=tracked.instance,
         proposer=best.proposer if best else "",
         blurs=best.blurs if best else (),
-        guesses=data.log.report,
+        guesses=data.searches[-1][0] if data.searches else None,
         doubt=verdict.doubt,
         offsets=offsets,
     )
@@ -74,20 +75,21 @@ def _offsets(judged: ScoredPose, body: Body) -> dict[str, Offsets]:
     return offsets
 
 
-def followed(tracked: TrackedBody, data: FrameData, verdict: Verdict) -> Track:
+def followed(tracked: TrackedBody, data: Frame, verdict: Verdict) -> Track:
     """The track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
     if best is None:
         clutter = track.clutter.learnt(data.views, tracked.rules.static)
-        return replace(track.missed(data.log.state, clutter), doubted=True)
+        state = data.searches[-1][1] if data.searches else SearchState()
+        return replace(track.missed(state, clutter), doubted=True)
     found = []
     for one, weight in verdict.kept:
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
         spread = one.spread if tracked.options.fuse else None
         momentary = np.diagonal(one.covariance - one.persistent)
-        deviation = np.sqrt(momentary) if is_timed(data.views) else None
-        found.append(Found(one.T_world_object, belief, spread, deviation))
+        deviation = np.sqrt(momentary) if data.is_timed else None
+        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
     met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
     tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
@@ -98,7 +100,7 @@ def followed(tracked: TrackedBody, data: FrameData, verdict: Verdict) -> Track:
         follow(data, found),
         residuals=best.noise if is_ok else track.residuals,
         tallies=tallies,
-        delays=track.delays.joined(data, best) if is_ok or late else track.delays,
+        delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or sum(one.is_met(least) for one in tallies.values()) > 1,
         known=is_known(data, best),
         believed=track.believed + is_ok,

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, mirror_image, thickness
 from mixpose.judgement import ScoredPose, is_far_off
-from mixpose.tracking.likelihood import FrameData, SearchLog, Start, likelihood_of
-from mixpose.tracking.proposers.searched import candidates_of, starts_at
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.proposers import candidates_of, starts_at
 from mixpose.tracking.track import Track
 
 TRIANGLE = "three markers are met, which other things may have alike"
@@ -30,13 +31,13 @@ _CORNERS = 3
 _FLAT = 1e-6  # thickness by width, below which no camera tells one side's markers from the other's
 
 
-def is_alone(data: FrameData, judged: ScoredPose, sensors: int) -> bool:
+def is_alone(data: Frame, judged: ScoredPose, sensors: int) -> bool:
     """Whether one of some sensors with a frame meets a body that none was sure of, as this."""
     lonely = sensors > 1 and np.count_nonzero(judged.matches.met) == 1
     return lonely and is_from_doubt(data, judged)
 
 
-def is_from_doubt(data: FrameData, judged: ScoredPose) -> bool:
+def is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
     if data.track.believed:
         return False
@@ -44,7 +45,7 @@ def is_from_doubt(data: FrameData, judged: ScoredPose) -> bool:
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
 
-def is_known(data: FrameData, judged: ScoredPose) -> bool:
+def is_known(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is the body's, by what it meets or by where it was expected."""
     if (judged.matches.dimensions == 1).any():
         return True  # ranges are no markers in space
@@ -57,7 +58,7 @@ def is_known(data: FrameData, judged: ScoredPose) -> bool:
     return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())
 
 
-def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
+def is_reflection(data: Frame, judged: ScoredPose) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
     body, rules, seen = data.body, data.rules, judged.matches
     if "mirrored" not in rules.look_alikes.kinds or not body.is_exact or _is_flat(body):
@@ -79,7 +80,7 @@ def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     # what explains more than this pose is met by the first guesses already
     options = replace(data.options, search="live")
     nothing = replace(data, predictions=(), beside=None, begun=None)
-    alone = replace(nothing, track=track, log=SearchLog(), options=options)
+    alone = replace(nothing, track=track, searches=[], options=options)
     own = _evidence(alone, Start(judged.T_world_object))
     mirror = replace(alone, body=mirror_image(body, _numbers(met >= 0)))
     least = own - rules.search.outdone
@@ -92,7 +93,7 @@ def _is_flat(body: Body) -> bool:
     return thickness(body) < _FLAT
 
 
-def _meets(mirror: FrameData, data: FrameData, start: Start) -> bool:
+def _meets(mirror: Frame, data: Frame, start: Start) -> bool:
     """Whether the mirror image meets a quarter of what the body meets, where a fit begins.
 
     The features met lie about the plane that it is reflected in, or it is no rival: then its value
@@ -102,7 +103,7 @@ def _meets(mirror: FrameData, data: FrameData, start: Start) -> bool:
     return bool(values[0] > values[1] / 16)
 
 
-def _is_by_chance(data: FrameData, judged: ScoredPose) -> bool:
+def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
     rules, seen = data.rules, judged.matches
     if judged.measurements - 6 > rules.look_alikes.by_chance:
@@ -114,7 +115,7 @@ def _is_by_chance(data: FrameData, judged: ScoredPose) -> bool:
     return off or bool((seen.missed > 0.5).any())
 
 
-def _evidence(data: FrameData, start: Start) -> float:
+def _evidence(data: Frame, start: Start) -> float:
     likelihood = likelihood_of(data)
     return likelihood.judge(likelihood.fit(start), start).log_evidence
 

@@ -8,7 +8,7 @@ from mixpose.constants import constant
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
-from mixpose.tracking.association_likelihood import RangeRules
+from mixpose.tracking.associations import RangeRules
 from mixpose.tracking.motion import CourseRules, MotionRules
 from mixpose.tracking.static_clutter import StaticRules
 

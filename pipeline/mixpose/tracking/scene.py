@@ -93,7 +93,7 @@ class Scene:
             ranked = decided[k].explained.ranked
             after = followed(tracked, data, verdict)
             estimate = estimate_of(tracked, data, views, decided[k].told, ranked)
-            outcomes.append(Outcome(after, replace(estimate, delays=after.delays.seconds())))
+            outcomes.append(Outcome(after, replace(estimate, delays=after.delays.seconds)))
         return self._acquainted(outcomes)
 
     def _identified(self, found: Mapping[int, Explanation]) -> list[Decided]:

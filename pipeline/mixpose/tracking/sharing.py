@@ -35,7 +35,7 @@ from mixpose.tracking.claims import (
     unmet_places,
 )
 from mixpose.tracking.explain import Explanation, explain, explain_by
-from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.frame import Frame
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.together import begun_together
 from mixpose.tracking.track import Prediction, Track
@@ -72,7 +72,7 @@ class Moment:
             return Unclaimed(self.views, {}, self.sensors)
         return left_for(k, self.views, owners, self.sensors)
 
-    def data(self, k: int, left: Unclaimed, track: Track | None = None) -> FrameData:
+    def data(self, k: int, left: Unclaimed, track: Track | None = None) -> Frame:
         """What is left of the frame for a body, and what is known before it."""
         return self.bodies[k].data(track or self.tracks[k], self.frame, self.time_s, left.views)
 
@@ -255,7 +255,7 @@ def _look(moment: Moment, shares: Shares, k: int, left: Unclaimed, as_one: bool)
         data = replace(data, options=replace(data.options, search="live"))
     found = explain(moment.bodies[k], data, left)
     if as_one:
-        own = replace(moment.data(k, left), beside=told, log=data.log)
+        own = replace(moment.data(k, left), beside=told, searches=data.searches)
         found = replace(found, frame=own)
     return found
 
@@ -268,7 +268,7 @@ def _again(
     moment: Moment, one: Explanation, k: int, left: Unclaimed, *, fitted: bool = False
 ) -> Explanation:
     """The poses of a body by what is left for it by now, and fitted to that."""
-    data = replace(moment.data(k, left), beside=one.frame.beside, log=one.frame.log)
+    data = replace(moment.data(k, left), beside=one.frame.beside, searches=one.frame.searches)
     return explain_by(moment.bodies[k], data, left, one.ranked, fitted=fitted)
 
 

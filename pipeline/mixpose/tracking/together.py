@@ -8,11 +8,11 @@ from dataclasses import replace
 from mixpose.fit import fit_together
 from mixpose.judgement import Case, judge_together, nearest_alike
 from mixpose.objective import SharedDensities, can_be_together, matched_objective
-from mixpose.tracking.in_motion import is_timed
-from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Start
+from mixpose.tracking.frame import Begun, Frame
+from mixpose.tracking.likelihood import MatchedLikelihood, Start
 
 
-def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
+def begun_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Frame]:
     """The frames of several bodies with what is climbed from their first predictions, and judged.
 
     Their sensors are the same, of which `shared` has all that they see; what is not a body's own is
@@ -20,7 +20,7 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
     """
     begun = list(frames)
     for k, one in enumerate(frames):
-        if not is_timed(one.views):
+        if not one.is_timed:
             objective = matched_objective(one.views, one.body, one.sigmas, shared=shared)
             begun[k] = replace(one, begun=Begun(objective))
     some = [k for k, one in enumerate(begun) if _is_climbed(one)]
@@ -52,7 +52,7 @@ def begun_together(frames: Sequence[FrameData], shared: SharedDensities) -> list
     return begun
 
 
-def _is_climbed(data: FrameData) -> bool:
+def _is_climbed(data: Frame) -> bool:
     """Whether a fit begins by climbing the matched objective from a prediction."""
-    plain = data.options.objective == "matched" and not is_timed(data.views)
+    plain = data.options.objective == "matched" and not data.is_timed
     return plain and bool(data.predictions) and can_be_together(data.body)

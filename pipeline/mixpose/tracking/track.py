@@ -5,38 +5,37 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.judgement import Prior, RememberedNoise, nearest_alike
-from mixpose.records import Floats
+from mixpose.objective import View
+from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
-from mixpose.tracking.in_motion import DelayEvidence
-from mixpose.tracking.motion import Course, MotionRules, RandomWalk
+from mixpose.tracking.motion import Course, MotionRules, RandomWalk, per_kind
 from mixpose.tracking.static_clutter import StaticClutter
 
-if TYPE_CHECKING:
-    from mixpose.tracking.likelihood import FrameData
+UNKNOWN_S = 0.1  # standard deviation of a delay of which nothing is known
 
 
 @dataclass(frozen=True)
 class Branch:
-    """One place where the body may be.
-
-    Where standard deviations of the pose are as large as its motion, the next frame takes it as a
-    prior, and no velocity is believed.
-    """
+    """One place where the body may be, and how it goes on from there."""
 
     T_world_object: Floats  # (4, 4)
     weight: float  # belief in this branch among its rivals
-    velocity: Floats | None  # (6,), twist per second where frames have times, else per frame
-    uncertainty: Floats  # (6,), standard deviations of the next pose about the prediction
-    spread: Floats | None = None  # (6,), of the pose itself, where it is to be a prior
-    course: Course | None = None  # for its velocity at a moment, where anybody asks for that
+    velocity: Floats | None = None  # (6,), twist per second where frames have times, else per frame
+    # (6,), standard deviations of the next pose about the prediction
+    uncertainty: Floats = field(default_factory=lambda: np.zeros(6))
+    # (6,), of the pose itself, where that is as large as its motion: the next frame takes the pose
+    # as a prior, and no velocity is believed
+    spread: Floats | None = None
+    deviation: Floats | None = None  # (6,), the same, where anybody asks for velocities at moments
+    course: Course | None = None  # for its velocity at a moment, there
 
 
 class SensorTally(NamedTuple):
@@ -51,11 +50,47 @@ class SensorTally(NamedTuple):
 
 
 @dataclass(frozen=True)
+class DelayEvidence:
+    """What the frames so far say of how late sensors are, beyond what was told of them."""
+
+    reference: str = ""  # the sensor against which delays are known; empty before the first frame
+    names: tuple[str, ...] = ()  # the others
+    information: Floats = field(default_factory=lambda: np.zeros((0, 0)))  # (n, n), s⁻²
+    vector: Floats = field(default_factory=lambda: np.zeros(0))  # (n,), s⁻¹
+
+    @cached_property
+    def seconds(self) -> Mapping[str, DelaySeen]:
+        """How late each sensor is, as far as it is known, and how surely."""
+        if not self.names:
+            return {}
+        inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / UNKNOWN_S**2)
+        late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
+        return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
+
+    def applied(
+        self, views: Sequence[View], time_s: float | None, elapsed: float | None
+    ) -> list[View]:
+        """Views as late as they are known to be, so long after a pose; none is without times."""
+        if time_s is None:
+            return [replace(view, delay=0.0, readout=0.0, unsure=None) for view in views]
+        applied = list(views)
+        for k, view in enumerate(views):
+            if view.unsure is not None:
+                late = self.seconds.get(view.name, DelaySeen(0.0, UNKNOWN_S))
+                told = replace(view, unsure=late.deviation, estimated=late.seconds)
+                applied[k] = replace(told, delay=view.delay + late.seconds)
+        # a clock that differs by ten standard deviations is not the same: none is late then
+        longest = min(10 * UNKNOWN_S, np.inf if elapsed is None else max(elapsed, 0.0))
+        if all(abs(view.delay) <= longest for view in applied):
+            return applied
+        return [replace(view, delay=0.0) for view in applied]
+
+
+@dataclass(frozen=True)
 class Companion:
     """The poses of a body seen from another one, in frames that were sure of both.
 
-    Limbs of a person, a tool and its tray stay near each other.  Where the one is sure and the
-    other was lost, or moved as nobody expected, these tell where it may be.
+    They tell where a limb, or a tool, may be beside another that is sure.
     """
 
     T_other_object: Floats  # (4, 4), their mean
@@ -75,18 +110,14 @@ class Companion:
         squares = before.squares + (away**2 * (1 - 1 / n) - before.squares) / n
         return cls(perturb(before.T_other_object, away / n), squares, n)
 
-    def expected(
-        self, T_world_other: Floats, body: Body, rules: MotionRules
-    ) -> tuple[Floats, Floats]:
-        """Where the body is expected beside the other one, and standard deviations (6,) of that.
-
-        What is guessed before anything is known counts as some frames.
-        """
-        n, few, guess = self.count, rules.known_from, rules.guess(body) ** 2
+    def expected(self, T_other: Floats, body: Body, rules: MotionRules) -> tuple[Floats, Floats]:
+        """Where the body is expected beside the other one, and standard deviations (6,) of that."""
+        n, few, guess = self.count, rules.known_from, per_kind(body, rules.unknown) ** 2
+        # what is guessed before anything is known counts as some frames
         spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
-        variances = np.maximum(spread, rules.steady(body) ** 2)
-        wide = variances.reshape(2, 3) @ T_world_other[:3, :3].T ** 2
-        return T_world_other @ self.T_other_object, np.sqrt(wide.ravel())
+        variances = np.maximum(spread, per_kind(body, rules.steady) ** 2)
+        wide = variances.reshape(2, 3) @ T_other[:3, :3].T ** 2
+        return T_other @ self.T_other_object, np.sqrt(wide.ravel())
 
 
 @dataclass(frozen=True)
@@ -132,13 +163,10 @@ class Prediction:
     weight: float
     is_prior: bool = False
 
-    def log_density(
-        self, T_world_object: Floats, free: NDArray[np.bool_], rules: MotionRules
-    ) -> float:
+    def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> float:
         """Of a pose before its frame, in the directions that are free.
 
-        How far a prediction errs is known from a step or two: errors have the distribution of
-        Student.
+        How far a prediction errs is known from a step or two: errors are Student's.
         """
         u = self.uncertainty[free]
         scaled = twist_between(self.T_world_object, T_world_object)[free] / u
@@ -152,16 +180,9 @@ class Prediction:
 
 
 def predict(
-    track: Track,
-    body: Body,
-    frame: int,
-    time_s: float | None,
-    rules: MotionRules = MotionRules(),
+    track: Track, body: Body, frame: int, time_s: float | None, rules: MotionRules = MotionRules()
 ) -> list[Prediction]:
-    """Where the branches of a track expect the body.
-
-    The longer nothing was seen, the wider; velocities are believed for a few frames only.
-    """
+    """Where the branches of a track expect the body; wider, the longer nothing was seen."""
     elapsed = track.elapsed(frame, time_s)
     widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
@@ -179,10 +200,9 @@ def predict(
 
 
 def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
-    """What the body's own track lets expect, or another body, of a pose.
+    """What the body's own track lets expect of a pose, or another body, the less the more misses.
 
-    Either may hold, the other body the less the longer this one was away.  As both are densities
-    of poses, no more of the poses made by chance are believed than without the other body.
+    Both are densities: no more poses made by chance are believed than without the other body.
     """
     share = rules.beside * (1 - rules.surprise) ** misses
     mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
@@ -190,57 +210,10 @@ def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
     return Prior(float(np.logaddexp(mine, theirs)), spread)
 
 
-class Found(NamedTuple):
-    """A pose of a frame, and how sure it is."""
-
-    T_world_object: Floats  # (4, 4)
-    weight: float  # belief among its rivals
-    spread: Floats | None = None  # (6,), if that is to be a prior
-    deviation: Floats | None = None  # (6,), where anybody asks for velocities at moments
-
-
-def follow(data: FrameData, found: Sequence[Found]) -> Track:
-    """The track after a frame with poses, the best first, as far as these tell."""
-    track, body, rules, course_rules = data.track, data.body, data.rules.motion, data.rules.course
-    elapsed, walk = track.elapsed(data.frame, data.time_s), track.walk
-    branches: list[Branch] = []
-    for T, weight, spread, deviation in found:
-        velocity, course, uncertainty = None, None, rules.unsteady * rules.steady(body)
-        parent = nearest_branch(track, T, body)
-        before = parent.course if parent else None
-        if parent is not None and track.frame is not None and elapsed > 0:
-            moved = twist_between(parent.T_world_object, T)
-            if spread is not None and not branches:
-                walk = walk or RandomWalk.unknown(body, elapsed, rules)
-                walk = walk.joined(moved, body.radius, elapsed)
-            elif spread is None and track.misses <= rules.coasting:
-                velocity = moved / elapsed
-                last = parent.velocity
-                change = moved / 2 if last is None else moved - last * elapsed
-                # of one frame, where it was seen over several
-                change = np.abs(change / (1 + track.misses)).reshape(2, 3)
-                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), rules.steady(body))
-            if deviation is not None and before and elapsed <= course_rules.longest_s:
-                course = before.followed(moved, deviation, elapsed, course_rules)
-        if deviation is not None:
-            course = course or Course.begun(deviation, body, course_rules)
-        branches.append(Branch(T, weight, velocity, uncertainty, spread, course))
-    return replace(
-        track,
-        branches=tuple(branches),
-        frame=data.frame,
-        time_s=data.time_s,
-        misses=0,
-        walk=walk,
-        search=SearchState(),
-    )
-
-
 def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:
     """The branch that a pose goes on from: the nearest."""
+    if not track.branches:
+        return None
     scale = np.repeat([body.radius, 1.0], 3)
-
-    def away(branch: Branch) -> float:
-        return float(np.linalg.norm(twist_between(branch.T_world_object, T) / scale))
-
-    return min(track.branches, key=away, default=None)
+    twists = [twist_between(branch.T_world_object, T) / scale for branch in track.branches]
+    return track.branches[int(np.argmin(np.linalg.norm(twists, axis=1)))]

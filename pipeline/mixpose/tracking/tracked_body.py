@@ -13,10 +13,10 @@ from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.objective import View
 from mixpose.records import Floats, label_of
-from mixpose.tracking.in_motion import is_timed
-from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.frame import Frame
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.proposers import PROPOSERS, Proposer
+from mixpose.tracking.refinements import REFINEMENTS, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Prediction, Track, predict
 
@@ -77,7 +77,7 @@ class TrackedBody:
         instance : int or None
         """
         motion = rules.motion
-        start = per_kind(body, motion.start_distance, motion.start_rotation_deg)
+        start = per_kind(body, motion.start)
         if distance is not None:
             start[:3] = distance
         if rotation_deg is not None:
@@ -105,14 +105,12 @@ class TrackedBody:
         """Where the track expects the body in a frame."""
         return predict(track, self.body, frame, time_s, self.rules.motion)
 
-    def data(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> FrameData:
+    def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
         """A frame, and what is known before it; sensors that saw nothing are left out."""
         views = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         views = track.delays.applied(views, time_s, track.seconds_until(time_s))
-        data = FrameData(
+        data = Frame(
             views=views,
             body=self.body,
             options=self.options,
@@ -125,7 +123,7 @@ class TrackedBody:
             frame=frame,
             time_s=time_s,
         )
-        if predictions and is_timed(views):
+        if predictions and data.is_timed:
             T = predictions[0].T_world_object
             return data.in_motion(data.expected(T).at(T))
         return data

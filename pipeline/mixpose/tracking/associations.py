@@ -1,7 +1,8 @@
 """Ranges whose features overlap: the likelihood of a pose over all associations.
 
-With n features in view and M detections of one sensor, every association λ gives each feature at
-most one detection and each detection at most one feature,
+What a range belongs to remains in doubt whatever the pose.  With n features in view and M
+detections of one sensor, every association λ gives each feature at most one detection and the
+reverse,
 
     L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
 
@@ -12,12 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import DetectionModel
+from mixpose.matching import Noise
 from mixpose.objective import View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Mask, PointPattern
@@ -25,7 +28,30 @@ from mixpose.rigid import perturb
 
 
 @dataclass(frozen=True)
-class AssociationSum:
+class RangeRules:
+    """What is believed of single ranges."""
+
+    max_features: int = constant(8, "of a body: the subsets that are summed double with each")
+    stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
+    min_information: float = constant(0.02, "of that of known labels, which any direction has")
+
+
+def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
+    """Whether all sensors gave single ranges, of a body of few points."""
+    return (
+        len(body.nodes.points) == len(body) <= rules.max_features
+        and all(view.sensor.dimension == 1 for view in views)
+        and all(isinstance(view.observation.pattern, PointPattern) for view in views)
+    )
+
+
+def noise_ratio(noise: Noise, rules: RangeRules) -> float:
+    """Standard deviation of ranges in σ_ε, as residuals of earlier frames show it."""
+    stated = Noise(rules.stated_degrees, rules.stated_degrees).joined(noise)
+    return max(1.0, float(np.sqrt(stated.variance)))
+
+
+class AssociationSum(NamedTuple):
     """The likelihood over all associations in all sensors, at H poses."""
 
     log_odds: Floats  # (H,), logarithm of the likelihood, over that of mere clutter
@@ -36,17 +62,13 @@ class AssociationSum:
 
 
 def sum_associations(
-    views: Sequence[View],
+    views: Sequence[View],  # `are_associated`, none with an empty observation
     body: Body,
-    poses: Floats,
-    noise: float = 1.0,
+    poses: Floats,  # (H, 4, 4)
+    noise: float = 1.0,  # standard deviation of offsets, in σ_ε
     detection: DetectionModel = DetectionModel(),
 ) -> AssociationSum:
-    """Sum the likelihood over all associations at poses (H, 4, 4).
-
-    For views `are_associated` holds, none has an empty observation; `noise` is the standard
-    deviation of offsets, in σ_ε.
-    """
+    """Sum the likelihood over all associations at poses."""
     patterns = [view.observation.pattern for view in views]
     ranges = [one.points[one.weights > 0, 0] for one in patterns if isinstance(one, PointPattern)]
     counts = np.array([len(one) for one in ranges])
@@ -80,8 +102,8 @@ def sum_associations(
 def _summed(odds: Floats) -> tuple[Floats, Floats]:
     """Sum over associations (H,) and how probable each pair is (H, n, M), of odds (H, n, M).
 
-    Exact: from the first detection to the last, the odds of each subset of features being taken by
-    the detections so far; and the same backwards.
+    From the first detection to the last, the odds of each subset of features being taken so far;
+    and the same backwards.
     """
     count, n, M = odds.shape
     subsets = np.arange(2**n)
@@ -106,28 +128,21 @@ def _summed(odds: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class AssociationTerm:
-    """Logarithm of the likelihood over all associations; as `sum_associations` has it.
-
-    Second derivatives are differences of gradients, by steps that move ranges by a small part of
-    their error, in free directions (6,).
-    """
+    """Logarithm of `sum_associations`, whose second derivatives are differences of gradients."""
 
     views: Sequence[View]
     body: Body
     free: Mask
     noise: float
     detection: DetectionModel
-    step: float = constant(
-        0.01, "of the error: by how much ranges differ for second derivatives, half of their digits"
-    )
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
         free, count = self.free, len(poses)
-        step = self.step
         error = self.noise * min(view.observation.sigma for view in self.views)
         arm = float(np.linalg.norm(self.body.means, axis=1).max())
-        scale = np.repeat([step * error, step * error / max(arm, error)], 3)[free]
+        # steps that move ranges by a hundredth of their error: half of the digits are left
+        scale = 0.01 * np.repeat([error, error / max(arm, error)], 3)[free]
         steps = scale[:, None] * np.eye(6)[free]
         twists = np.vstack([np.zeros(6), steps, -steps])
         around = perturb(poses[:, None], twists).reshape(-1, 4, 4)

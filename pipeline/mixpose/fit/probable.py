@@ -1,0 +1,330 @@
+"""Grey values and profiles: the most probable pose, also of a body that does not fit.
+
+Under white noise half of the energy ⟨g, h⟩² / ⟨h, h⟩ that a pose explains, over the noise of a
+cell, is the log-likelihood with the amplitude at its best; the Gaussian prior of the start comes on
+top.  Under heavy noise the sum has several maxima: they are sought from the maximum of the
+objective, and from the points of the cubature rule of third degree, which has mean and covariance
+of the prior.
+
+In the matched objective a feature r away from its prediction pulls with r exp(−r²/4σ²): of a
+deformed body only features that fit count.  There places, the peaks of a density, go to features so
+that the sum of squares S is least, the pose is fitted to them, and so on.  An assignment is as
+probable as S^(−ν/2), if the misfits of ν redundant coordinates are normal with one unknown
+variance; see *A body that does not fit* in `docs/method.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from mixpose.density import peak
+from mixpose.fit.options import FitRules
+from mixpose.objective import (
+    AmplitudesObjective,
+    BodyProjection,
+    MatchedObjective,
+    NormalPrior,
+    View,
+    matched_objective,
+)
+from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
+from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import perturb, transform
+from mixpose.sensors import Sensor
+
+NATS = 1e-6
+"""Gains of log-likelihood that do not matter: 0.001 standard deviations; and shares of the energy:
+a part in a thousand of heights, which drawing may be off by."""
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """Log-likelihood of densities with noise in every cell."""
+
+    objective: MatchedObjective  # in nats
+    shares: Floats  # (L,) of each sensor's energy ⟨g, g⟩, explained by the pose
+    noise: Floats  # (L,) variance of a cell's noise times the size of a cell
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether no other pose can be as likely: it explains more than half of each density.
+
+        Shares that orthogonal predictions explain sum to 1 at the most (Bessel's inequality).
+        """
+        return bool(self.shares.min() > 0.5)
+
+
+def has_likelihood(views: Sequence[View]) -> bool:
+    """Whether all sensors gave grey values or profiles, whose noise is that of their cells."""
+    return all(view.observation.cell is not None for view in views)
+
+
+def likelihood_at(
+    objective: MatchedObjective, T_world_object: Floats, misfit: float = 1.0
+) -> Likelihood:
+    """The log-likelihood; what an objective at σ_ε leaves at a pose (4, 4) is taken for noise.
+
+    `misfit`, χ² per degree of freedom of a body that does not fit, is a factor on its variance.
+    """
+    plain = replace(objective, weights=np.ones_like(objective.weights))
+    shares = plain.shares(T_world_object[None])[:, 0]
+    noise = cell_variances(objective.energies[:, 0], shares, _cells(objective))
+    weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]
+    return Likelihood(replace(objective, weights=weights), shares, noise)
+
+
+def cell_variances(energies: Floats, shares: Floats, cells: Indices) -> Floats:
+    """Variance of a cell's noise times its size (L,): the unexplained of energies, over cells."""
+    # shares are quotients of single-precision numbers: nothing below 1e-9 is known of a rest
+    return np.asarray(np.maximum(1 - shares, 1e-9) * energies / cells)
+
+
+def most_probable(
+    objective: MatchedObjective, T_world_object: Floats, prior: NormalPrior, misfit: float = 1.0
+) -> Floats:
+    """The pose (4, 4) that maximises likelihood and prior, from a maximum of the objective."""
+    T = T_world_object
+    likelihood = likelihood_at(objective, T, misfit)
+    if not likelihood.is_alone:
+        starts = np.concatenate([T[None], prior.points()])
+        # roughly: it is asked which of several maxima is highest
+        T = _climbed(likelihood.objective, prior, starts, 1e4 * NATS)
+    for _ in range(2):  # the second time with the noise that the maximum leaves
+        T = _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], NATS)
+    return T
+
+
+def believed(
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    prior: NormalPrior,
+    rules: FitRules = FitRules(),
+) -> tuple[Floats, bool]:
+    """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
+
+    Or the fit to freed features of a body that does not fit, and whether it is that.
+    """
+    projection, body = objective.projection, objective.projection.body
+    T = most_probable(objective, T_world_object, prior)
+    T_unlike, noises = with_amplitudes(objective, T, prior, rules)
+    if not projection.project(T[None]).seen.all() or len(body.nodes.points) != len(body):
+        return T_unlike, False
+    densities = _densities(objective, noises)
+    points = transform(T_unlike, body.nodes.points)
+    ratio = misfit(densities, points, int(prior.free.sum()), rules)
+    if ratio == 1:
+        return T_unlike, False
+    sigmas = [view.observation.sigma for view in objective.views]
+    # to look for peaks everywhere
+    rough = matched_objective(objective.views, body, sigmas, steps_per_sigma=STEPS_PER_SIGMA)
+    starts = np.concatenate([T[None], prior.points()])
+    T_freed = fit_freed(projection, _densities(rough, noises), starts, prior.free)
+    if T_freed is not None:
+        return T_freed, True
+    # what is left at features is no noise of cells: in a body that does not fit it is as large
+    T = most_probable(objective, T, prior, ratio)
+    return with_amplitudes(objective, T, prior, rules, ratio)[0], False
+
+
+def with_amplitudes(
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    prior: NormalPrior,
+    rules: FitRules,
+    misfit: float = 1.0,
+) -> tuple[Floats, Floats]:
+    """The most probable pose near that of equally bright features, and the noise (L,) of cells."""
+    T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
+    noise, cells = equal, _cells(objective)
+    smallest = NATS * objective.energies[:, 0] / cells
+    for _ in range(3):  # noise and pose by turns: the noise holds to a part in a hundred
+        unlike = AmplitudesObjective(objective, noise, rules.unlike)
+        noise = np.maximum(unlike.unexplained(T) / cells, smallest)
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], NATS)
+    # twice the logarithm of the ratio of likelihoods, each with its own noise
+    gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
+    freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
+    is_equal = gain < float(chdtri(freedom, 1 - rules.believed))
+    return (T_world_object, equal) if is_equal else (T, noise)
+
+
+def _cells(objective: MatchedObjective) -> Indices:
+    return np.array([view.observation.cells for view in objective.views])
+
+
+def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
+    """The densities that an objective has drawn."""
+
+    def sampled(sensor: int, y: Floats) -> Floats:
+        padded = np.zeros((len(objective.views), 1, len(y), 2))
+        padded[sensor, 0, :, : y.shape[1]] = y
+        return objective.atlas.look_up(padded)[sensor, 0, :, : 1 + y.shape[1]]
+
+    each = zip(objective.views, objective.variances[:, 0].tolist(), noises.tolist(), strict=True)
+    return [
+        SensorDensity(view.sensor, partial(sampled, k), variance, noise, view.observation.extent)
+        for k, (view, variance, noise) in enumerate(each)
+    ]
+
+
+def _climbed(likelihood: Term, prior: NormalPrior, starts: Floats, nats: float) -> Floats:
+    """The highest maximum (4, 4) of likelihood and prior near starts (H, 4, 4), to some nats."""
+    options = NewtonOptions(60, 1e-11, value_error=value_error(FINE_STEPS), negligible=nats)
+    ends = ascend(Sum((likelihood, prior)), starts, perturb, prior.free, options)
+    return np.asarray(ends.states[int(np.argmax(ends.values))])
+
+
+@dataclass(frozen=True)
+class SensorDensity:
+    """The matched density of one sensor, as a function of places."""
+
+    geometry: Sensor
+    density: Callable[[Floats], NDArray[Any]]  # with its gradient (n, 1 + m) at places (n, m)
+    variance: float  # 2σ², that of a feature in the matched density, in squared sensor units
+    cell_variance: float  # of the noise of a cell, times the size of a cell
+    extent: tuple[Floats, Floats]  # smallest and largest coordinates (m,) of the density's cells
+
+    def left(self, y: Floats) -> tuple[Floats, Floats]:
+        """What features (n, m) leave of the gradient (n, m) times √2 σ, and their heights (n,)."""
+        away = (y[:, None] - y) / np.sqrt(self.variance)
+        bells = np.exp(-0.5 * (away * away).sum(axis=2))
+        here = self.density(y).astype(np.float64)
+        # features nearer than 1e-4 of √2 σ have one height
+        heights = np.linalg.solve(bells + 1e-9 * np.eye(len(y)), here[:, 0])
+        slopes = -((bells * heights)[..., None] * away).sum(axis=1)
+        return np.sqrt(self.variance) * here[:, 1:] - slopes, heights
+
+    def noise(self) -> float:
+        """Standard deviation of the noise of the matched density."""
+        return float(np.sqrt(self.cell_variance * peak(self.variance, self.geometry.dimension)))
+
+
+def misfit(
+    densities: Sequence[SensorDensity], points: Floats, unknowns: int, rules: FitRules = FitRules()
+) -> float:
+    """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
+
+    Each feature's height was fitted, and some unknowns of the pose, to densities at points (n, 3).
+    """
+    statistic, freedom = 0.0, -unknowns
+    for sensor in densities:
+        rest, heights = sensor.left(sensor.geometry.project(points)[0])
+        # drawing rounds heights to 1/512
+        statistic += float((rest**2).sum() / (sensor.noise() ** 2 + (heights.mean() / 512) ** 2))
+        freedom += rest.size
+    if freedom <= 0 or statistic < float(chdtri(freedom, 1 - rules.believed)):
+        return 1.0
+    return statistic / freedom
+
+
+def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
+    """Where each of `count` features (n, m) explains most, if each has a peak of its own."""
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415 - takes long to import, seldom needed
+
+    step = np.sqrt(sensor.variance / 8)  # half of σ
+    limits = zip(*sensor.extent, strict=True)
+    grid = np.stack(np.meshgrid(*(np.arange(a, b, step) for a, b in limits)), axis=-1)
+    heights = sensor.density(grid.reshape(-1, grid.shape[-1]))[:, 0].reshape(grid.shape[:-1])
+    peaks = (heights == maximum_filter(heights, size=3)) & (heights > 0)
+    order = np.argsort(-heights[peaks])
+    if len(order) < count:
+        return None
+    y = grid[peaks][order[:count]]
+    for _ in range(30):  # peaks two widths apart, the least, draw each other by 0.4 of a step
+        rest, own = sensor.left(y)
+        if own.min() <= 0:
+            return None
+        y = y + np.sqrt(sensor.variance) * rest / own[:, None]
+    chance = sensor.noise() * np.sqrt(2 * np.log(heights.size))
+    others = heights[peaks][order[count:]].max(initial=chance)
+    return y if others < 0.5 * own.mean() < sensor.density(y)[:, 0].min() else None
+
+
+@dataclass(frozen=True)
+class LabelledPlaces:
+    """Minus the sum of squares between features and the places that are taken for theirs."""
+
+    projection: BodyProjection
+    places: Floats  # (L, n, 2) in unknown order
+    scales: Floats  # (L,) 1 / √2 σ
+    labels: Indices  # (L, n), the place of each feature
+
+    def offsets(self, poses: Floats) -> tuple[Floats, Floats]:
+        """Places less projections (H, 2Ln), in units of √2 σ, and Jacobians (H, 2Ln, 6)."""
+        at, H = self.projection.project(poses), len(poses)
+        taken = np.take_along_axis(self.places, self.labels[..., None], axis=1)
+        scales = self.scales[:, None, None, None]
+        offsets, J = scales * (taken[:, None] - at.y), scales[..., None] * at.J
+        return offsets.swapaxes(0, 1).reshape(H, -1), J.swapaxes(0, 1).reshape(H, -1, 6)
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        offsets, J = self.offsets(poses)
+        gradient = 2 * (offsets[:, None] @ J)[:, 0]
+        return Quadratic(-(offsets**2).sum(axis=1), gradient, 2 * J.swapaxes(1, 2) @ J)
+
+    def nearest(self, T: Floats) -> Indices:
+        """The labels with the least sum of squares at a pose (4, 4)."""
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - as above
+
+        y = self.projection.project(T[None]).y[:, 0]
+        costs = ((y[:, :, None] - self.places[:, None]) ** 2).sum(axis=3)
+        return np.array([linear_sum_assignment(cost)[1] for cost in costs])
+
+    def fitted(self, T: Floats, free: Mask) -> tuple[float, Floats, LabelledPlaces]:
+        """The sum of squares that is reached from a pose, where, and with which labels."""
+        term, tried = replace(self, labels=self.nearest(T)), set[bytes]()
+        while (key := term.labels.tobytes()) not in tried:
+            tried.add(key)
+            last = term
+            end = ascend(term, T[None], perturb, free, NewtonOptions(60, tolerance=1e-13))
+            T = end.states[0]
+            term = replace(self, labels=self.nearest(T))
+        return -float(end.values[0]), T, last
+
+    def exchanged(self, T: Floats, free: Mask) -> list[float]:
+        """Sums of squares, to first order, once two features of a sensor change their places."""
+        Q, _ = np.linalg.qr(self.offsets(T[None])[1][0][:, free])
+        count, n = self.labels.shape
+        squares = []
+        for k, (i, j) in product(range(count), combinations(range(n), 2)):
+            labels = self.labels.copy()
+            labels[k, [i, j]] = labels[k, [j, i]]
+            rest = replace(self, labels=labels).offsets(T[None])[0][0]
+            squares.append(float(rest @ rest) - float(np.sum((rest @ Q) ** 2)))
+        return squares
+
+
+def fit_freed(
+    projection: BodyProjection, densities: Sequence[SensorDensity], starts: Floats, free: Mask
+) -> Floats | None:
+    """Fit the pose to freed features by least squares; None where no place is surely whose.
+
+    The features, all of one weight, are seen by all sensors; correspondences are sought from
+    starts (H, 4, 4), which may change in free directions (6,).
+    """
+    count = len(projection.body)
+    redundant = int(projection.dimensions.sum()) * count - int(free.sum())
+    places = np.zeros((len(densities), count, 2))
+    for k, density in enumerate(densities):
+        y = own_peaks(density, count) if redundant > 0 else None
+        if y is None:
+            return None
+        places[k, :, : y.shape[1]] = y
+    scales = 1 / np.sqrt([sensor.variance for sensor in densities])
+    term = LabelledPlaces(projection, places, scales, np.zeros(places.shape[:2], np.intp))
+    ends = sorted((term.fitted(T, free) for T in starts), key=lambda end: end[0])
+    least, T_best, best = ends[0]
+    rivals = {end.labels.tobytes(): squares for squares, _, end in ends}
+    del rivals[best.labels.tobytes()]
+    others = np.array([*rivals.values(), *best.exchanged(T_best, free)])
+    return T_best if ((others / least) ** (-0.5 * redundant)).sum() < 1 else None

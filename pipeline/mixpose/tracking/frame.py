@@ -1,0 +1,202 @@
+"""A frame of one body: what its sensors saw, what is known before it, and the track after it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions, Fit, free_mask
+from mixpose.judgement import Prior, ScoredPose, flat_prior, nearest_alike
+from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
+from mixpose.records import Floats, Mask
+from mixpose.rigid import twist_between
+from mixpose.search import SearchReport, SearchState
+from mixpose.sensors import Motion, in_motion
+from mixpose.tracking.motion import Course, Expected, RandomWalk, per_kind
+from mixpose.tracking.rules import Rules
+from mixpose.tracking.track import Branch, Prediction, Track, either, nearest_branch
+
+
+class Begun(NamedTuple):
+    """What is known of the fit from the first prediction, where bodies were fitted together."""
+
+    objective: MatchedObjective  # at σ_ε
+    fit: Fit | None = None  # that this was climbed to with others'
+    judged: ScoredPose | None = None  # the pose of that fit
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame, and what is known before it."""
+
+    views: Sequence[View]
+    body: Body
+    options: EstimatorOptions
+    samples: Floats  # (N, R, 3) of the body, for the objectives that integrate by sampling
+    track: Track
+    predictions: Sequence[Prediction]
+    T_reference: Floats | None  # (4, 4), that tells poses apart that look the same
+    start_uncertainty: Floats  # (6,)
+    rules: Rules
+    frame: int
+    time_s: float | None
+    begun: Begun | None = None
+    # what searches of the frame cost, and where they go on in the next; the proposer adds to it
+    searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
+    still: Frame | None = None  # where views are as of the common time: sensors as they stand
+    beside: Prediction | None = None  # where another body lets expect one that is not where it was
+
+    @cached_property
+    def free(self) -> Mask:
+        """Directions that are estimated."""
+        return free_mask(self.options)
+
+    @cached_property
+    def is_timed(self) -> bool:
+        """Whether any view is seen at another moment than the common time."""
+        return any(view.delay or view.readout or view.unsure is not None for view in self.views)
+
+    @property
+    def sigmas(self) -> list[float]:
+        """σ_ε of each view."""
+        return [view.observation.sigma for view in self.views]
+
+    @cached_property
+    def noise(self) -> Floats:
+        """What is remembered of each view's noise: squares in σ_ε², degrees of freedom (2, L)."""
+        names = [view.name for view in self.views]
+        return self.rules.judgement.noise.memory * self.track.residuals.of(names)
+
+    @property
+    def close(self) -> Floats:
+        """Standard deviations (6,) of a start that was searched for, or is a rival's."""
+        return self.start_uncertainty / self.rules.proposals.narrowing**2
+
+    @cached_property
+    def anywhere(self) -> Prior:
+        """What is known of a pose of which nothing is known."""
+        return flat_prior(self.body, self.free, self.rules.judgement.detection)
+
+    @cached_property
+    def finest(self) -> MatchedObjective:
+        """The matched objective at σ_ε."""
+        if self.still is not None:  # densities do not move with the sensors
+            views = tuple(self.views)
+            projection = project_body(tuple(view.sensor for view in views), self.body)
+            return replace(self.still.finest, views=views, projection=projection)
+        if self.begun is not None:
+            return self.begun.objective
+        return matched_objective(self.views, self.body, self.sigmas)
+
+    def prior(self, T_world_object: Floats) -> Prior:
+        """What was known of a pose before the frame."""
+        misses, rules = self.track.misses, self.rules.motion
+        own = self._prior(T_world_object, self.predictions, misses)
+        if self.beside is None:
+            return own
+        return either(own, self._prior(T_world_object, [self.beside], 0), misses, rules)
+
+    def _prior(self, T_world_object: Floats, some: Sequence[Prediction], misses: int) -> Prior:
+        """Density of a pose by predictions, or now and then anywhere."""
+        anywhere, rules = self.anywhere, self.rules.motion
+        if not some:
+            return anywhere
+        surprise = min(rules.surprise * (1 + misses), 1.0)
+        terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
+        for one in some:
+            T = nearest_alike(T_world_object, self.body, one.T_world_object)
+            weight = max((1 - surprise) * one.weight, 1e-12)
+            terms.append(np.log(weight) + one.log_density(T, self.free, rules))
+            spreads.append(one.uncertainty)
+        # directions that the data leave open are as uncertain as where the pose likely comes from
+        return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
+
+    def without(self, names: Mapping[str, str]) -> Frame:
+        """The frame without some sensors."""
+        if not names:
+            return self
+        views = [view for view in self.views if view.name not in names]
+        still = self.still.without(names) if self.still else None
+        return replace(self, views=views, still=still, begun=None)
+
+    def in_motion(self, motion: Motion) -> Frame:
+        """The frame as of the common time, of a body that moves."""
+        still = self.still or self
+        views = [
+            replace(view, sensor=in_motion(view.sensor, motion, view.delay, view.readout))
+            for view in still.views
+        ]
+        return replace(still, views=views, still=still)
+
+    def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
+        """The velocity that the frames before let expect of a pose, or near it."""
+        elapsed, rules = self.track.seconds_until(self.time_s), self.rules.course
+        # where nothing was seen before: rest, give or take what hands can do
+        rest = Expected(np.zeros(6), np.zeros(6), per_kind(self.body, rules.fastest), np.zeros(6))
+        branch = nearest_branch(self.track, T_world_object, self.body)
+        if branch is None or not elapsed:
+            return rest
+        T = nearest_alike(T_world_object, self.body, branch.T_world_object)
+        moved = twist_between(branch.T_world_object, T)
+        if branch.course is None and branch.velocity is not None:  # by the last two steps alone
+            velocity = moved / elapsed + (moved / elapsed - branch.velocity) / 2
+            return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
+        if branch.course is None or elapsed > rules.longest_s:
+            return rest
+        expected = branch.course.expected(moved if is_there else None, elapsed, rules)
+        return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected
+
+
+def given(frame: Frame, T_world_object: Floats) -> float:
+    """How far features in view may be off by the body's spread, in σ_ε of their sensor."""
+    if not frame.body.spread:
+        return 0.0
+    projection = frame.finest.projection
+    at = projection.project(T_world_object[None])
+    # per coordinate, of which each sensor has two in J
+    each = (2 / projection.dimensions)[:, None] * at.seen[:, 0]
+    variances = each * in_image(frame.body.node_spreads(T_world_object), at.J[:, 0])
+    return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
+
+
+def follow(frame: Frame, found: Sequence[Branch]) -> Track:
+    """The track after a frame with poses, the best first: how each goes on, as far as they tell."""
+    track, body, rules = frame.track, frame.body, frame.rules.motion
+    elapsed, walk, steady = track.elapsed(frame.frame, frame.time_s), track.walk, rules.steady
+    branches: list[Branch] = []
+    for one in found:
+        T, deviation = one.T_world_object, one.deviation
+        velocity, course, uncertainty = None, None, rules.unsteady * per_kind(body, steady)
+        parent = nearest_branch(track, T, body)
+        if parent is not None and track.frame is not None and elapsed > 0:
+            moved = twist_between(parent.T_world_object, T)
+            if one.spread is not None and not branches:
+                walk = walk or RandomWalk.unknown(body, elapsed, rules)
+                walk = walk.joined(moved, body.radius, elapsed)
+            elif one.spread is None and track.misses <= rules.coasting:
+                velocity = moved / elapsed
+                last = parent.velocity
+                change = moved / 2 if last is None else moved - last * elapsed
+                # of one frame, where it was seen over several
+                change = np.abs(change / (1 + track.misses)).reshape(2, 3)
+                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), per_kind(body, steady))
+            is_near = elapsed <= frame.rules.course.longest_s
+            if deviation is not None and parent.course is not None and is_near:
+                course = parent.course.followed(moved, deviation, elapsed, frame.rules.course)
+        if deviation is not None:
+            course = course or Course.begun(deviation, body, frame.rules.course)
+        branches.append(replace(one, velocity=velocity, uncertainty=uncertainty, course=course))
+    return replace(
+        track,
+        branches=tuple(branches),
+        frame=frame.frame,
+        time_s=frame.time_s,
+        misses=0,
+        walk=walk,
+        search=Track.search,
+    )

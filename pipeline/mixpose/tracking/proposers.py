@@ -1,0 +1,238 @@
+"""Where the body of a frame may be, in the order in which it is tried.
+
+A proposer yields starts for a frame, given the poses found so far; it says itself when it applies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import partial
+from operator import add
+from typing import Protocol
+
+import numpy as np
+
+from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
+from mixpose.fit import blur_schedule
+from mixpose.judgement import ScoredPose, assess
+from mixpose.objective import matched_objective
+from mixpose.records import Floats
+from mixpose.rigid import perturb
+from mixpose.search import Candidate, Descent, SearchReport, SearchState, Stage, search_frame
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Start
+
+
+class Proposer(Protocol):
+    """Starts for a frame, given the poses found so far, the most evident first."""
+
+    __name__: str
+
+    def __call__(self, frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+        """Where fits may begin; nothing where the proposer does not apply."""
+
+
+def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+    """Where the branches of the track expect the body, and another body beside it; always."""
+    beside = [] if frame.beside is None else [frame.beside]
+    return [Start(p.T_world_object, p.uncertainty, p) for p in [*frame.predictions, *beside]]
+
+
+def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
+    """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
+
+    Of a body that was followed for some frames it is enough that no more is missed all at once:
+    what slips by a step of its grid, or turns over, meets less.
+    """
+    if not ranked:
+        return True
+    track, rules, best = frame.track, frame.rules, ranked[0]
+    checks = assess(best, frame.free, rules.acceptance)
+    if checks.convinces or not checks.is_sure:
+        return not checks.convinces
+    if track.believed < rules.proposals.believed or track.misses or track.doubted:
+        return True
+    before = sum(tally.met for tally in track.tallies.values())
+    met = int(np.count_nonzero(best.used.shares))
+    return len(track.branches) != 1 or met <= rules.acceptance.convincing * before
+
+
+def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+    """Promising poses around the first prediction, where the coarsest blurs may lead astray."""
+    if not frame.predictions or not is_doubtful(frame, ranked):
+        return
+    first, rules = frame.predictions[0], frame.rules.proposals
+    wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
+    starts = starts_around(frame, first.T_world_object, wide)
+    narrow, sigmas = wide / rules.narrowing, np.array(frame.sigmas)
+    levels = blur_schedule(frame.views, frame.body, starts[0], narrow)
+    stages = [Stage(tuple(level / sigmas), rules.steps, len(starts)) for level in levels]
+    descent = Descent(frame.views, frame.body, frame.free, frame.rules.search)
+    poses = descent.refine(np.array(starts), stages)
+    values = descent.objective().value(poses)
+    order = np.argsort(-values, kind="stable")
+    # those that meet anything, best first
+    for T in poses[order[values[order] > frame.rules.fit.near * len(frame.views)]]:
+        if is_doubtful(frame, ranked):
+            yield Start(T, narrow / rules.narrowing)
+
+
+def starts_around(frame: Frame, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
+    """The most promising poses (4, 4) around a guess, uncertain by (6,), none close to another."""
+    rules = frame.rules.proposals
+    sigmas = blur_schedule(frame.views, frame.body, T_guess, uncertainty / rules.narrowing)[0]
+    cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
+    # uniform within √3 standard deviations each way
+    drawn = (2 * cube - 1) * np.sqrt(3) * uncertainty
+    twists = np.concatenate([np.zeros((1, 6)), drawn])
+    poses = perturb(T_guess, twists)
+    scores = matched_objective(frame.views, frame.body, sigmas).value(poses)
+    kept: list[int] = []
+    scale = np.where(uncertainty > 0, uncertainty / rules.narrowing, np.inf)
+    for k in np.argsort(scores)[::-1].tolist():
+        if all(np.linalg.norm((twists[k] - twists[other]) / scale) > 1.0 for other in kept):
+            kept.append(k)
+        if len(kept) == rules.kept:
+            break
+    return [poses[k] for k in kept]
+
+
+def searched(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+    """Candidates of a search everywhere, where nothing convinces yet."""
+    return starts_at(frame, candidates_of(frame)) if is_doubtful(frame, ranked) else []
+
+
+def starts_at(frame: Frame, candidates: Sequence[Candidate]) -> Iterable[Start]:
+    """Candidates as they are, and fitted: the wider blurs of a fit reach false detections."""
+    for candidate in candidates:
+        yield Start(candidate.T_world_object)
+        yield Start(candidate.T_world_object, frame.close)
+
+
+def candidates_of(frame: Frame) -> list[Candidate]:
+    """What the search finds, the most evident first, as far as the budget reaches.
+
+    Detections that stayed where they are while the body was lost are left out at first.
+    """
+    live = frame.options.search == "live"
+    budget = frame.rules.live if live else frame.rules.search
+    state = frame.track.search if live else SearchState()
+    search = partial(
+        search_frame,
+        body=frame.body,
+        free=frame.free,
+        T_reference=frame.T_reference,
+        rules=frame.rules.judgement,
+        seed=frame.options.seed,
+    )
+    among_moving, spent = list[Candidate](), SearchReport()
+    moving = frame.track.clutter.without(frame.views, frame.rules.static)
+    if any(view is not whole for view, whole in zip(moving, frame.views, strict=True)):
+        budget = replace(budget, max_guesses=budget.max_guesses / 2)
+        among_moving, spent, _ = search(moving, budget=budget)
+        if among_moving and among_moving[0].evidence > budget.beyond_doubt:
+            frame.searches.append((spent, SearchState()))
+            return among_moving
+    candidates, report, state = search(frame.views, budget=budget, state=state)
+    frame.searches.append((SearchReport(*map(add, spent, report)), state))
+    return among_moving + candidates
+
+
+def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
+    """Poses at which the body looks the same, or nearly so, as at the best pose of the frame.
+
+    What is met there may lie like other features: a chessboard of which a rim is hidden explains
+    what is seen a step of its grid off, too.  A flat body that is small in an image looks almost
+    the same tilted the other way.  The sum of evidence tells which is right, or that none can.
+    """
+    kinds = frame.rules.look_alikes.kinds
+    best = None
+    # once more, where what is moved is better and meets more
+    for _ in range(2 if "congruent" in kinds else 0):
+        if not ranked or ranked[0] is best:
+            break
+        best = ranked[0]
+        yield from _as_evident(frame, best)
+    if ranked and "tilted" in kinds:
+        close = frame.start_uncertainty / frame.rules.proposals.narrowing
+        for T in _tilted(frame, ranked[0]):
+            yield Start(T, close, T_moved=_moves_alike(frame, ranked[0].T_world_object))
+
+
+def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
+    """In words, if one of the rivals is a look-alike of the best pose; else empty."""
+    alike = _congruent(frame, best)
+    if not alike:
+        return ""
+    T, body = best.T_world_object, frame.body
+    corners = np.vstack([body.means.T, np.ones(len(body))])
+    points = np.array([T @ one.T_body_other for one in alike]) @ corners
+    for rival in rivals:
+        there = rival.T_world_object @ body.symmetries @ corners
+        away = np.abs(points[:, None] - there[None]).max(axis=(2, 3)).min(axis=1)
+        if away.min() < frame.rules.look_alikes.alike * body.radius:
+            return alike[int(away.argmin())].reason
+    return ""
+
+
+def met_features(judged: ScoredPose) -> frozenset[int]:
+    """Numbers of the features that any sensor meets."""
+    return frozenset(np.flatnonzero(judged.matches.met_by).tolist())
+
+
+def _moves_alike(frame: Frame, T_world_object: Floats) -> Floats | None:
+    """The pose, where the frame before left open which look-alike is right: they move alike."""
+    return T_world_object if len(frame.track.branches) > 1 else None
+
+
+def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
+    """Motions under which what is met at a pose lies like other features of the body."""
+    body = frame.body
+    # single ranges do not say what is met
+    if len(body.nodes.points) != len(body) or (best.matches.dimensions == 1).any():
+        return ()
+    tolerance = tolerance_of(body, body, frame.rules.look_alikes.alike)
+    return like_features(body, met_features(best), body, tolerance)
+
+
+def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
+    """The best pose moved, where as much is met and motion does not tell against it.
+
+    What motion says against a pose must be made up for by features that it meets more.
+    """
+    alike = _congruent(frame, best)
+    if not alike:
+        return
+    rules, T = frame.rules, best.T_world_object
+    poses = np.array([T, *(T @ one.T_body_other for one in alike)])
+    met = float(best.matches.met.max())
+    # the value grows as the square of the features met
+    values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
+    fewer = met * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
+    here = frame.prior(T).log_density
+    for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
+        moved = _moves_alike(frame, T) if alike[k].is_step else None
+        against = here - frame.prior(poses[1 + k] if moved is None else moved).log_density
+        least = 1 + max(against, 0.0) / np.log(rules.acceptance.rival)
+        if fewer[k] < rules.look_alikes.fewer * least:
+            yield Start(poses[1 + k], frame.close, T_moved=moved)
+
+
+def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Floats]:
+    """The pose (4, 4) tilted the other way, where one camera alone meets a nearly flat body."""
+    body, views = frame.body, frame.views
+    if len(views) > 1:
+        least = frame.rules.acceptance.agreeing
+        seen = best.matches
+        met = {name for name, share in zip(seen.names, seen.coverage) if share >= least}
+        views = [view for view in views if view.name in met]
+    if len(views) != 1 or views[0].sensor.dimension != 2 or len(body) < 3:
+        return
+    if thickness(body) <= frame.rules.look_alikes.flat:
+        T = best.T_world_object
+        middle = T[:3, :3] @ body.means.mean(axis=0) + T[:3, 3]
+        yield other_tilt(body, T, views[0].sensor.towards(middle[None])[0])
+
+
+PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
