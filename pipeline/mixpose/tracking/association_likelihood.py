@@ -19,8 +19,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.fit import Fit, blur_schedule
-from mixpose.judgement import Case, RememberedNoise, ScoredPose, judge, nearest_alike
-from mixpose.matching import Noise
+from mixpose.judgement import RememberedNoise, ScoredPose, judge, nearest_alike
 from mixpose.objective import NormalPrior, View
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend
 from mixpose.records import Floats, PointPattern
@@ -56,10 +55,10 @@ def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeR
     )
 
 
-def noise_ratio(noise: Noise, rules: RangeRules) -> float:
-    """Standard deviation of ranges in σ_ε, as residuals of earlier frames show it."""
-    stated = Noise(rules.stated_degrees, rules.stated_degrees).joined(noise)
-    return max(1.0, float(np.sqrt(stated.variance)))
+def noise_ratio(noise: Floats, rules: RangeRules) -> float:
+    """Standard deviation of ranges in σ_ε, by squares and degrees of freedom (2,) so far."""
+    squares, degrees = noise + rules.stated_degrees
+    return max(1.0, float(np.sqrt(squares / degrees)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +98,13 @@ class AssociationLikelihood:
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by the sum over all associations, with the prior of the start."""
         data, T, free, model = self.data, fit.T_world_object, self.data.free, self.data.rules
-        judged = judge(Case(data.finest, T), free, model.judgement)
+        judged = judge(data.finest, T, free, model.judgement)
         views, detection = data.views, model.judgement.detection
         found = sum_associations(views, data.body, T[None], self.noise, detection)
         before, memory = data.track.residuals.total, model.judgement.noise.memory
         count = int(free.sum())
         degrees = max(float(found.met[0]) - count, 0.0)
-        noise = Noise(float(found.squares[0]) if degrees else 0.0, degrees)
+        squares = float(found.squares[0]) if degrees else 0.0
         inner = np.ix_(free, free)
         # a direction that the data leave open is as uncertain as anywhere; the posterior holds
         # the prediction already
@@ -115,15 +114,15 @@ class AssociationLikelihood:
         covariance = np.zeros((6, 6))
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-        degrees = model.ranges.stated_degrees + before.degrees
-        covariance *= model.judgement.noise.enlargement(count, degrees)
+        known = model.ranges.stated_degrees + float(before[1])
+        covariance *= model.judgement.noise.enlargement(count, known)
         log_odds = float(found.log_odds[0])
         return replace(
             judged,
             covariance=covariance,
             log_evidence=log_odds + data.prior(T).log_density + float(volume),
             noise=RememberedNoise(
-                ("",), memory * data.track.residuals.of(("",)) + [[noise.squares], [noise.degrees]]
+                ("",), memory * data.track.residuals.of(("",)) + [[squares], [degrees]]
             ),
             spread=np.sqrt(np.diag(covariance)),
         )

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.fit import Fit
-from mixpose.judgement import ScoredPose, nearest_alike
-from mixpose.judgement.moments import inverses
+from mixpose.judgement import ScoredPose, inverses, nearest_alike
 from mixpose.matching import ErrorRules, Matches, associate, errors_seen
 from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
@@ -216,7 +215,7 @@ def _change(
 
 def _inverse(information: Floats) -> Floats:
     """Inverse of one information matrix; large where it is open."""
-    return np.asarray(inverses(information[None])[0])
+    return inverses(information)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.fit import Climbed, EstimatorOptions, Fit, fit_near, free_mask
 from mixpose.judgement import (
-    Case,
     Prior,
     ScoredPose,
     flat_prior,
@@ -258,10 +257,18 @@ class MatchedLikelihood:
             motion = motion or data.expected(T).at(T)
             data = data.in_motion(motion)
         prior = data.prior(T if start.T_moved is None else start.T_moved)
-        case = Case(data.finest, T, data.track.residuals, prior, start.left_out)
-        if T is fit.T_world_object and motion is None and not start.left_out:
-            case = replace(case, matches=fit.matches, noise=fit.noise)
-        judged = judge(case, data.free, data.rules.judgement)
+        is_seen = T is fit.T_world_object and motion is None and not start.left_out
+        judged = judge(
+            data.finest,
+            T,
+            data.free,
+            data.rules.judgement,
+            before=data.track.residuals,
+            prior=prior,
+            left_out=start.left_out,
+            matches=fit.matches if is_seen else None,
+            noise=fit.noise if is_seen else None,
+        )
         return judged if motion is None else with_motion_unknown(judged, data, motion)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from mixpose.judgement import ScoredPose, assess
+from mixpose.judgement import ScoredPose, convinces, is_sure
 from mixpose.tracking.likelihood import FrameData, Start
 
 
@@ -21,8 +21,8 @@ def is_doubtful(data: FrameData, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere."""
     if not ranked:
         return True
-    checks = assess(ranked[0], data.free, data.rules.acceptance)
-    return not (checks.convinces or (checks.is_sure and _is_met_as_before(data, ranked[0])))
+    given = ranked[0], data.free, data.rules.acceptance
+    return not (convinces(*given) or (is_sure(*given) and _is_met_as_before(data, ranked[0])))
 
 
 def _is_met_as_before(data: FrameData, best: ScoredPose) -> bool:
