@@ -14,7 +14,7 @@ from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.judge import ScoredPose, beliefs, nearest_alike
 from mixpose.judgement.noise import NoiseModel
-from mixpose.matching import Matches
+from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import rotation_angle_deg, twist_between
 
@@ -35,41 +35,30 @@ class AcceptanceRules:
         -4.5, "the same of a pose that stands out: sure, less the share of two misses"
     )
     doubtful_coverage: float = constant(0.6, "share of the body that a pose must meet to stand out")
+    # of frames of one camera with five features and five false detections
     spare: float = constant(
-        4.0,
-        "coordinates beyond those that fix it that a pose must meet to stand out: of one feature "
-        "more chance makes enough (one camera, body absent: told in 9 % of 110 frames of 5/0/5)",
+        4.0, "coordinates beyond six that it must meet: of two fewer chance makes enough, in 9 %"
     )
     standing_out: float = constant(
-        1.5,
-        "log odds against all other poses of the frame from which one stands out: of 330 frames of "
-        "one camera without the body 4 % are told, of 330 with it the right pose in 96 %",
+        1.5, "log odds against all other poses: 4 % without the body are told, 96 % with it"
     )
     enough: float = constant(
         8.0, "features met by some sensor that are enough however many are missed: a shape"
     )
     rival: float = constant(
-        0.01,
-        "belief from which another pose makes a frame ambiguous; with a tenth it stands among the "
-        "hypotheses",
+        0.01, "belief from which another pose makes a frame ambiguous; a tenth makes a hypothesis"
     )
     widest_turn_deg: float = constant(
         15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
     )
     convincing: float = constant(
-        0.75,
-        "share of the body that must be met for the prediction to be taken without looking "
-        "elsewhere: a body slipped by a step of its grid meets less",
+        0.75, "share of the body that must be met not to look elsewhere: after a slip less is met"
     )
     agreeing: float = constant(
-        0.5,
-        "share of the body that a sensor must meet to count as one that agrees, and of the "
-        "features in view that all of them must meet for a pose to be sure",
+        0.5, "the same of a sensor that agrees, and of the features in view of a sure pose"
     )
     disagreeing: float = constant(
-        25.0,
-        "residual variance over that of the other sensors from which one that meets the body is "
-        "left out: five times their deviation; web cams a frame late have three and still help",
+        25.0, "variance over the others' of a sensor to leave out: five times their deviation"
     )
     same: float = constant(
         0.02, "of the body's radius, and rad: poses nearer than this are one, unless both fit"
@@ -137,7 +126,8 @@ def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> Verdict:
     """Decide about a frame from all its poses, the most evident first."""
     told = [one for one in ranked if is_possible(one, free, rules)]
-    told = [*ranked[:1], *told] if _stands_out(ranked, free, rules) else told
+    if ranked and _stands_out(ranked, free, rules):
+        told.insert(0, ranked[0])
     if not told:
         return Verdict("lost", None, [])
     best, weights = told[0], beliefs(ranked)
@@ -161,12 +151,13 @@ def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules
 
     Poses that meet detections by chance come in numbers, and about equally good.
     """
-    if not ranked or ranked[0].coverage < rules.doubtful_coverage:
-        return False
-    if ranked[0].measurements < int(free.sum()) + rules.spare:
-        return False
-    rest = np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in ranked[1:])])
-    return ranked[0].log_evidence > max(rules.doubtful, float(rest) + rules.standing_out)
+    first, *others = ranked
+    rest = float(np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in others)]))
+    return (
+        first.coverage >= rules.doubtful_coverage
+        and first.measurements >= int(free.sum()) + rules.spare
+        and first.log_evidence > max(rules.doubtful, rest + rules.standing_out)
+    )
 
 
 def insert(
@@ -251,5 +242,5 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
         return False
     limit = rules.disagreeing / 4 * model.errors.typical**2
     if before[1] >= model.known:
-        limit = rules.disagreeing * max(before[0] / before[1], model.smallest**2)
+        limit = rules.disagreeing * max(before[0] / before[1], LEAST_VARIANCE)
     return bool(float(used.squares.sum()) / degrees >= limit)

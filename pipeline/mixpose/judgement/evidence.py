@@ -42,9 +42,7 @@ class DetectionModel:
         -5.0, "at least, for all features that one sensor misses: in 1 of 150 it sees none"
     )
     by_count: bool = constant(
-        True,
-        "whether a pose may pay for its freedom by the features that fix it: cheaper than by "
-        "volume where priors are wide",
+        True, "whether features that fix a pose may pay for its freedom: cheaper by wide priors"
     )
     in_space: bool = constant(
         True, "whether clutter may be a point in space that all cameras see: then it counts once"
@@ -91,16 +89,15 @@ def log_evidence(
     information: Floats,
     spreads: Floats | None = None,
 ) -> Floats:
-    """Logarithm of the odds (K,) for bodies at K poses against mere clutter.
+    """Logarithm of the odds (K,) for bodies at K poses of an information (K, 6, 6) against clutter.
 
-    Of poses with an information (K, 6, 6) that are free in directions (6,), each with a prior; all
-    else as `odds_of` has it.
+    All else as `odds_of` has it.
     """
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     wide = np.array([prior.spread for prior in priors])[:, free]
     inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
-    laplace = 0.5 * (wide.shape[1] * math.log(2 * math.pi) - _log_det(inner))
+    laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
     log_densities = np.array([prior.log_density for prior in priors])
     evidence = odds[0] + odds[1] + laplace + log_densities
     if detection.by_count:
@@ -115,24 +112,20 @@ def odds_of(
     detection: DetectionModel,
     spreads: Floats | None = None,  # (K, N, 3, 3) of features in the world, where a body gives way
 ) -> tuple[Floats, Floats, Floats]:
-    """Odds of K poses against clutter, as if they had not been chosen to fit.
+    """What features met gain (K,) against clutter, others lose, and coordinates that tell anything.
 
-    What the features met gain and the others lose (K,), in view or out of it, and the number of
-    coordinates that tell anything: three for a point in space.
+    Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
     """
     roots, m = np.sqrt(variances), found.dimensions
     crowd = found.crowd * roots**m
     rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
-    costs = _costs(found, roots, spreads)
-    gained = found.shares * np.maximum(rarity[..., None] - costs, 0.0)
+    gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
     is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
-    shares = found.shares
-    if is_blind.any():
-        even = found.weights / np.maximum(found.expected, 1.0)[..., None]
-        missed = np.where(is_blind, even * detection.log_blind, missed)
-        gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, shares)
+    even = found.weights / np.maximum(found.expected, 1.0)[..., None]
+    missed = np.where(is_blind, even * detection.log_blind, missed)
+    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
     missed = missed.sum(axis=1)
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
@@ -198,11 +191,7 @@ def _in_space(
 
 
 def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mask) -> Floats:
-    """Evidence (K,) of poses that pay for their freedom by the features that fix them.
-
-    These earn nothing, and cost the logarithm of the number of ways to fix a pose by what was
-    observed.
-    """
+    """Evidence (K,) of poses that pay by count: by the ways to fix them by what was observed."""
     gained, missed, coordinates = odds
     expected, count = found.weights.sum(axis=2), int(free.sum())
     pins = -(-count // int(found.dimensions.max()))
@@ -212,11 +201,3 @@ def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mas
     assigned = gammaln(features + 1) - gammaln(features - pins + 1)
     spare = np.maximum(1.0 - count / np.maximum(coordinates, 1.0), 0.0)
     return np.asarray(gained * spare + missed - (ways + assigned + math.log(2)))
-
-
-def _log_det(A: Floats) -> Floats:
-    """Logarithms of the determinants of positive definite matrices, however ill conditioned."""
-    scale = np.sqrt(A.diagonal(axis1=1, axis2=2))
-    values = np.linalg.eigvalsh(A / scale[:, :, None] / scale[:, None])
-    logs = np.log(np.maximum(values, 1e-12)).sum(axis=1) + 2 * np.log(scale).sum(axis=1)
-    return np.asarray(logs)

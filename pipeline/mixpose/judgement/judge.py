@@ -89,11 +89,9 @@ class ScoredPose:
     @property
     def sensors(self) -> dict[str, SensorReport]:
         """How each sensor took part."""
-        rows = zip(self.matches.names, self.matches.explained.tolist(), self.matches.rms)
-        return {
-            name: SensorReport(name not in self.left_out, explained, rms, self.left_out.get(name))
-            for name, explained, rms in rows
-        }
+        out, rows = self.left_out, zip(self.matches.explained.tolist(), self.matches.rms)
+        by_name = zip(self.matches.names, rows)
+        return {name: SensorReport(name not in out, *row, out.get(name)) for name, row in by_name}
 
 
 def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
@@ -117,9 +115,8 @@ def judge(
 ) -> ScoredPose:
     """Judge a pose (4, 4), estimated in free directions (6,), by the matched objective at σ_ε.
 
-    `before` is the noise of the frames before, `prior` what was known of the pose (None: nothing);
-    sensors that are left out count as if they had met nothing.  `matches` and `noise` are those of
-    the pose, where the fit has them.
+    `before` is the noise of earlier frames, `prior` what was known of the pose; sensors left out
+    count as if they had met nothing.  `matches` and `noise` are the fit's, where it has them.
     """
     case = objective, T_world_object, before, prior, matches, noise
     return judge_together([case], free, rules, left_out)[0]
@@ -135,11 +132,9 @@ def judge_together(
     left_out, narrowest = left_out or {}, rules.noise.errors.narrowest
     whole, noises = [], []
     for objective, T, before, _, matches, noise in cases:
-        one = matches or associate(objective, T, rules.association, narrowest)
-        part = taken_part(one, left_out)
-        whole.append(one)
+        whole.append(matches or associate(objective, T, rules.association, narrowest))
+        part = taken_part(whole[-1], left_out)
         noises.append(noise_of(part, free, before, rules.noise, noise))
-    # sensors that are left out count as if they had met nothing
     used = np.array([name not in left_out for name in whole[0].names])
     variances, seen = np.ones((len(whole), len(used))), Matches.stacked(whole)
     variances[:, used] = [noise[0] for noise in noises]

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -27,7 +28,6 @@ from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
 from mixpose.judgement.covariance import inverses
-from mixpose.judgement.residuals import fields_of, normal_equations, weighted
 from mixpose.matching import ErrorRules, Matches, NoiseEstimate, errors_seen, pooled
 from mixpose.records import Floats
 
@@ -50,7 +50,6 @@ class NoiseModel:
 
     errors: ErrorRules = ErrorRules()
     bias: BiasRules = BiasRules()
-    smallest: float = constant(1e-3, "of σ_ε: float32 densities do not resolve residuals below")
     by_chance: float = constant(
         0.999, "frames whose residuals are larger than so many by chance stand on their own"
     )
@@ -62,9 +61,7 @@ class NoiseModel:
         0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
     )
     lasting: float = constant(
-        0.18,
-        "of the noise: an offset that all features of a sensor have in common, or what turns, "
-        "scales and shears them, before it is seen (half and twice of it do as well)",
+        0.18, "of the noise: fields of a sensor before they are seen; half and twice do as well"
     )
 
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
@@ -108,58 +105,100 @@ def noise_of(
     free: NDArray[np.bool_],
     before: RememberedNoise,
     model: NoiseModel,
-    estimate: NoiseEstimate | None = None,
+    estimate: NoiseEstimate | None = None,  # as the fit has it
 ) -> tuple[Floats, Floats, Floats, RememberedNoise, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
-    As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes.  `estimate` is what the
-    fit saw already.
-
-    Returns the variances (L,) of each sensor in σ_ε²; the covariance (6, 6), zero where the pose
-    is not free, and what of it lasts from frame to frame and leaves velocities alone; what is
-    remembered; and the ratio of residuals to the largest that those before let chance make.
+    Variances (L,) of each sensor, σ_ε²; the covariance (6, 6), zero where the pose is not free, and
+    what of it lasts from frame to frame and leaves velocities alone; what is remembered; and the
+    ratio of residuals to the largest that those before let chance make.
     """
-    count = int(free.sum())
+    count, inner = int(free.sum()), np.ix_(free, free)
     variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
     is_noise = found.squared <= model.errors.outlying**2 * scale[:, None]
     shares, noise = np.where(is_noise, found.shares, 0.0), np.sqrt(scale)
-    r, rows, by_calibration = weighted(found, shares, noise)
-    fields, kinds = fields_of(found, shares, rows)
-    J = rows[:, free]
+    # residuals, Jacobian and fields, weighted
+    roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
+    r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
+    J, (fields, kinds) = rows[:, free], _fields_of(found, shares, rows)
     inverse = inverses(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
     drawn = inverse @ (J.T @ fields)
     left = fields - J @ drawn
     # those of the sensors may last
     q = fields.shape[1] - 3 * shares.shape[1]
-    sizes = np.repeat(noise, q // len(noise))
+    sizes = noise.repeat(q // len(noise))
     lasting = left[:, :q] / sizes
-    biases = _with(before.biases, found.names, lasting.T @ np.column_stack([lasting, r]), model)
-    mean, second = _fields_that_last(biases[found.names], model)
-    rest = r - lasting @ mean
+    shown = lasting.T @ np.column_stack([lasting, r])
+    biases, mean, second = _lasting(before.biases, found.names, shown, model)
+    rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
     pulls = np.concatenate([rest @ fields[:, :q], r @ fields[:, q:]])
     redundancy = float(shares.sum(axis=1) @ found.dimensions) - count
-    own = normal_equations(rest, redundancy, fields, left, pulls, kinds)
+    own = _normal_equations(rest, redundancy, fields, left, pulls, kinds)
     moments = model.memory * before.moments + own
-    met = float(found.met.mean())
-    by_kind, of_fields = _variances(moments, own, met, model)
+    by_kind, of_fields = _variances(moments, own, float(found.met.mean()), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
-    moved = drawn[:, :q] / sizes
     covariance, steady = np.zeros((2, 6, 6))
-    steady[np.ix_(free, free)] = moved @ second @ moved.T
-    inner = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
-    pulled = inverse @ (J.T @ by_calibration)
-    covariance[np.ix_(free, free)] = inner + pulled @ pulled.T
+    steady[inner] = moved @ second @ moved.T
+    covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    if found.by_calibration is not None:
+        pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
+        covariance[inner] += pulled @ pulled.T
     others = [k for k, name in enumerate(before.names) if name not in found.names]
-    remembered = RememberedNoise(
-        (*found.names, *(before.names[k] for k in others)),
-        np.hstack([sums, before.sums[:, others]]),
-        moments,
-        biases,
-    )
+    names = (*found.names, *(before.names[k] for k in others))
+    sums = np.hstack([sums, before.sums[:, others]])
+    remembered = RememberedNoise(names, sums, moments, biases)
     return variances, covariance + steady, steady, remembered, ratio
+
+
+def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Floats]:
+    """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
+
+    Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
+    about their middle (kind 2); of each marker what it is off by along the axes of the world (3).
+    """
+    L, N = shares.shape
+    total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
+    away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
+    spread = (shares[..., None] * away * away).sum(axis=(1, 2))
+    size = np.sqrt(spread / (found.dimensions * total[:, 0]))
+    away /= np.maximum(size, 1e-6)[:, None, None]
+    by_feature = np.concatenate([np.ones((L, N, 1)), away], axis=2) * np.sqrt(shares)[..., None]
+    columns, kinds = _columns(tuple(found.dimensions.tolist()), N)
+    of_sensors = by_feature[:, :, None, None, None] * columns[:, None, ..., None]
+    # in units of how features move with the body, the root mean square of those in view
+    counts = 3 * np.count_nonzero(found.weights, axis=1) @ found.dimensions
+    moved = np.sqrt((J[:, :3] ** 2).sum() / max(counts, 1))
+    by_place = J[:, :3].reshape(L, N, 2, 1, 3) / max(moved, 1e-6)
+    of_markers = by_place * np.eye(N)[:, None, :, None]
+    return np.hstack([of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)]), kinds
+
+
+@lru_cache(maxsize=64)
+def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats]:
+    """Which rows (L, 2) the columns (L, 2) of each sensor are of, and the kinds of all fields."""
+    L = len(dimensions)
+    axes = np.arange(2) < np.array(dimensions)[:, None]
+    columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)
+    return columns, np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
+
+
+def _normal_equations(
+    r: Floats, redundancy: float, fields: Floats, left: Floats, pulls: Floats, kinds: Floats
+) -> Floats:
+    """Moments (4, 5), [expected | seen], of independent errors and fields of each kind.
+
+    `left` is what a pose leaves of fields, `pulls` how these pull at residuals, `redundancy` tr R.
+    """
+    moments = np.zeros((4, 5))
+    if redundancy > 0:
+        gram = fields.T @ left
+        moments[:, :4] = kinds.T @ gram**2 @ kinds
+        moments[0, :4] = moments[:, 0] = gram.diagonal() @ kinds
+        moments[0, 0], moments[0, 4] = redundancy, r @ r
+        moments[1:, 4] = pulls**2 @ kinds[:, 1:]
+    return moments
 
 
 def _level(
@@ -169,18 +208,18 @@ def _level(
     model: NoiseModel,
     estimate: NoiseEstimate | None,
 ) -> tuple[Floats, Floats, Floats, float, float]:
-    """How large residuals are, sensor by sensor.
+    """Variances (L,) as offsets show them, and those that residuals are measured in.
 
-    Variances (L,) as offsets show them, and drawn to that of all sensors, which residuals are
-    measured in; sums (2, L) to remember; degrees of freedom of all that was seen; the ratio.
+    As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
+    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Then the
+    degrees of freedom of all that was seen, and the ratio.
     """
     rules, past = model.errors, before.of(matches.names)
     sums, ratio = model.memory * past, 0.0
     seen = estimate or errors_seen(matches, count, sums, rules)
     known, degrees = float(past[1].sum()), float(seen.own[1].sum())
     if known >= model.known and degrees >= 1:
-        usual = np.maximum(pooled(past, rules, 0.0), model.smallest**2)
-        ratio = float((seen.own[0] / usual).sum()) / degrees
+        ratio = float((seen.own[0] / pooled(past, rules, 0.0)).sum()) / degrees
         ratio /= float(fdtri(degrees, known, model.by_chance))
     told = sums + seen.own / [[max(ratio, 1.0)], [1.0]]
     if ratio > 1:
@@ -189,27 +228,27 @@ def _level(
     sums = sums + seen.own
     degrees = float(sums[1].sum())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return seen.variances, np.maximum(scale, model.smallest**2), told, degrees, ratio
+    return seen.variances, scale, told, degrees, ratio
 
 
-def _with(before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel) -> Biases:
-    """Sums (q, q + 1) with those of a frame, of the last four sets of sensors that were seen."""
+def _lasting(
+    before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel
+) -> tuple[Biases, Floats, Floats]:
+    """Sums [A | v] with those (q, q + 1) of a frame, and what they show of fields that last.
+
+    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
+    """
     if names in before and before[names].shape == shown.shape:
         shown = model.bias.memory * before[names] + shown
     others = [(own, sums) for own, sums in before.items() if own != names]
-    return {names: shown, **dict(others[:3])}
-
-
-def _fields_that_last(sums: Floats, model: NoiseModel) -> tuple[Floats, Floats]:
-    """Sizes γ̂ (q,) in σ_ε of fields with sums [A | v], and second moments (q, q); 0 for none."""
-    information, vector, deviation = sums[:, :-1], sums[:, -1], model.bias.deviation
+    biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
+    A, v, deviation = shown[:, :-1], shown[:, -1], model.bias.deviation
     if deviation:
-        S = np.linalg.inv(information + np.eye(len(vector)) / deviation**2)
-        mean = S @ vector
-        degrees = float((S * information).sum())
-        if vector @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
-            return mean, S + np.outer(mean, mean)
-    return np.zeros_like(vector), np.zeros_like(information)
+        S = np.linalg.inv(A + np.eye(len(v)) / deviation**2)
+        mean, degrees = S @ v, float((S * A).sum())
+        if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
+            return biases, mean, S + np.outer(mean, mean)
+    return biases, np.zeros_like(v), np.zeros_like(A)
 
 
 def _variances(
@@ -217,10 +256,9 @@ def _variances(
 ) -> tuple[Floats, Floats]:
     """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter.
 
-    From normal equations (4, 5) of all frames and of this one's own, where each sensor meets so
-    many features.  What is believed before counts as a camera's fields along an axis: an offset,
-    and two that turn, scale and shear; that markers are where they are said to be, as surely as so
-    many frames tell.
+    From normal equations of all frames and of one alone, where sensors meet so many features.  What
+    is believed before, as that markers are where they are said to be, counts as a camera's fields
+    along an axis in it: an offset, and two that turn, scale and shear.
     """
     fields, least = 3.0, 1e-6  # degrees of freedom that are as good as none
     of_markers = fields * own[3, 3] + least

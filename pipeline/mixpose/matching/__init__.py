@@ -6,6 +6,7 @@ from mixpose.matching.associate import (
     crowding as crowding,
 )
 from mixpose.matching.errors import (
+    LEAST_VARIANCE as LEAST_VARIANCE,
     ErrorRules as ErrorRules,
     NoiseEstimate as NoiseEstimate,
     errors_seen as errors_seen,

@@ -15,7 +15,7 @@ import numpy as np
 from mixpose.constants import constant
 from mixpose.density import DRAWING, peak
 from mixpose.matching.matches import Matches
-from mixpose.objective import Match, MatchedObjective, View, in_image
+from mixpose.objective import MatchedObjective, View, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
@@ -26,14 +26,10 @@ class AssociationRules:
     """When a feature counts as met."""
 
     min_share: float = constant(
-        0.3,
-        "share of a feature's peak density from which it is met: within 1.55 standard deviations "
-        "of C, 2.2 σ_ε; false features pass for true ones beyond (search rows)",
+        0.3, "of a feature's peak density: within 2.2 σ_ε; false features pass for true ones beyond"
     )
     min_region: float = constant(
-        20.0,
-        "σ_ε: features crowd at least over so wide a region, so that two that are close do not "
-        "make the density of clutter infinite",
+        20.0, "σ_ε over which features crowd at least: two alone make no infinite density"
     )
     crowded: bool = constant(
         True, "whether clutter is as dense as detections around the body, where they are denser"
@@ -42,9 +38,7 @@ class AssociationRules:
         True, "whether two features may share one detection: blobs that touch have one centre"
     )
     slip: float = constant(
-        0.25,
-        "of the body's size in the image: around its box, a grid shifted by a step has detections "
-        "that belong to no feature (chessboards have steps of 1/8)",
+        0.25, "of the body's size, around it: where a slipped grid (steps of 1/8) has detections"
     )
 
     @property
@@ -56,36 +50,40 @@ class AssociationRules:
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what a pose (4, 4) predicts with what every sensor observed.
+    """Compare what a pose (4, 4) predicts with what every sensor observed at σ_ε.
 
-    The objective is that at σ_ε of every sensor; `narrowest` is the narrowest blur of interest,
-    σ_ε.
+    `narrowest` is the narrowest blur of interest, σ_ε.
     """
     match, views = objective.match(T_world_object[None]), objective.views
-    at, body = match.at, objective.projection.body
-    y, seen, weights = at.y[:, 0], at.seen[:, 0], at.weights[:, 0]
+    at, dimensions, body = match.at, objective.projection.dimensions, objective.projection.body
+    y, seen, weights, J = at.y[:, 0], at.seen[:, 0], at.weights[:, 0], at.J[:, 0]
     sigmas, detections = np.array([view.observation.sigma for view in views]), _detections(views)
     product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.over.norm[:, 0])
+    reach = np.broadcast_to(objective.variances, seen.shape)
+    if body.spread:  # variances along an axis by which features may be off
+        spreads = body.node_spreads(T_world_object)
+        reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
     # shares, offsets in sensor units, detections, and partners of features in merged pairs
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
-    is_open = seen & (product > 0)[:, None]
-    reach = rules.reach_squared * objective.variances
-    if body.spread:
-        reach = reach + rules.reach_squared * _spread(objective, at.J[:, 0], T_world_object)
-    _to_nearest(y, weights, detections, np.broadcast_to(reach, seen.shape), is_open, rules, met)
     shares, offsets, by, partner = met
+    is_open = seen & (product > 0)[:, None]
+    _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
-        _to_grid(k, objective, match, float(product[k]), rules, all(is_grid), shares, offsets)
-    J = at.J[:, 0] / sigmas[:, None, None, None]
+        of, m, amplitude = seen[k], dimensions[k], product[k] / match.over.norm[k, 0]
+        mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
+        shares[k, of], offsets[k, of, :m] = _residuals(
+            *mixture, match.sampled[k, 0, of, : 1 + m], float(amplitude), rules, all(is_grid)
+        )
+    J = J / sigmas[:, None, None, None]
     paired = np.nonzero(partner >= 0)
     if len(paired[0]):
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
-        dimensions=objective.projection.dimensions,
+        dimensions=dimensions,
         sigmas=sigmas,
         weights=weights,
         shares=shares,
@@ -100,7 +98,7 @@ def associate(
         crowd=crowd,
         unmatched_nearby=unmatched,
         finest=np.minimum(np.maximum(narrowest, finest), 1.0),
-        by_calibration=_by_calibration(objective, T_world_object, sigmas),
+        by_calibration=_by_calibration(views, transform(T_world_object, body.nodes.points)),
     )
 
 
@@ -115,23 +113,16 @@ def _detections(views: Sequence[View]) -> Floats:
     return detections
 
 
-def _spread(objective: MatchedObjective, J: Floats, T_world_object: Floats) -> Floats:
-    """Variances (L, n) along an axis by which features of a body that gives way may be off."""
-    spreads = objective.projection.body.node_spreads(T_world_object)
-    m = objective.projection.dimensions.tolist()
-    return np.array([in_image(spreads, own[..., :size, :]) for own, size in zip(J, m)])
-
-
 def _to_nearest(
     y: Floats,
     weights: Floats,
     detections: Floats,
     reach: Floats,  # (L, n) squared, in sensor units
     is_open: Mask,
-    rules: AssociationRules,
+    merged: bool,
     met: tuple[Floats, Floats, Indices, Indices],
 ) -> None:
-    """Write which features are met by the nearest detections, each taken once, or by a pair."""
+    """Write what the nearest detections meet, each taken once or by a pair of features."""
     shares, offsets, by, _ = met
     away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
@@ -143,7 +134,7 @@ def _to_nearest(
     chosen = _once_each(features, taken, squared[pairs])
     at = k[chosen], i[chosen]
     shares[at], offsets[at], by[at] = weights[at], away[(*at, j[chosen])], j[chosen]
-    if rules.merged and len(chosen) < len(features):
+    if merged and len(chosen) < len(features):
         # only a feature near a detection that is taken can share it
         for row in np.unique(k[shares[k, i] == 0]).tolist():
             _run_together(y[row], weights[row], reach[row], is_open[row], *(a[row] for a in met))
@@ -151,16 +142,14 @@ def _to_nearest(
 
 def _once_each(features: Indices, detections: Indices, squared: Floats) -> Indices:
     """Pairs in which no feature and no detection occurs twice, the nearest first."""
-    if np.bincount(features).max() == 1 and np.bincount(detections).max() == 1:
-        return np.arange(len(features))
-    order = np.argsort(squared, kind="stable")
-    pairs = zip(order.tolist(), features[order].tolist(), detections[order].tolist(), strict=True)
     chosen, met, taken = [], set[int](), set[int]()
-    for number, feature, detection in pairs:
+    features_of, detections_of = features.tolist(), detections.tolist()
+    for pair in np.argsort(squared, kind="stable").tolist():
+        feature, detection = features_of[pair], detections_of[pair]
         if feature not in met and detection not in taken:
             met.add(feature)
             taken.add(detection)
-            chosen.append(number)
+            chosen.append(pair)
     return np.array(chosen)
 
 
@@ -176,8 +165,7 @@ def _run_together(
 ) -> None:
     """Let two features share a detection that lies nearer to their middle than to either.
 
-    Images that overlap are detected as one, in the middle.  The two count as one feature that was
-    met there: half of each, with the offset of their middle.
+    Images that overlap are detected as one.  The two count as one feature in their middle.
     """
     single = shares > 0
     for i in np.flatnonzero(is_open & ~single).tolist():
@@ -199,26 +187,6 @@ def _run_together(
         single[pair[1]] = False
 
 
-def _to_grid(
-    k: int,
-    objective: MatchedObjective,
-    match: Match,
-    product: float,
-    rules: AssociationRules,
-    unlike: bool,
-    shares: Floats,
-    offsets: Floats,
-) -> None:
-    """Write how a grid of values meets the features in view of sensor k."""
-    of, m = np.flatnonzero(match.at.seen[k, 0]), int(objective.projection.dimensions[k])
-    y, weights = match.at.y[k, 0, of, :m], match.at.weights[k, 0, of]
-    sampled, variance = match.sampled[k, 0, of, : 1 + m], float(objective.variances[k, 0])
-    amplitude = product / float(match.over.norm[k, 0])
-    shares[k, of], offsets[k, of, :m] = _residuals(
-        y, weights, variance, sampled, amplitude, rules, unlike
-    )
-
-
 def _residuals(
     y: Floats,
     weights: Floats,
@@ -234,21 +202,21 @@ def _residuals(
     amplitude of its own about `amplitude`, or with that where they are not `unlike`.  What is left
     of the gradient once all are taken off is the pull on this feature alone.
     """
-    n, top = len(y), peak(variance, y.shape[1])
-    away = y[:, None] - y[None]
+    n, top, away = len(y), peak(variance, y.shape[1]), y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
-    rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
-    # features nearer than a seventh of C's deviation cannot be told apart: they are taken for alike
-    widened = bells + 0.01 * top * np.diag(weights)
-    amplitudes = amplitude + (np.linalg.solve(widened, rest) if unlike else np.zeros(n))
-    predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
-    height = amplitudes * weights * top if unlike else rest + amplitude * weights * top
+    rest, amplitudes = sampled[:, 0] - amplitude * bells.sum(axis=1), np.full(n, amplitude)
+    height = rest + amplitude * weights * top
+    if unlike:
+        # nearer than a seventh of C's deviation features cannot be told apart: they are alike
+        amplitudes += np.linalg.solve(bells + 0.01 * top * np.diag(weights), rest)
+        height = amplitudes * weights * top
     # what the better half of the features looks like by itself
     full = float(np.median(np.sort(height)[n // 2 :]))
     if full <= 0:
         return np.zeros(n), np.zeros(y.shape)
     shares = np.clip(height / full, 0.0, 1.0)
     is_met = shares > rules.min_share
+    predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(height, rules.min_share * full)[:, None]
     return np.where(is_met, shares * weights, 0.0), np.where(is_met[:, None], offsets, 0.0)
@@ -309,19 +277,13 @@ def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | fl
     return np.asarray(np.maximum(overall, inside / sides.prod(axis=-1)))
 
 
-def _by_calibration(
-    objective: MatchedObjective, T_world_object: Floats, sigmas: Floats
-) -> Floats | None:
-    """By how much features are elsewhere (L, N, 2, Q), in σ_ε, for calibrations that are off."""
-    views = objective.views
-    if not any(view.doubts for view in views):
-        return None
-    points = transform(T_world_object, objective.projection.body.nodes.points)
+def _by_calibration(views: Sequence[View], points: Floats) -> Floats | None:
+    """By how much calibrations that are off move points (N, 3) in sensors (L, N, 2, Q), σ_ε."""
     columns = []
     for k, view in enumerate(views):
         if view.doubts:
             shifts = by_calibration(view.doubts, points)
             own = np.zeros((len(views), len(points), 2, shifts.shape[2]))
-            own[k, :, : shifts.shape[1]] = shifts / sigmas[k]
+            own[k, :, : shifts.shape[1]] = shifts / view.observation.sigma
             columns.append(own)
-    return np.concatenate(columns, axis=-1)
+    return np.concatenate(columns, axis=-1) if columns else None

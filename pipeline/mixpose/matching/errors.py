@@ -51,6 +51,10 @@ class ErrorRules:
         return math.sqrt(2) * DRAWING.reach + self.met
 
 
+LEAST_VARIANCE = float(np.finfo(np.float32).eps)
+"""In σ_ε²: densities of single precision do not resolve smaller offsets."""
+
+
 class NoiseEstimate(NamedTuple):
     """What offsets show."""
 
@@ -63,7 +67,7 @@ class NoiseEstimate(NamedTuple):
 def errors_seen(
     matches: Matches, free: int, known: Floats, rules: ErrorRules = ErrorRules()
 ) -> NoiseEstimate:
-    """How large the errors are, of matches at a pose fitted to them in so many free directions.
+    """How large errors are, of matches at a pose fitted to them in so many free directions.
 
     `known` (2, L) has the squares and degrees of freedom of each sensor's noise so far.
     """
@@ -133,14 +137,14 @@ def log_likelihood(
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
-    """Variances (L,), each drawn to that of all sensors together, in σ_ε².
+    """Variances (L,) of squares and degrees of freedom (2, L), each drawn to that of all sensors.
 
-    Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
-    that of all sensors, in degrees of freedom.
+    In that the typical variance counts as `typical` degrees of freedom.
     """
     squares, degrees = sums
     total_squares, total_degrees = sums.sum(axis=1).tolist()
     most = total_degrees + typical
     common = (total_squares + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, 1e-12))
+    variances = (squares + pull * common) / np.maximum(degrees + pull, 1e-12)
+    return np.asarray(np.maximum(variances, LEAST_VARIANCE))

@@ -67,7 +67,11 @@ class Matches:
         for name in _BY_POSE:
             parts = [getattr(one, name) for one in poses]
             if parts[0] is not None:
-                stacks[name] = np.array([_filled(part, most, name) for part in parts])
+                sensors, *rest = parts[0].shape
+                shape = (len(poses), sensors, most, *rest[1:]) if rest else (len(poses), sensors)
+                stacks[name] = np.full(shape, -1 if name == "detections" else 0, parts[0].dtype)
+                for stack, part in zip(stacks[name], parts):
+                    stack[tuple(map(slice, part.shape))] = part
         return replace(poses[0], **stacks)
 
     @cached_property
@@ -126,11 +130,3 @@ class Matches:
 
 _BY_SENSOR = ("names", "dimensions", "sigmas")
 _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SENSOR])
-
-
-def _filled(array: Any, count: int, name: str) -> Any:
-    """An array (L, N, ...) with `count` features; one (L,) as it is."""
-    if array.ndim == 1 or array.shape[1] == count:
-        return array
-    width = [(0, 0), (0, count - array.shape[1])] + [(0, 0)] * (array.ndim - 2)
-    return np.pad(array, width, constant_values=-1 if name == "detections" else 0)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose
-from mixpose.matching import Matches
+from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start
 
 OUT_OF_STEP = "out of step or bumped"
@@ -45,6 +45,6 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
             continue
         variance = float(squares.sum() - squares[k]) / rest
         limit = max(rules.disagreeing, float(fdtri(own, rest, model.by_chance)))
-        apart[k] = squares[k] / own > limit * max(variance, model.smallest**2)
+        apart[k] = squares[k] / own > limit * max(variance, LEAST_VARIANCE)
     names = [seen.names[k] for k in np.flatnonzero(apart)]
     return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
