@@ -245,7 +245,7 @@ _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-noise-never-learnt",
         "tracking/association_likelihood.py",
-        "return max(1.0, float(np.sqrt(stated.variance)))",
+        "return max(1.0, float(np.sqrt(squares / degrees)))",
         "return 1.0",
         "ranges that err by more than said are believed",
         (_RANGES,),
@@ -261,7 +261,7 @@ _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-covariance-not-enlarged",
         "tracking/association_likelihood.py",
-        "covariance *= model.judgement.noise.enlargement(count, degrees)",
+        "covariance *= model.judgement.noise.enlargement(count, known)",
         "covariance *= 1.0",
         "covariances of ranges are too small at first",
         (_RANGES,),

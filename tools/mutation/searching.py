@@ -220,7 +220,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-never-in-doubt",
         "tracking/proposers/predicted.py",
-        "(checks.is_sure and _is_met_as_before(data, ranked[0]))",
+        "(is_sure(*given) and _is_met_as_before(data, ranked[0]))",
         "_is_met_as_before(data, ranked[0])",
         "where a prediction fails nothing else is tried",
         (_STARTS,),

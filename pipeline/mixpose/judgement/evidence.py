@@ -56,11 +56,6 @@ class DetectionModel:
         """Of a feature in view without a detection."""
         return math.log(1 - self.probability)
 
-    @property
-    def log_covered(self) -> float:
-        """Of a feature in view of several sensors without any: as if two had missed it."""
-        return 2 * self.log_missed
-
 
 @dataclass(frozen=True)
 class Prior:
@@ -130,8 +125,8 @@ def odds_of(
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
     gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
-    # a feature that no sensor sees is covered: cameras do not miss it one by one
-    most = detection.log_covered * found.weights.max(axis=1)
+    # a feature that no sensor sees is covered, as if two had missed it: not one by one
+    most = 2 * detection.log_missed * found.weights.max(axis=1)
     missed = np.where((shares > 0).any(axis=1), missed, np.maximum(missed, most))
     together = np.nonzero(near.sum(axis=1) > 1)
     if detection.in_space and len(together[0]):

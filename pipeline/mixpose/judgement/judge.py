@@ -42,10 +42,8 @@ class ScoredPose:
     matches: Matches  # against each sensor that saw something
     covariance: Floats  # (6, 6) zero in directions that are not estimated
     log_evidence: float  # logarithm of the odds for this pose against mere clutter
-    # of this frame and, fading, of those before it, for the next frame
-    noise: RememberedNoise = RememberedNoise()
-    # sensors that the pose was fitted without, and why
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    noise: RememberedNoise = RememberedNoise()  # of this frame and those before it, for the next
+    left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
     # (6, 6) of the covariance, what lasts from frame to frame
     persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     residual_ratio: float = 0.0  # of its residuals to the largest that chance makes

@@ -71,15 +71,13 @@ def associate(
     _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
-        of, m, amplitude = seen[k], dimensions[k], product[k] / match.over.norm[k, 0]
+        of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.over.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m] = _residuals(
-            *mixture, match.sampled[k, 0, of, : 1 + m], float(amplitude), rules, all(is_grid)
+            *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
         )
-    J = J / sigmas[:, None, None, None]
-    paired = np.nonzero(partner >= 0)
-    if len(paired[0]):
-        J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
+    paired, J = np.nonzero(partner >= 0), J / sigmas[:, None, None, None]
+    J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
@@ -127,30 +125,15 @@ def _to_nearest(
     away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
-    k, i, j = pairs
-    if not len(k):
-        return
-    features, taken = k * y.shape[1] + i, k * squared.shape[2] + j
-    chosen = _once_each(features, taken, squared[pairs])
-    at = k[chosen], i[chosen]
-    shares[at], offsets[at], by[at] = weights[at], away[(*at, j[chosen])], j[chosen]
-    if merged and len(chosen) < len(features):
+    order, taken = np.argsort(squared[pairs], kind="stable"), set[tuple[int, int]]()
+    for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
+        if by[k, i] < 0 and (k, j) not in taken:
+            taken.add((k, j))
+            shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
+    if merged and len(taken) < len(order):
         # only a feature near a detection that is taken can share it
-        for row in np.unique(k[shares[k, i] == 0]).tolist():
-            _run_together(y[row], weights[row], reach[row], is_open[row], *(a[row] for a in met))
-
-
-def _once_each(features: Indices, detections: Indices, squared: Floats) -> Indices:
-    """Pairs in which no feature and no detection occurs twice, the nearest first."""
-    chosen, met, taken = [], set[int](), set[int]()
-    features_of, detections_of = features.tolist(), detections.tolist()
-    for pair in np.argsort(squared, kind="stable").tolist():
-        feature, detection = features_of[pair], detections_of[pair]
-        if feature not in met and detection not in taken:
-            met.add(feature)
-            taken.add(detection)
-            chosen.append(pair)
-    return np.array(chosen)
+        for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
+            _run_together(y[k], weights[k], reach[k], is_open[k], *(array[k] for array in met))
 
 
 def _run_together(
@@ -169,22 +152,16 @@ def _run_together(
     """
     single = shares > 0
     for i in np.flatnonzero(is_open & ~single).tolist():
-        seen = np.flatnonzero(single)
-        if not len(seen):
-            break
-        places = y[seen] + offsets[seen]
-        near = ((places - y[i]) ** 2).sum(axis=1) <= reach[i]
-        middle = places - (y[seen] + y[i]) / 2
-        closer = (middle**2).sum(axis=1) - (offsets[seen] ** 2).sum(axis=1)
+        places = y + offsets
+        near = single & (((places - y[i]) ** 2).sum(axis=1) <= reach[i])
+        middle = places - (y + y[i]) / 2
+        closer = (middle**2).sum(axis=1) - (offsets**2).sum(axis=1)
         k = int(np.argmin(np.where(near, closer, np.inf)))
-        if not near[k] or closer[k] >= 0:
-            continue
-        pair = [i, int(seen[k])]
-        shares[pair] = weights[pair] / 2
-        offsets[pair] = middle[k]
-        partner[pair] = pair[::-1]
-        detections[pair] = detections[pair[1]]
-        single[pair[1]] = False
+        if near[k] and closer[k] < 0:
+            pair = [i, k]
+            shares[pair], offsets[pair] = weights[pair] / 2, middle[k]
+            partner[pair], detections[pair] = pair[::-1], detections[k]
+            single[k] = False
 
 
 def _residuals(
