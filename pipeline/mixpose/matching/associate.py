@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING, peak
@@ -50,10 +52,7 @@ class AssociationRules:
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what a pose (4, 4) predicts with what every sensor observed at σ_ε.
-
-    `narrowest` is the narrowest blur of interest, σ_ε.
-    """
+    """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
     match, views = objective.match(T_world_object[None]), objective.views
     at, dimensions, body = match.at, objective.projection.dimensions, objective.projection.body
     y, seen, weights, J = at.y[:, 0], at.seen[:, 0], at.weights[:, 0], at.J[:, 0]
@@ -96,7 +95,7 @@ def associate(
         crowd=crowd,
         unmatched_nearby=unmatched,
         finest=np.minimum(np.maximum(narrowest, finest), 1.0),
-        by_calibration=_by_calibration(views, transform(T_world_object, body.nodes.points)),
+        by_calibration=_by_calibration(objective, T_world_object),
     )
 
 
@@ -133,7 +132,7 @@ def _to_nearest(
     if merged and len(taken) < len(order):
         # only a feature near a detection that is taken can share it
         for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
-            _run_together(y[k], weights[k], reach[k], is_open[k], *(array[k] for array in met))
+            _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
 
 
 def _run_together(
@@ -141,15 +140,13 @@ def _run_together(
     weights: Floats,
     reach: Floats,
     is_open: Mask,
-    shares: Floats,
-    offsets: Floats,
-    detections: Indices,
-    partner: Indices,
+    met: Sequence[NDArray[Any]],
 ) -> None:
     """Let two features share a detection that lies nearer to their middle than to either.
 
     Images that overlap are detected as one.  The two count as one feature in their middle.
     """
+    shares, offsets, detections, partner = met
     single = shares > 0
     for i in np.flatnonzero(is_open & ~single).tolist():
         places = y + offsets
@@ -207,9 +204,9 @@ def _surroundings(
     detections: Floats,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Of L sensors, the number of detections and how dense, of no feature, and the finest blur.
+    """Number of detections of L sensors, their density, those of no feature, and the finest blur.
 
-    The last two are those of the box of the features in view at places y (L, n, 2).
+    All but the first go by the box of the features in view at places y (L, n, 2).
     """
     observations = [view.observation for view in objective.views]
     sigmas = np.array([one.sigma for one in observations])
@@ -254,11 +251,12 @@ def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | fl
     return np.asarray(np.maximum(overall, inside / sides.prod(axis=-1)))
 
 
-def _by_calibration(views: Sequence[View], points: Floats) -> Floats | None:
-    """By how much calibrations that are off move points (N, 3) in sensors (L, N, 2, Q), σ_ε."""
-    columns = []
+def _by_calibration(objective: MatchedObjective, T_world_object: Floats) -> Floats | None:
+    """By how much calibrations that are off move features (L, N, 2, Q), σ_ε."""
+    columns, views = [], objective.views
     for k, view in enumerate(views):
         if view.doubts:
+            points = transform(T_world_object, objective.projection.body.nodes.points)
             shifts = by_calibration(view.doubts, points)
             own = np.zeros((len(views), len(points), 2, shifts.shape[2]))
             own[k, :, : shifts.shape[1]] = shifts / view.observation.sigma

@@ -42,8 +42,8 @@ class Matches:
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
 
-    def at(self, index: int | list[int]) -> Matches:
-        """At one of K poses."""
+    def at(self, index: int | list[int] | None) -> Matches:
+        """At one of K poses; None makes K = 1 of one."""
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _BY_POSE}
         for name, array in arrays.items():
             arrays[name] = None if array is None else array[index]
@@ -62,6 +62,8 @@ class Matches:
     @classmethod
     def stacked(cls, poses: Sequence[Matches]) -> Matches:
         """K poses of the same sensors, of bodies of their own; fewer features are filled up."""
+        if len(poses) == 1:
+            return poses[0].at(None)
         most = max(one.weights.shape[1] for one in poses)
         stacks: dict[str, Any] = {}
         for name in _BY_POSE:
