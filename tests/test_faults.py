@@ -13,7 +13,6 @@ from matches import Seen, scored
 
 from mixpose.cli.findings import Stretches
 from mixpose.judgement import AcceptanceRules, NoiseModel, contradict
-from mixpose.matching import Noise
 from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -23,7 +22,9 @@ from faults import FAULTS, Fault, outcome, rewritten
 from mixpose.records import Floats
 
 RULES, MODEL = AcceptanceRules(), NoiseModel()
-QUIET = Noise(squares=0.01, degrees=100.0)  # offsets of 0.01 σ: far below what is put in below
+QUIET = np.array(
+    [0.01, 100.0]
+)  # squares and degrees of freedom: offsets of 0.01 σ: far below what is put in below
 
 
 @pytest.mark.parametrize(
@@ -139,7 +140,7 @@ def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> 
     return Seen(J, name, offsets, met, count=count, unmatched_nearby=unmatched)
 
 
-def is_contradiction(sensors: Sequence[Seen], before: Noise = QUIET, agreed: bool = True) -> bool:
+def is_contradiction(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
     return contradict(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
 
 
@@ -178,9 +179,9 @@ def test_of_three_sensors_the_majority_tells(jacobians: Floats) -> None:
 def test_a_sensor_that_never_met_the_body_but_sees_as_much_contradicts(jacobians: Floats) -> None:
     one, _ = seen(jacobians, [0.0, 0.0])
     blind = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
-    assert is_contradiction([one, blind], Noise(), False)
+    assert is_contradiction([one, blind], np.zeros(2), False)
     empty = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 1.0)
-    assert not is_contradiction([one, empty], Noise(), False)
+    assert not is_contradiction([one, empty], np.zeros(2), False)
     # once they agreed, what is seen elsewhere may be anything
     assert not is_contradiction([one, empty])
 

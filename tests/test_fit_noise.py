@@ -10,7 +10,7 @@ from detections import ALL_FREE, EIGHT, TRUTH, detect, view_of
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions, FitRules, fit_near, near
-from mixpose.judgement.expected_covariance import expected_covariance
+from mixpose.judgement import expected_covariance
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, errors_seen
 from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.optimise import Ascent, ascend

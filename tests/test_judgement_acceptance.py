@@ -14,8 +14,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.judgement import (
     AcceptanceRules,
     ScoredPose,
-    assess,
     beliefs,
+    convinces,
     decide,
     insert,
     nearest_alike,
@@ -153,13 +153,13 @@ def test_a_prediction_that_meets_too_little_of_the_body_does_not_convince() -> N
     # a grid of 7 by 5 that slipped by a step meets 28 of 35 in one direction, 30 in the other; a
     # body of 8 with more than two missed may have slipped
     for met, expected in ((5.9, False), (6.1, True)):
-        assert assess(matched_to(sensor("0", met)), ALL_FREE, RULES).convinces is expected
+        assert convinces(matched_to(sensor("0", met)), ALL_FREE, RULES) is expected
 
 
 def test_a_covered_camera_does_not_take_away_what_two_others_agree_on() -> None:
     judged = matched_to(sensor("0", 8.0), sensor("1", 7.0), sensor("2", 1.0))
     assert judged.coverage == pytest.approx(16 / 24)
-    assert assess(judged, ALL_FREE, RULES).convinces
+    assert convinces(judged, ALL_FREE, RULES)
 
 
 def test_features_that_face_a_camera_out_of_its_view_are_not_covered() -> None:

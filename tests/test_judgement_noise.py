@@ -11,8 +11,7 @@ from matches import Seen, matches_of
 from numpy.typing import NDArray
 
 from mixpose.judgement import NoiseModel, RememberedNoise
-from mixpose.judgement.noise import FrameNoise, noises_of
-from mixpose.matching import Matches, Noise
+from mixpose.judgement.noise import noise_of
 
 Floats = NDArray[np.float64]
 
@@ -22,14 +21,14 @@ ALONE = replace(MODEL, confidence=0.0, lasting=0.0)
 """Nothing is enlarged, and nothing believed to last before it is seen."""
 
 
-def noise_of(
+def judged(
     sensors: Sequence[Seen],
-    free: NDArray[np.bool_],
-    before: RememberedNoise,
-    model: NoiseModel,
-) -> FrameNoise:
-    """The noise of one frame."""
-    return noises_of(Matches.stacked([matches_of(*sensors)]), free, [before], model)[0]
+    before: RememberedNoise = RememberedNoise(),
+    model: NoiseModel = MODEL,
+) -> tuple[Floats, RememberedNoise]:
+    """The covariance of one frame, and what is remembered."""
+    _, covariance, _, remembered, _ = noise_of(matches_of(*sensors), FREE, before, model)
+    return covariance, remembered
 
 
 def sensor(name: str, rng: np.random.Generator, offsets: Floats) -> Seen:
@@ -44,9 +43,9 @@ def known(squares: float, degrees: float) -> RememberedNoise:
     return RememberedNoise(("0",), np.array([[squares], [degrees]]))
 
 
-def of_first(noise: FrameNoise) -> Noise:
-    """What is remembered of the sensor "0"."""
-    return Noise(*noise.remembered.of(["0"])[:, 0].tolist())
+def of_first(remembered: RememberedNoise) -> list[float]:
+    """Squares and degrees of freedom that are remembered of the sensor "0"."""
+    return [float(one) for one in remembered.of(["0"])[:, 0]]
 
 
 def fitted(found: list[Seen], errors: list[Floats]) -> tuple[list[Seen], Floats]:
@@ -68,54 +67,52 @@ def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:
 
 def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:
     one = sensor("0", np.random.default_rng(0), np.full((6, 2), 0.1))  # 0.05 σ along each axis
-    noise = of_first(noise_of([one], FREE, RememberedNoise(), MODEL))
+    squares, degrees = of_first(judged([one])[1])
     # twelve coordinates, six are used up; equal offsets weigh a little more than normal ones
-    assert noise.squares == pytest.approx(12 * 0.05**2, rel=0.1)
-    assert noise.degrees == pytest.approx(6.0, rel=0.05)
+    assert squares == pytest.approx(12 * 0.05**2, rel=0.1)
+    assert degrees == pytest.approx(6.0, rel=0.05)
     three = replace(one, shares=np.array([1.0, 1, 1, 0, 0, 0]))
-    assert of_first(noise_of([three], FREE, RememberedNoise(), MODEL)) == Noise(0.0, 0.0)
+    assert of_first(judged([three])[1]) == [0.0, 0.0]
 
 
 def test_where_no_residuals_say_otherwise_detections_err_by_a_fifth_of_sigma() -> None:
     three = sensor("0", np.random.default_rng(0), np.zeros((3, 2)))
-    covariance = noise_of([three], FREE, RememberedNoise(), ALONE).covariance
+    covariance, _ = judged([three], model=ALONE)
     J = three.J.reshape(-1, 6) / 2.0
     np.testing.assert_allclose(covariance, 0.04 * np.linalg.inv(J.T @ J), rtol=1e-6)
 
 
 def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:
     one = sensor("0", np.random.default_rng(0), np.full((8, 2), 0.2))
-    alone = of_first(noise_of([one], FREE, RememberedNoise(), MODEL))
-    joined = of_first(noise_of([one], FREE, known(40 * 0.01, 40.0), MODEL))
+    alone = of_first(judged([one])[1])
+    joined = of_first(judged([one], known(40 * 0.01, 40.0))[1])
     # the blur at which offsets are weighted is another with what is remembered
-    assert joined.squares == pytest.approx(0.95 * 0.4 + alone.squares, rel=0.02)
-    assert joined.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
+    assert joined[0] == pytest.approx(0.95 * 0.4 + alone[0], rel=0.02)
+    assert joined[1] == pytest.approx(0.95 * 40.0 + alone[1], rel=0.02)
 
 
 def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
     rng = np.random.default_rng(1)
     one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))  # 0.1 σ; ten degrees of freedom
     before = known(40 * 0.02**2, 40.0)
-    found = noise_of([one], FREE, before, ALONE)
-    own = noise_of([one], FREE, RememberedNoise(), ALONE)
-    np.testing.assert_allclose(found.covariance, own.covariance)
+    covariance, found = judged([one], before, ALONE)
+    covariance_alone, own = judged([one], model=ALONE)
+    np.testing.assert_allclose(covariance, covariance_alone)
     # remembered as the largest that chance makes: F of 10 and 40 degrees is 3.87 at 99.9 %
     kept, alone = of_first(found), of_first(own)
-    assert kept.degrees == pytest.approx(0.95 * 40.0 + alone.degrees, rel=0.02)
-    limit = 3.87 * 0.02**2 * alone.degrees
-    assert kept.squares == pytest.approx(0.95 * 40 * 0.02**2 + limit, rel=0.02)
+    assert kept[1] == pytest.approx(0.95 * 40.0 + alone[1], rel=0.02)
+    limit = 3.87 * 0.02**2 * alone[1]
+    assert kept[0] == pytest.approx(0.95 * 40 * 0.02**2 + limit, rel=0.02)
 
 
 def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:
     rng = np.random.default_rng(2)
     offsets = rng.normal(0, 0.1, (12, 2))
-    whole = noise_of(
-        [sensor("0", np.random.default_rng(3), offsets)], FREE, RememberedNoise(), ALONE
-    )
+    whole, _ = judged([sensor("0", np.random.default_rng(3), offsets)], model=ALONE)
     offsets[4] = [1.5, -1.0]
-    cut = noise_of([sensor("0", np.random.default_rng(3), offsets)], FREE, RememberedNoise(), ALONE)
+    cut, _ = judged([sensor("0", np.random.default_rng(3), offsets)], model=ALONE)
     # one of twelve tells nothing: the other eleven fix the pose, two degrees of freedom fewer
-    ratio = np.diag(cut.covariance) / np.diag(whole.covariance)
+    ratio = np.diag(cut) / np.diag(whole)
     assert ratio.max() < 2.5
 
 
@@ -131,9 +128,8 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
             found.append(replace(one, J=shift + 0.3 * one.J))
         made = [rng.normal(0, 0.3, 2) + rng.normal(0, 0.1, (12, 2)) for _ in found]
         left, off = fitted(found, made)
-        noise = noise_of(left, FREE, residuals, ALONE)
-        residuals = noise.remembered
-        errors.append(off @ np.linalg.solve(noise.covariance, off) / 6)
+        covariance, residuals = judged(left, residuals, ALONE)
+        errors.append(off @ np.linalg.solve(covariance, off) / 6)
         J = np.concatenate([one.J.reshape(-1, 6) for one in left])
         r = np.concatenate([np.ravel(one.offsets) for one in left])
         plain.append(off @ (J.T @ J) @ off / (r @ r / (len(r) - 6)) / 6)
@@ -157,9 +153,8 @@ def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> N
                 sensors.append(replace(one, J=shift + 0.3 * one.J))
             noise = [made[one.name] + rng.normal(0, 0.1, (12, 2)) for one in sensors]
             left, off = fitted(sensors, noise)
-            known = noise_of(left, FREE, residuals, model)
-            residuals = known.remembered
-            found.append(float(off @ np.linalg.solve(known.covariance, off) / 6))
+            covariance, residuals = judged(left, residuals, model)
+            found.append(float(off @ np.linalg.solve(covariance, off) / 6))
     # one degree of freedom in six is as large as it is; the others are noise
     assert np.mean(errors[ALONE][20:]) < 2.0
     assert np.mean(errors[blind][20:]) > 2 * np.mean(errors[ALONE][20:])
@@ -169,8 +164,8 @@ def test_sensors_that_were_seen_together_before_are_remembered_apart() -> None:
     rng, residuals = np.random.default_rng(4), RememberedNoise()
     for names in ("01", "0", "01", "1", "01"):
         found = [sensor(name, rng, rng.normal(0, 0.1, (8, 2))) for name in names]
-        residuals = noise_of(found, FREE, residuals, MODEL).remembered
-    kept = {one.names: len(one.vector) for one in residuals.biases}
+        _, residuals = judged(found, residuals)
+    kept = {names: len(sums) for names, sums in residuals.biases.items()}
     # an offset and a slant of each: 2 + 4 sizes
     assert kept == {("0", "1"): 12, ("0",): 6, ("1",): 6}
 
@@ -185,9 +180,8 @@ def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
             (one.J[..., :3] @ off[..., None])[..., 0] + rng.normal(0, 0.1, (12, 2)) for one in found
         ]
         left, error = fitted(found, made)
-        noise = noise_of(left, FREE, residuals, ALONE)
-        residuals = noise.remembered
-        errors.append(error @ np.linalg.solve(noise.covariance, error) / 6)
+        covariance, residuals = judged(left, residuals, ALONE)
+        errors.append(error @ np.linalg.solve(covariance, error) / 6)
         J = np.concatenate([one.J.reshape(-1, 6) for one in left])
         r = np.concatenate([np.ravel(one.offsets) for one in left])
         plain.append(error @ (J.T @ J) @ error / (r @ r / (len(r) - 6)) / 6)

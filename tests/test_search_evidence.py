@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import Case, DetectionModel, JudgementRules, NoiseModel, Prior, judge
+from mixpose.judgement import DetectionModel, JudgementRules, NoiseModel, Prior, judge
 from mixpose.matching import AssociationRules, ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
@@ -65,7 +65,7 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
         found, _ = evidence(problem(views), poses)
         objective = matched_objective(views, EIGHT, [1.5] * len(views))
         for pose, log_odds in zip(poses, found, strict=True):
-            judged = judge(Case(objective, pose, prior=never), ALL_FREE)
+            judged = judge(objective, pose, ALL_FREE, prior=never)
             # either draws the noise of a sensor to another mean: a nat at most
             assert log_odds == pytest.approx(judged.log_evidence, abs=1.0)
 

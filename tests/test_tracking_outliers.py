@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, fit_near
-from mixpose.judgement import Case, ScoredPose, judge
+from mixpose.judgement import ScoredPose, judge
 from mixpose.matching import ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.records import Estimate, PointPattern
@@ -49,7 +49,7 @@ def view_of(points: Floats) -> View:
 
 def judged_at(T_world_object: Floats, views: list[View]) -> ScoredPose:
     objective = matched_objective(views, BODY, [SIGMA] * len(views))
-    return judge(Case(objective, T_world_object), np.ones(6, dtype=np.bool_))
+    return judge(objective, T_world_object, np.ones(6, dtype=np.bool_))
 
 
 def estimated(points: Floats, T_start: Floats) -> Estimate:

@@ -13,7 +13,6 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import DetectionModel, JudgementRules, NoiseModel
-from mixpose.matching import Noise
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
@@ -128,8 +127,8 @@ def test_the_odds_of_one_tag_in_false_ranges_are_those_of_the_formula() -> None:
 
 def test_ranges_err_by_more_than_said_where_residuals_say_so() -> None:
     # twenty degrees of freedom at 1 and twenty at 4
-    assert noise_ratio(Noise(80.0, 20.0), RangeRules()) == pytest.approx(np.sqrt(2.5))
-    assert noise_ratio(Noise(1.0, 20.0), RangeRules()) == 1.0
+    assert noise_ratio(np.array([80.0, 20.0]), RangeRules()) == pytest.approx(np.sqrt(2.5))
+    assert noise_ratio(np.array([1.0, 20.0]), RangeRules()) == 1.0
 
 
 def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:

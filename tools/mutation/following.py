@@ -245,7 +245,7 @@ _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-noise-never-learnt",
         "tracking/associations.py",
-        "return max(1.0, float(np.sqrt(stated.variance)))",
+        "return max(1.0, float(np.sqrt(squares / degrees)))",
         "return 1.0",
         "ranges that err by more than said are believed",
         (_RANGES,),

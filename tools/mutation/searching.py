@@ -220,8 +220,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-never-in-doubt",
         "tracking/proposers.py",
-        "if checks.convinces or not checks.is_sure:",
-        "if checks.convinces:",
+        "if convinces(*given) or not is_sure(*given):",
+        "if convinces(*given):",
         "where a prediction fails nothing else is tried",
         (_STARTS,),
     ),

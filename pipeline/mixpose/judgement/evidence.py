@@ -17,7 +17,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,7 @@ from scipy.special import gammaln
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.matching import Matches
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,7 @@ class DetectionModel:
         -5.0, "at least, for all features that one sensor misses: in 1 of 150 it sees none"
     )
     by_count: bool = constant(
-        True,
-        "whether a pose may pay for its freedom by the features that fix it: cheaper than by "
-        "volume where priors are wide",
+        True, "whether features that fix a pose may pay for its freedom: cheaper by wide priors"
     )
     in_space: bool = constant(
         True, "whether clutter may be a point in space that all cameras see: then it counts once"
@@ -59,11 +56,6 @@ class DetectionModel:
         """Of a feature in view without a detection."""
         return math.log(1 - self.probability)
 
-    @property
-    def log_covered(self) -> float:
-        """Of a feature in view of several sensors without any: as if two had missed it."""
-        return 2 * self.log_missed
-
 
 @dataclass(frozen=True)
 class Prior:
@@ -73,16 +65,8 @@ class Prior:
     spread: Floats  # (6,) how uncertain it is; matters where the data leave a direction open
 
 
-class Odds(NamedTuple):
-    """Evidence of K poses before they pay for having been chosen, each (K,)."""
-
-    gained: Floats  # of the features that are met
-    missed: Floats  # of those that are not, and of those out of view; negative
-    coordinates: Floats  # number of them that tell anything: three for a point in space
-
-
-def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -> Prior:
-    """Nothing is known: anywhere within ten radii of the body, turned in any way."""
+def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
+    """Nothing is known: anywhere within some radii of the body, turned in any way."""
     room = detection.room * body.radius
     turns = int(free[3:].sum())
     rotations = 8 * np.pi**2 if turns == 3 else (2 * np.pi) ** turns
@@ -93,25 +77,24 @@ def flat_prior(body: Body, free: NDArray[np.bool_], detection: DetectionModel) -
 def log_evidence(
     found: Matches,
     variances: Floats,
-    free: NDArray[np.bool_],
+    free: Mask,
     priors: Sequence[Prior],
     sizes: Floats,
     detection: DetectionModel,
     information: Floats,
     spreads: Floats | None = None,
 ) -> Floats:
-    """Logarithm of the odds (K,) for bodies at K poses against mere clutter.
+    """Logarithm of the odds (K,) for bodies at K poses of an information (K, 6, 6) against clutter.
 
-    Of poses with an information (K, 6, 6) that are free in directions (6,), each with a prior; all
-    else as `odds_of` has it.
+    All else as `odds_of` has it.
     """
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     wide = np.array([prior.spread for prior in priors])[:, free]
     inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
-    laplace = 0.5 * (wide.shape[1] * math.log(2 * math.pi) - _log_det(inner))
+    laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
     log_densities = np.array([prior.log_density for prior in priors])
-    evidence = odds.gained + odds.missed + laplace + log_densities
+    evidence = odds[0] + odds[1] + laplace + log_densities
     if detection.by_count:
         evidence = np.maximum(evidence, paid_by_count(odds, found, free))
     return np.where(found.shares.any(axis=(1, 2)), evidence, -np.inf)
@@ -119,43 +102,31 @@ def log_evidence(
 
 def odds_of(
     found: Matches,
-    variances: Floats,
-    sizes: Floats,
+    variances: Floats,  # (K, L) of the noise of each sensor, in σ_ε²
+    sizes: Floats,  # (K,) of the body, length units
     detection: DetectionModel,
-    spreads: Floats | None = None,
-) -> Odds:
-    """Odds of K poses against clutter, as if they had not been chosen to fit.
+    spreads: Floats | None = None,  # (K, N, 3, 3) of features in the world, where a body gives way
+) -> tuple[Floats, Floats, Floats]:
+    """What features met gain (K,) against clutter, others lose, and coordinates that tell anything.
 
-    Parameters
-    ----------
-    found : Matches
-    variances : (K, L) array
-        Of the noise of each sensor, in σ_ε².
-    sizes : (K,) array
-        Of the body, length units.
-    detection : DetectionModel
-    spreads : (K, N, 3, 3) array or None
-        Covariances of features in the world, of a body that gives way; None: it does not.
+    Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
     """
     roots, m = np.sqrt(variances), found.dimensions
     crowd = found.crowd * roots**m
     rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
-    costs = _costs(found, roots, spreads)
-    gained = found.shares * np.maximum(rarity[..., None] - costs, 0.0)
+    gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
     is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
-    shares = found.shares
-    if is_blind.any():
-        even = found.weights / np.maximum(found.expected, 1.0)[..., None]
-        missed = np.where(is_blind, even * detection.log_blind, missed)
-        gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, shares)
+    even = found.weights / np.maximum(found.expected, 1.0)[..., None]
+    missed = np.where(is_blind, even * detection.log_blind, missed)
+    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
     missed = missed.sum(axis=1)
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
     gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
-    # a feature that no sensor sees is covered: cameras do not miss it one by one
-    most = detection.log_covered * found.weights.max(axis=1)
+    # a feature that no sensor sees is covered, as if two had missed it: not one by one
+    most = 2 * detection.log_missed * found.weights.max(axis=1)
     missed = np.where((shares > 0).any(axis=1), missed, np.maximum(missed, most))
     together = np.nonzero(near.sum(axis=1) > 1)
     if detection.in_space and len(together[0]):
@@ -166,17 +137,16 @@ def odds_of(
         most = 3 * share[likelier]
         coordinates[pose, feature] = np.minimum(coordinates[pose, feature], most)
     unseen = found.unseen.sum(axis=1) * detection.log_unseen
-    return Odds(gained.sum(axis=1), missed.sum(axis=1) + unseen, coordinates.sum(axis=1))
+    return gained.sum(axis=1), missed.sum(axis=1) + unseen, coordinates.sum(axis=1)
 
 
 def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
     """What offsets (K, L, N) cost: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
     if spreads is None:
         return np.asarray(found.squared / (2 * roots**2)[..., None])
-    offsets = found.offsets / roots[..., None, None]
+    r = (found.offsets / roots[..., None, None])[..., None]
     by_world = found.J[..., :3] / roots[..., None, None, None]
-    S = np.eye(offsets.shape[3]) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
-    r = offsets[..., None]
+    S = np.eye(2) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
     away = (r * np.linalg.solve(S, r)).sum(axis=(3, 4))
     return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
 
@@ -185,7 +155,7 @@ def _in_space(
     found: Matches,
     roots: Floats,
     crowd: Floats,
-    near: NDArray[np.bool_],
+    near: Mask,
     chosen: tuple[NDArray[np.intp], ...],
     sizes: Floats,
     spreads: Floats | None,
@@ -215,28 +185,14 @@ def _in_space(
     return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
 
 
-def paid_by_count(odds: Odds, found: Matches, free: NDArray[np.bool_]) -> Floats:
-    """Evidence (K,) of poses that pay for their freedom by the features that fix them."""
-    spare = 1.0 - int(free.sum()) / np.maximum(odds.coordinates, 1.0)
-    return np.asarray(
-        odds.gained * np.maximum(spare, 0.0) + odds.missed - _log_choices(found, free)
-    )
-
-
-def _log_choices(found: Matches, free: NDArray[np.bool_]) -> Floats:
-    """Logarithm (K,) of the number of ways to fix a pose by observed features."""
-    expected = found.weights.sum(axis=2)
-    pins = -(-int(free.sum()) // int(found.dimensions.max()))
+def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mask) -> Floats:
+    """Evidence (K,) of poses that pay by count: by the ways to fix them by what was observed."""
+    gained, missed, coordinates = odds
+    expected, count = found.weights.sum(axis=2), int(free.sum())
+    pins = -(-count // int(found.dimensions.max()))
     observed = np.maximum((found.count * (expected > 0)).sum(axis=1), pins)
     features = np.maximum(expected.max(axis=1), pins)
     ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
     assigned = gammaln(features + 1) - gammaln(features - pins + 1)
-    return np.asarray(ways + assigned + math.log(2))
-
-
-def _log_det(A: Floats) -> Floats:
-    """Logarithms of the determinants of positive definite matrices, however ill conditioned."""
-    scale = np.sqrt(A.diagonal(axis1=1, axis2=2))
-    values = np.linalg.eigvalsh(A / scale[:, :, None] / scale[:, None])
-    logs = np.log(np.maximum(values, 1e-12)).sum(axis=1) + 2 * np.log(scale).sum(axis=1)
-    return np.asarray(logs)
+    spare = np.maximum(1.0 - count / np.maximum(coordinates, 1.0), 0.0)
+    return np.asarray(gained * spare + missed - (ways + assigned + math.log(2)))

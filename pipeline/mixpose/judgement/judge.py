@@ -6,18 +6,23 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.body import Body
+from mixpose.judgement.covariance import information_of, inverses
 from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
-from mixpose.judgement.moments import inverses
-from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, noises_of
+from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
 from mixpose.records import Floats, SensorReport
+
+# objective, pose (4, 4), noise before, prior, and matches and noise where the fit has them
+Case: TypeAlias = tuple[
+    MatchedObjective, Floats, RememberedNoise, Prior | None, Matches | None, NoiseEstimate | None
+]
 
 
 @dataclass(frozen=True)
@@ -31,49 +36,22 @@ class JudgementRules:
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """A pose, and how well it explains the frame.
+    """A pose, and how well it explains the frame."""
 
-    Attributes
-    ----------
-    T_world_object : (4, 4)
-    matches : Matches
-        Against each sensor that saw something.
-    covariance : (6, 6)
-        Zero in directions that are not estimated.
-    log_evidence : float
-        Logarithm of the odds for this pose against mere clutter.
-    noise : RememberedNoise
-        Of this frame and, fading, of those before it, for the next frame.
-    left_out : mapping of str to str
-        Sensors that the pose was fitted without, and why.
-    persistent : (6, 6)
-        Of the covariance, what lasts from frame to frame.
-    residual_ratio : float
-        Of its residuals to the largest that chance makes.
-    bent : (6, 6)
-        Covariance where features are off by all that the spreads of a body that gives way allow.
-    spread : (6,) or None
-        Standard deviations where they are as large as the body's motion.
-    proposer : str
-        Where the pose came from.
-    blurs : tuple of mapping of str to float
-        By sensor, through which it was fitted.
-    """
-
-    T_world_object: Floats
-    matches: Matches
-    covariance: Floats
-    log_evidence: float
-    noise: RememberedNoise = RememberedNoise()
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    T_world_object: Floats  # (4, 4)
+    matches: Matches  # against each sensor that saw something
+    covariance: Floats  # (6, 6) zero in directions that are not estimated
+    log_evidence: float  # logarithm of the odds for this pose against mere clutter
+    noise: RememberedNoise = RememberedNoise()  # of this frame and those before it, for the next
+    left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
+    # (6, 6) of the covariance, what lasts from frame to frame
     persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    residual_ratio: float = 0.0
+    residual_ratio: float = 0.0  # of its residuals to the largest that chance makes
+    # (6, 6) where features are off by all that the spreads of a body that gives way allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    spread: Floats | None = None
-    proposer: str = ""
-    blurs: tuple[Mapping[str, float], ...] = ()
-    # what the rules of acceptance make of it, once they are asked
-    checked: list[Any] = field(default_factory=list, init=False, repr=False)
+    spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
+    proposer: str = ""  # where the pose came from
+    blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted
 
     @cached_property
     def used(self) -> Matches:
@@ -91,6 +69,12 @@ class ScoredPose:
         return float(self.used.measurements.sum())
 
     @cached_property
+    def features(self) -> tuple[int, int]:
+        """Numbers of features that some sensor meets, and that some sensor has in view."""
+        met, in_view = self.matches.met_by, self.matches.weights.any(axis=0)
+        return int(np.count_nonzero(met)), int(np.count_nonzero(in_view))
+
+    @cached_property
     def score(self) -> float:
         """Mean cosine between predicted and observed densities, 0 to 1."""
         return float(np.sqrt(self.used.explained).mean())
@@ -103,11 +87,9 @@ class ScoredPose:
     @property
     def sensors(self) -> dict[str, SensorReport]:
         """How each sensor took part."""
-        rows = zip(self.matches.names, self.matches.explained.tolist(), self.matches.rms)
-        return {
-            name: SensorReport(name not in self.left_out, explained, rms, self.left_out.get(name))
-            for name, explained, rms in rows
-        }
+        out, rows = self.left_out, zip(self.matches.explained.tolist(), self.matches.rms)
+        by_name = zip(self.matches.names, rows)
+        return {name: SensorReport(name not in out, *row, out.get(name)) for name, row in by_name}
 
 
 def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
@@ -117,97 +99,86 @@ def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
     return matches.of_sensors([k for k, name in enumerate(matches.names) if name not in left_out])
 
 
-@dataclass(frozen=True)
-class Case:
-    """A pose that is to be judged, and what was known before."""
-
-    objective: MatchedObjective  # at σ_ε of every sensor
-    T_world_object: Floats  # (4, 4)
-    before: RememberedNoise = RememberedNoise()  # of the frames before
-    prior: Prior | None = None  # what was known of the pose; None: nothing
-    left_out: Mapping[str, str] = field(default_factory=dict)  # count as if they had met nothing
-    matches: Matches | None = None  # of the pose, where the fit has them
-    noise: NoiseEstimate | None = None  # likewise
-
-
 def judge(
-    case: Case, free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    free: NDArray[np.bool_],
+    rules: JudgementRules = JudgementRules(),
+    *,
+    before: RememberedNoise = RememberedNoise(),
+    prior: Prior | None = None,
+    left_out: Mapping[str, str] | None = None,
+    matches: Matches | None = None,
+    noise: NoiseEstimate | None = None,
 ) -> ScoredPose:
-    """Judge a pose, estimated in free directions (6,), by matched densities at the finest blur."""
-    return judge_together([case], free, rules)[0]
+    """Judge a pose (4, 4), estimated in free directions (6,), by the matched objective at σ_ε.
+
+    `before` is the noise of earlier frames, `prior` what was known of the pose; sensors left out
+    count as if they had met nothing.  `matches` and `noise` are the fit's, where it has them.
+    """
+    case = objective, T_world_object, before, prior, matches, noise
+    return judge_together([case], free, rules, left_out)[0]
 
 
 def judge_together(
-    cases: Sequence[Case], free: NDArray[np.bool_], rules: JudgementRules = JudgementRules()
+    cases: Sequence[Case],
+    free: NDArray[np.bool_],
+    rules: JudgementRules = JudgementRules(),
+    left_out: Mapping[str, str] | None = None,
 ) -> list[ScoredPose]:
-    """Judge poses that the same sensors see and take part in, at once: as `judge` does each."""
-    narrowest, left_out = rules.noise.errors.narrowest, cases[0].left_out
-    whole = [
-        one.matches or associate(one.objective, one.T_world_object, rules.association, narrowest)
-        for one in cases
-    ]
-    matches = Matches.stacked([taken_part(one, left_out) for one in whole])
-    before, estimates = [one.before for one in cases], [one.noise for one in cases]
-    noises = noises_of(matches, free, before, rules.noise, estimates)
-    variances = np.array([noise.variances for noise in noises])
-    scored, widened = matches, variances
+    """Judge K poses that the same sensors see and take part in, at once: as `judge` does each."""
+    left_out, narrowest = left_out or {}, rules.noise.errors.narrowest
+    whole, noises = [], []
+    for objective, T, before, _, matches, noise in cases:
+        whole.append(matches or associate(objective, T, rules.association, narrowest))
+        part = taken_part(whole[-1], left_out)
+        noises.append(noise_of(part, free, before, rules.noise, noise))
+    used = np.array([name not in left_out for name in whole[0].names])
+    variances, seen = np.ones((len(whole), len(used))), Matches.stacked(whole)
+    variances[:, used] = [noise[0] for noise in noises]
     if left_out:
-        scored, widened = _unmet(whole, variances, left_out)
-    evidence, bent = _evidence(cases, scored, widened, free, rules.detection)
+        seen = replace(seen, shares=seen.shares * used[:, None])
+    evidence, bent = _evidence(cases, seen, variances, free, rules.detection)
     return [
         ScoredPose(
-            T_world_object=case.T_world_object,
-            matches=own,
-            covariance=noise.covariance,
-            log_evidence=log_odds,
-            noise=noise.remembered,
+            T_world_object=cases[k][1],
+            matches=whole[k],
+            covariance=covariance,
+            log_evidence=float(evidence[k]),
+            noise=remembered,
             left_out=left_out,
-            persistent=noise.persistent,
-            residual_ratio=noise.residual_ratio,
-            bent=apart,
+            persistent=persistent,
+            residual_ratio=ratio,
+            bent=bent[k],
         )
-        for case, own, noise, log_odds, apart in zip(
-            cases, whole, noises, evidence.tolist(), bent, strict=True
-        )
+        for k, (_, covariance, persistent, remembered, ratio) in enumerate(noises)
     ]
-
-
-def _unmet(
-    whole: Sequence[Matches], variances: Floats, left_out: Mapping[str, str]
-) -> tuple[Matches, Floats]:
-    """All sensors with noise (K, L), those left out as if they had met nothing."""
-    stacked = Matches.stacked(whole)
-    used = np.array([name not in left_out for name in stacked.names])
-    all_of_them = np.ones((len(whole), len(used)))
-    all_of_them[:, used] = variances
-    return replace(stacked, shares=stacked.shares * used[:, None]), all_of_them
 
 
 def _evidence(
     cases: Sequence[Case],
-    whole: Matches,
+    seen: Matches,
     variances: Floats,
     free: NDArray[np.bool_],
     detection: DetectionModel,
 ) -> tuple[Floats, Floats]:
     """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
-    bodies = [one.objective.projection.body for one in cases]
+    bodies = [case[0].projection.body for case in cases]
     priors = [
-        one.prior or flat_prior(body, free, detection)
-        for one, body in zip(cases, bodies, strict=True)
+        case[3] or flat_prior(body, free, detection)
+        for case, body in zip(cases, bodies, strict=True)
     ]
     sizes = np.array([2 * body.radius for body in bodies])
-    given = whole, variances, free, priors, sizes, detection
-    evidence = log_evidence(*given, information_of(whole, variances))
+    given = seen, variances, free, priors, sizes, detection
+    evidence = log_evidence(*given, information_of(seen, variances))
     bent = np.zeros((len(cases), 6, 6))
     if any(body.spread for body in bodies):
-        spreads = np.zeros((len(cases), whole.shares.shape[2], 3, 3))
+        spreads = np.zeros((len(cases), seen.shares.shape[2], 3, 3))
         for own, body, case in zip(spreads, bodies, cases, strict=True):
-            turned = body.node_spreads(case.T_world_object)
+            turned = body.node_spreads(case[1])
             own[: len(turned)] = turned
         # rigid as a rule, and bent now and then: as often the one as the other
-        information = information_of(whole, variances, spreads)
-        at_all = spreads.any(axis=(1, 2, 3))
+        information, at_all = information_of(seen, variances, spreads), spreads.any(axis=(1, 2, 3))
         both = np.logaddexp(evidence, log_evidence(*given, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)
         bent[np.ix_(at_all, free, free)] = inverses(information[:, free][..., free])[at_all]
@@ -215,10 +186,7 @@ def _evidence(
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
-    """Of the poses that look the same, the one turned least against a reference.
-
-    Without a reference it is the one turned least against the world.
-    """
+    """Of the poses that look the same, the one turned least against a reference, or the world."""
     if len(body.symmetries) == 1:
         return T_world_object
     alike = T_world_object @ body.symmetries

@@ -8,13 +8,18 @@ all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, field
 
 is expected of residuals r (C. R. Henderson's method of moments), and the covariance of a pose is
 s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as the F distribution says.
+
+Fields of a sensor that last, of sizes γ in σ_ε, show in fading sums A of PᵀWRP and v of PᵀWr.  With
+γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance
+makes it, something lasts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +27,21 @@ from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
 from mixpose.constants import constant
-from mixpose.judgement.moments import LEAST, Frame, Moments, frames_of
-from mixpose.judgement.persistent_bias import BiasRules, PersistentBias
-from mixpose.matching import ErrorRules, Matches, Noise, NoiseEstimate, errors_seen, pooled
+from mixpose.judgement.covariance import inverses
+from mixpose.matching import ErrorRules, Matches, NoiseEstimate, errors_seen, pooled
 from mixpose.records import Floats
 
-_LEAST_SHARE = 0.05  # of the squares of residuals, that is not taken for fields
+Biases: TypeAlias = Mapping[tuple[str, ...], Floats]
+
+
+@dataclass(frozen=True)
+class BiasRules:
+    """What is believed of errors that last."""
+
+    deviation: float = constant(
+        0.25, "σ_ε: of fields that last, once some are seen: 0.4 px, a camera turned by 0.02°"
+    )
+    memory: float = constant(0.99, "per frame, of what was seen before: 100 frames count")
 
 
 @dataclass(frozen=True)
@@ -36,7 +50,6 @@ class NoiseModel:
 
     errors: ErrorRules = ErrorRules()
     bias: BiasRules = BiasRules()
-    smallest: float = constant(1e-3, "of σ_ε: float32 densities do not resolve residuals below")
     by_chance: float = constant(
         0.999, "frames whose residuals are larger than so many by chance stand on their own"
     )
@@ -48,12 +61,7 @@ class NoiseModel:
         0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
     )
     lasting: float = constant(
-        0.18,
-        "of the noise: an offset that all features of a sensor have in common, or what turns, "
-        "scales and shears them, before it is seen (half and twice of it do as well)",
-    )
-    lasting_fields: float = constant(
-        3.0, "fields that `lasting` counts as: those of two cameras outweigh it after a frame"
+        0.18, "of the noise: fields of a sensor before they are seen; half and twice do as well"
     )
 
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
@@ -69,97 +77,128 @@ class NoiseModel:
 
 @dataclass(frozen=True, eq=False)
 class RememberedNoise:
-    """What is remembered of residuals, for the next frame.
+    """What is remembered of residuals, for the next frame."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Sensors that were seen so far.
-    sums : (2, L) float64
-        Squares of their residuals in σ_ε², and degrees of freedom.
-    moments : Moments
-        Of fields that change from frame to frame.
-    biases : tuple of PersistentBias
-        Fields that last, by sets of sensors.
-    """
-
-    names: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()  # sensors that were seen so far
+    # (2, L) squares of their residuals in σ_ε², and degrees of freedom
     sums: Floats = field(default_factory=lambda: np.zeros((2, 0)))
-    moments: Moments = Moments()
-    biases: tuple[PersistentBias, ...] = ()
+    # (4, 5) normal equations of the variances of errors and fields, [expected | seen]
+    moments: Floats = field(default_factory=lambda: np.zeros((4, 5)))
+    # (q, q + 1) sums [A | v] of fields that last, by sets of sensors, the last seen first
+    biases: Biases = field(default_factory=dict)
 
     @property
-    def total(self) -> Noise:
-        """Noise of all sensors."""
-        return Noise(*self.sums.sum(axis=1).tolist())
+    def total(self) -> Floats:
+        """Squares and degrees of freedom (2,) of all sensors together."""
+        return np.asarray(self.sums.sum(axis=1))
 
     def of(self, names: Sequence[str]) -> Floats:
         """Squares and degrees of freedom (2, L) of some sensors."""
         if tuple(names) == self.names:
             return self.sums
-        sums, numbers = np.zeros((2, len(names))), {name: k for k, name in enumerate(self.names)}
-        for k, name in enumerate(names):
-            if name in numbers:
-                sums[:, k] = self.sums[:, numbers[name]]
-        return sums
-
-    def after(
-        self,
-        names: tuple[str, ...],
-        sums: Floats,
-        frame: Moments,
-        biases: tuple[PersistentBias, ...],
-    ) -> RememberedNoise:
-        """With what a frame shows of some sensors."""
-        others = [k for k, name in enumerate(self.names) if name not in names]
-        if others:
-            names = (*names, *(self.names[k] for k in others))
-            sums = np.hstack([sums, self.sums[:, others]])
-        return RememberedNoise(names, sums, frame, biases)
+        known = dict(zip(self.names, self.sums.T))
+        return np.array([known.get(name, np.zeros(2)) for name in names]).reshape(-1, 2).T
 
 
-class FrameNoise(NamedTuple):
-    """The noise that a frame goes by."""
-
-    variances: Floats  # (L,) of each sensor, in σ_ε²; the typical one counts, too
-    covariance: Floats  # (6, 6) zero where the pose is not free
-    persistent: Floats  # (6, 6) of it, what lasts from frame to frame and leaves velocities alone
-    remembered: RememberedNoise  # for the next frame
-    residual_ratio: float  # of residuals to the largest that those before them let chance make
-
-
-def noises_of(
+def noise_of(
     found: Matches,
     free: NDArray[np.bool_],
-    before: Sequence[RememberedNoise],
+    before: RememberedNoise,
     model: NoiseModel,
-    estimates: Sequence[NoiseEstimate | None] = (),
-) -> list[FrameNoise]:
-    """The noise of K frames, from the residuals of each and from those before it.
+    estimate: NoiseEstimate | None = None,  # as the fit has it
+) -> tuple[Floats, Floats, Floats, RememberedNoise, float]:
+    """The noise of a frame at one pose, from its residuals and from those before it.
 
-    As a rule it is that of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes.  `estimates` are what the
-    fits saw already.
+    Variances (L,) of each sensor, σ_ε²; the covariance (6, 6), zero where the pose is not free, and
+    what of it lasts from frame to frame and leaves velocities alone; what is remembered; and the
+    ratio of residuals to the largest that those before let chance make.
     """
-    known = estimates or [None] * len(before)
-    levels = [
-        _level(found.at(k), memory, int(free.sum()), model, estimate)
-        for k, (memory, estimate) in enumerate(zip(before, known, strict=True))
-    ]
-    frames = frames_of(found, np.array([one.scale for one in levels]), free, model.errors.outlying)
-    met = found.met.mean(axis=1).tolist()
-    parts = zip(before, levels, frames, met, strict=True)
-    return [_frame_noise(found.names, *part, free, model) for part in parts]
+    count, inner = int(free.sum()), np.ix_(free, free)
+    variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
+    is_noise = found.squared <= model.errors.outlying**2 * scale[:, None]
+    shares, noise = np.where(is_noise, found.shares, 0.0), np.sqrt(scale)
+    # residuals, Jacobian and fields, weighted
+    roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
+    r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
+    J, (fields, kinds) = rows[:, free], _fields_of(found, shares, rows)
+    inverse = inverses(J.T @ J)
+    # by how much fields move the pose, and what it leaves of them
+    drawn = inverse @ (J.T @ fields)
+    left = fields - J @ drawn
+    # those of the sensors may last
+    q = fields.shape[1] - 3 * shares.shape[1]
+    sizes = noise.repeat(q // len(noise))
+    lasting = left[:, :q] / sizes
+    shown = lasting.T @ np.column_stack([lasting, r])
+    biases, mean, second = _lasting(before.biases, found.names, shown, model)
+    rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
+    pulls = np.concatenate([rest @ fields[:, :q], r @ fields[:, q:]])
+    redundancy = float(shares.sum(axis=1) @ found.dimensions) - count
+    own = _normal_equations(rest, redundancy, fields, left, pulls, kinds)
+    moments = model.memory * before.moments + own
+    by_kind, of_fields = _variances(moments, own, float(found.met.mean()), model)
+    # fields last: a further frame shows no more of them
+    by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
+    covariance, steady = np.zeros((2, 6, 6))
+    steady[inner] = moved @ second @ moved.T
+    covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    if found.by_calibration is not None:
+        pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
+        covariance[inner] += pulled @ pulled.T
+    others = [k for k, name in enumerate(before.names) if name not in found.names]
+    names = (*found.names, *(before.names[k] for k in others))
+    sums = np.hstack([sums, before.sums[:, others]])
+    remembered = RememberedNoise(names, sums, moments, biases)
+    return variances, covariance + steady, steady, remembered, ratio
 
 
-class _Level(NamedTuple):
-    """How large residuals are, sensor by sensor."""
+def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Floats]:
+    """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
 
-    seen: Floats  # (L,) variances as offsets show them
-    scale: Floats  # (L,) the same, drawn to that of all sensors, which residuals are measured in
-    told: Floats  # (2, L) squares and degrees of freedom that are remembered
-    degrees: float  # of freedom, of all that was seen
-    residual_ratio: float  # as `FrameNoise` has it
+    Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
+    about their middle (kind 2); of each marker what it is off by along the axes of the world (3).
+    """
+    L, N = shares.shape
+    total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
+    away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
+    spread = (shares[..., None] * away * away).sum(axis=(1, 2))
+    size = np.sqrt(spread / (found.dimensions * total[:, 0]))
+    away /= np.maximum(size, 1e-6)[:, None, None]
+    by_feature = np.concatenate([np.ones((L, N, 1)), away], axis=2) * np.sqrt(shares)[..., None]
+    columns, kinds = _columns(tuple(found.dimensions.tolist()), N)
+    of_sensors = by_feature[:, :, None, None, None] * columns[:, None, ..., None]
+    # in units of how features move with the body, the root mean square of those in view
+    counts = 3 * np.count_nonzero(found.weights, axis=1) @ found.dimensions
+    moved = np.sqrt((J[:, :3] ** 2).sum() / max(counts, 1))
+    by_place = J[:, :3].reshape(L, N, 2, 1, 3) / max(moved, 1e-6)
+    of_markers = by_place * np.eye(N)[:, None, :, None]
+    return np.hstack([of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)]), kinds
+
+
+@lru_cache(maxsize=64)
+def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats]:
+    """Which rows (L, 2) the columns (L, 2) of each sensor are of, and the kinds of all fields."""
+    L = len(dimensions)
+    axes = np.arange(2) < np.array(dimensions)[:, None]
+    columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)
+    return columns, np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
+
+
+def _normal_equations(
+    r: Floats, redundancy: float, fields: Floats, left: Floats, pulls: Floats, kinds: Floats
+) -> Floats:
+    """Moments (4, 5), [expected | seen], of independent errors and fields of each kind.
+
+    `left` is what a pose leaves of fields, `pulls` how these pull at residuals, `redundancy` tr R.
+    """
+    moments = np.zeros((4, 5))
+    if redundancy > 0:
+        gram = fields.T @ left
+        moments[:, :4] = kinds.T @ gram**2 @ kinds
+        moments[0, :4] = moments[:, 0] = gram.diagonal() @ kinds
+        moments[0, 0], moments[0, 4] = redundancy, r @ r
+        moments[1:, 4] = pulls**2 @ kinds[:, 1:]
+    return moments
 
 
 def _level(
@@ -168,11 +207,20 @@ def _level(
     count: int,
     model: NoiseModel,
     estimate: NoiseEstimate | None,
-) -> _Level:
+) -> tuple[Floats, Floats, Floats, float, float]:
+    """Variances (L,) as offsets show them, and those that residuals are measured in.
+
+    As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
+    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Then the
+    degrees of freedom of all that was seen, and the ratio.
+    """
     rules, past = model.errors, before.of(matches.names)
-    sums = model.memory * past
+    sums, ratio = model.memory * past, 0.0
     seen = estimate or errors_seen(matches, count, sums, rules)
-    ratio = _residual_ratio(past, seen, model)
+    known, degrees = float(past[1].sum()), float(seen.own[1].sum())
+    if known >= model.known and degrees >= 1:
+        ratio = float((seen.own[0] / pooled(past, rules, 0.0)).sum()) / degrees
+        ratio /= float(fdtri(degrees, known, model.by_chance))
     told = sums + seen.own / [[max(ratio, 1.0)], [1.0]]
     if ratio > 1:
         sums = np.zeros_like(past)
@@ -180,80 +228,47 @@ def _level(
     sums = sums + seen.own
     degrees = float(sums[1].sum())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return _Level(seen.variances, np.maximum(scale, model.smallest**2), told, degrees, ratio)
+    return seen.variances, scale, told, degrees, ratio
 
 
-def _frame_noise(
-    names: tuple[str, ...],
-    before: RememberedNoise,
-    level: _Level,
-    frame: Frame,
-    met: float,
-    free: NDArray[np.bool_],
-    model: NoiseModel,
-) -> FrameNoise:
-    biases = frame.bias.after(before.biases, model.bias)
-    sizes = biases[0].sizes(model.bias, model.by_chance)
-    own = frame.moments if sizes is None else frame.without(sizes[0])
-    moments = before.moments.joined(own, model.memory)
-    variances, of_fields = _shares(moments, own, met, model)
-    # fields last: a further frame shows no more of them
-    factors = model.enlargement(int(free.sum()), np.array([level.degrees, *of_fields]))
-    inner = np.tensordot(variances * factors, frame.parts, 1)
-    inner += frame.by_calibration @ frame.by_calibration.T
-    covariance, steady = np.zeros((2, 6, 6))
-    if sizes is not None:
-        steady[np.ix_(free, free)] = frame.by_fields @ sizes[1] @ frame.by_fields.T
-    covariance[np.ix_(free, free)] = inner
-    covariance += steady
-    remembered = before.after(names, level.told, moments, biases)
-    return FrameNoise(level.seen, covariance, steady, remembered, level.residual_ratio)
+def _lasting(
+    before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel
+) -> tuple[Biases, Floats, Floats]:
+    """Sums [A | v] with those (q, q + 1) of a frame, and what they show of fields that last.
+
+    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
+    """
+    if names in before and before[names].shape == shown.shape:
+        shown = model.bias.memory * before[names] + shown
+    others = [(own, sums) for own, sums in before.items() if own != names]
+    biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
+    A, v, deviation = shown[:, :-1], shown[:, -1], model.bias.deviation
+    if deviation:
+        S = np.linalg.inv(A + np.eye(len(v)) / deviation**2)
+        mean, degrees = S @ v, float((S * A).sum())
+        if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
+            return biases, mean, S + np.outer(mean, mean)
+    return biases, np.zeros_like(v), np.zeros_like(A)
 
 
-def _residual_ratio(past: Floats, seen: NoiseEstimate, model: NoiseModel) -> float:
-    """How many times larger a frame's residuals are than chance makes them; 1 is just by chance."""
-    known, degrees = float(past[1].sum()), float(seen.own[1].sum())
-    if known < model.known or degrees < 1:
-        return 0.0
-    before = np.maximum(pooled(past, model.errors, 0.0), model.smallest**2)
-    ratio = float((seen.own[0] / before).sum()) / degrees
-    return ratio / float(fdtri(degrees, known, model.by_chance))
-
-
-def _shares(moments: Moments, own: Moments, met: float, model: NoiseModel) -> tuple[Floats, Floats]:
+def _variances(
+    moments: Floats, own: Floats, met: float, model: NoiseModel
+) -> tuple[Floats, Floats]:
     """Variances (4,) of independent errors and of fields; degrees of freedom (3,) of the latter.
 
-    Each sensor meets so many features, of a frame that has its own moments.
+    From normal equations of all frames and of one alone, where sensors meet so many features.  What
+    is believed before, as that markers are where they are said to be, counts as a camera's fields
+    along an axis in it: an offset, and two that turn, scale and shear.
     """
-    weights = model.lasting_fields * np.array([met, met**2])
-    # markers are where they are said to be, as surely as so many frames tell
-    of_markers = model.lasting_fields * own.expected[3, 3] + LEAST
-    believed = np.array([LEAST, weights[1], weights[1], of_markers])
-    expected = moments.expected + np.diag(believed)
-    size = np.array([1.0, model.lasting**2, model.lasting**2, 0.0])
-    seen = moments.seen + believed * size
-    scale = 1 / np.maximum(expected.diagonal(), LEAST)
+    fields, least = 3.0, 1e-6  # degrees of freedom that are as good as none
+    of_markers = fields * own[3, 3] + least
+    believed = np.array([least, fields * met**2, fields * met**2, of_markers])
+    expected = moments[:, :4] + np.diag(believed)
+    seen = moments[:, 4] + believed * [1.0, model.lasting**2, model.lasting**2, 0.0]
+    scale = 1 / np.maximum(expected.diagonal(), least)
     variances = nnls(scale[:, None] * expected, scale * seen)[0]
-    variances[0] = max(variances[0], _LEAST_SHARE * seen[0] * scale[0])
-    taken = np.array([weights[0], weights[0], model.lasting_fields * own.expected[0, 3] + LEAST])
-    once, squared = own.expected[0, 1:] + taken, own.expected.diagonal()[1:] + believed[1:]
-    return variances, once**2 / np.maximum(squared, LEAST)
-
-
-def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε².
-
-    What features tell that are off by `spreads` (K, N, 3, 3) in the world is less.
-    """
-    frames, sensors, n, m, _ = found.J.shape
-    weights = (found.shares / variances[..., None])[..., None, None]
-    J, weighted = (
-        one.swapaxes(1, 2).reshape(frames, n, sensors * m, 6)
-        for one in (found.J, weights * found.J)
-    )
-    information = weighted.swapaxes(2, 3) @ J
-    if spreads is not None:
-        place = information[..., :3, :3]
-        taken = spreads @ np.linalg.inv(np.eye(3) + place @ spreads)
-        information = information - information[..., :3] @ taken @ information[..., :3, :]
-    return np.asarray(information.sum(axis=1))
+    # a twentieth of the squares is not taken for fields
+    variances[0] = max(variances[0], 0.05 * seen[0] * scale[0])
+    once = own[0, 1:4] + [fields * met, fields * met, fields * own[0, 3] + least]
+    squared = own.diagonal()[1:] + believed[1:]
+    return variances, once**2 / np.maximum(squared, least)

@@ -6,54 +6,81 @@ left of the density once the neighbours' share of it is taken off.
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from mixpose.density import peak
-from mixpose.matching.detections import Detections, side_by_side, surroundings
+import numpy as np
+from numpy.typing import NDArray
+
+from mixpose.constants import constant
+from mixpose.density import DRAWING, peak
 from mixpose.matching.matches import Matches
-from mixpose.matching.rules import AssociationRules
-from mixpose.objective import Match, MatchedObjective, in_image
-from mixpose.records import Floats, Indices, Mask
+from mixpose.objective import MatchedObjective, View, in_image
+from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import by_calibration
 
-_ALIKE = 0.01  # of a height: features are told apart from a seventh of C's deviation on
+
+@dataclass(frozen=True)
+class AssociationRules:
+    """When a feature counts as met."""
+
+    min_share: float = constant(
+        0.3, "of a feature's peak density: within 2.2 σ_ε; false features pass for true ones beyond"
+    )
+    min_region: float = constant(
+        20.0, "σ_ε over which features crowd at least: two alone make no infinite density"
+    )
+    crowded: bool = constant(
+        True, "whether clutter is as dense as detections around the body, where they are denser"
+    )
+    merged: bool = constant(
+        True, "whether two features may share one detection: blobs that touch have one centre"
+    )
+    slip: float = constant(
+        0.25, "of the body's size, around it: where a slipped grid (steps of 1/8) has detections"
+    )
+
+    @property
+    def reach_squared(self) -> float:
+        """Squared distance within which a feature is met, in variances of C."""
+        return -2 * math.log(self.min_share)
 
 
 def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
-    """Compare what a pose predicts with what every sensor observed.
-
-    Parameters
-    ----------
-    objective : MatchedObjective
-        At σ_ε of every sensor.
-    T_world_object : (4, 4) array
-    rules : AssociationRules
-    narrowest : float
-        Narrowest blur of interest, σ_ε.
-    """
+    """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
     match, views = objective.match(T_world_object[None]), objective.views
-    at, y, seen, weights = match.at, match.at.y[:, 0], match.at.seen[:, 0], match.at.weights[:, 0]
-    sigmas = np.array([view.observation.sigma for view in views])
-    detections = side_by_side(tuple([view.observation for view in views]), rules)
+    at, dimensions, body = match.at, objective.projection.dimensions, objective.projection.body
+    y, seen, weights, J = at.y[:, 0], at.seen[:, 0], at.weights[:, 0], at.J[:, 0]
+    sigmas, detections = np.array([view.observation.sigma for view in views]), _detections(views)
     product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
-    energy, norm = objective.energies[:, 0], match.over.norm[:, 0]
-    explained = np.minimum(np.maximum(product, 0.0) ** 2 / (energy * norm), 1.0)
-    shares, offsets, by, partner = _met(
-        objective, match, T_world_object, product, detections, rules
-    )
-    J, merged = at.J[:, 0] / sigmas[:, None, None, None], np.zeros(len(views), dtype=np.intp)
-    paired = np.nonzero(partner >= 0)
-    if len(paired[0]):
-        J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-        merged = np.bincount(paired[0], minlength=len(views)) // 2
-    faced = at.faced[:, 0] & ~seen
-    around = surroundings(objective, y, seen, shares, detections, rules)
+    explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.over.norm[:, 0])
+    reach = np.broadcast_to(objective.variances, seen.shape)
+    if body.spread:  # variances along an axis by which features may be off
+        spreads = body.node_spreads(T_world_object)
+        reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
+    # shares, offsets in sensor units, detections, and partners of features in merged pairs
+    met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
+    shares, offsets, by, partner = met
+    is_open = seen & (product > 0)[:, None]
+    _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
+    is_grid = [view.observation.cell is not None for view in views]
+    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
+        of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.over.norm[k, 0])
+        mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
+        shares[k, of], offsets[k, of, :m] = _residuals(
+            *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
+        )
+    paired, J = np.nonzero(partner >= 0), J / sigmas[:, None, None, None]
+    J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
+    count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
-        dimensions=objective.projection.dimensions,
+        dimensions=dimensions,
         sigmas=sigmas,
         weights=weights,
         shares=shares,
@@ -61,138 +88,77 @@ def associate(
         offsets=offsets / sigmas[:, None, None],
         J=J,
         detections=by,
-        explained=explained,
-        unseen=(objective.projection.body.nodes.weights * faced).sum(axis=1),
-        merged=merged,
-        count=around.count,
-        crowd=around.crowd,
-        unmatched_nearby=around.unmatched,
-        finest=np.minimum(np.maximum(narrowest, around.finest), 1.0),
-        by_calibration=_by_calibration(objective, T_world_object, sigmas),
+        explained=np.minimum(explained, 1.0),
+        unseen=(body.nodes.weights * (at.faced[:, 0] & ~seen)).sum(axis=1),
+        merged=np.bincount(paired[0], minlength=len(views)) // 2,
+        count=count,
+        crowd=crowd,
+        unmatched_nearby=unmatched,
+        finest=np.minimum(np.maximum(narrowest, finest), 1.0),
+        by_calibration=_by_calibration(objective, T_world_object),
     )
 
 
-def _met(
-    objective: MatchedObjective,
-    match: Match,
-    T_world_object: Floats,
-    product: Floats,
-    detections: Detections,
-    rules: AssociationRules,
-) -> tuple[Floats, Floats, Indices, Indices]:
-    """Shares, offsets in sensor units, detections, and partners of features in merged pairs."""
-    at, variances = match.at, objective.variances
-    y, weights = at.y[:, 0], at.weights[:, 0]
-    shares, offsets = np.zeros(weights.shape), np.zeros(y.shape)
-    by, partner = np.full((2, *weights.shape), -1)
-    is_open = at.seen[:, 0] & (product > 0)[:, None]
-    if detections.points.shape[1]:
-        reach = rules.reach_squared * variances
-        if objective.projection.body.spread:
-            reach = reach + rules.reach_squared * _spread(objective, at.J[:, 0], T_world_object)
-        _to_nearest(y, weights, detections, reach, is_open, rules, (shares, offsets, by, partner))
-    unlike = all(detections.is_grid)
-    for k in np.flatnonzero(detections.is_grid) if any(detections.is_grid) else ():
-        of, m = np.flatnonzero(is_open[k]), int(objective.projection.dimensions[k])
-        if len(of):
-            amplitude, variance = product[k] / match.over.norm[k, 0], float(variances[k, 0])
-            sampled = match.sampled[k, 0, of, : 1 + m]
-            shares[k, of], offsets[k, of, :m] = _residuals(
-                y[k, of, :m], weights[k, of], variance, sampled, float(amplitude), rules, unlike
-            )
-    return shares, offsets, by, partner
-
-
-def _spread(objective: MatchedObjective, J: Floats, T_world_object: Floats) -> Floats:
-    """Variances (L, n) along an axis by which features of a body that gives way may be off."""
-    spreads = objective.projection.body.node_spreads(T_world_object)
-    m = objective.projection.dimensions.tolist()
-    return np.array([in_image(spreads, own[..., :size, :]) for own, size in zip(J, m)])
+def _detections(views: Sequence[View]) -> Floats:
+    """Detections (L, M, 2) of L sensors side by side; NaN beyond those that a sensor has."""
+    patterns = [view.observation.pattern for view in views]
+    points = [p.points if isinstance(p, PointPattern) else np.zeros((0, 2)) for p in patterns]
+    detections = np.full((len(points), max(map(len, points)) or 1, 2), np.nan)
+    for side, own in zip(detections, points):
+        side[: len(own)] = 0.0
+        side[: len(own), : own.shape[1]] = own
+    return detections
 
 
 def _to_nearest(
     y: Floats,
     weights: Floats,
-    detections: Detections,
-    reach: Floats,
+    detections: Floats,
+    reach: Floats,  # (L, n) squared, in sensor units
     is_open: Mask,
-    rules: AssociationRules,
-    result: tuple[Floats, Floats, Indices, Indices],
+    merged: bool,
+    met: tuple[Floats, Floats, Indices, Indices],
 ) -> None:
-    """Features met by the nearest detections, each taken once; two that share one, in pairs.
-
-    `reach` (L, n) is squared, in sensor units; the arrays of the result are written to.
-    """
-    shares, offsets, by, partner = result
-    away = detections.points[:, None] - y[:, :, None]
+    """Write what the nearest detections meet, each taken once or by a pair of features."""
+    shares, offsets, by, _ = met
+    away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
-    k, i, j = pairs
-    if not len(k):
-        return
-    features, taken = k * y.shape[1] + i, k * squared.shape[2] + j
-    chosen = _once_each(features, taken, squared[pairs])
-    at = k[chosen], i[chosen]
-    shares[at], offsets[at], by[at] = weights[at], away[(*at, j[chosen])], j[chosen]
-    if rules.merged and len(chosen) < len(features):
+    order, taken = np.argsort(squared[pairs], kind="stable"), set[tuple[int, int]]()
+    for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
+        if by[k, i] < 0 and (k, j) not in taken:
+            taken.add((k, j))
+            shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
+    if merged and len(taken) < len(order):
         # only a feature near a detection that is taken can share it
-        left = shares[k, i] == 0
-        for row in np.unique(k[left]).tolist():
-            of = np.flatnonzero(is_open[row])
-            own = [np.array(array[row, of]) for array in result]
-            limits = np.broadcast_to(reach, weights.shape)[row, of]
-            _run_together(y[row, of], weights[row, of], limits, *own)
-            shares[row, of], offsets[row, of], by[row, of] = own[:3]
-            partner[row, of] = np.where(own[3] >= 0, of[own[3]], -1)
-
-
-def _once_each(features: Indices, detections: Indices, squared: Floats) -> Indices:
-    """Pairs in which no feature and no detection occurs twice, the nearest first."""
-    if np.bincount(features).max() == 1 and np.bincount(detections).max() == 1:
-        return np.arange(len(features))
-    order = np.argsort(squared, kind="stable")
-    pairs = zip(order.tolist(), features[order].tolist(), detections[order].tolist(), strict=True)
-    chosen, met, taken = [], set[int](), set[int]()
-    for number, feature, detection in pairs:
-        if feature not in met and detection not in taken:
-            met.add(feature)
-            taken.add(detection)
-            chosen.append(number)
-    return np.array(chosen)
+        for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
+            _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
 
 
 def _run_together(
     y: Floats,
     weights: Floats,
     reach: Floats,
-    shares: Floats,
-    offsets: Floats,
-    detections: Indices,
-    partner: Indices,
+    is_open: Mask,
+    met: Sequence[NDArray[Any]],
 ) -> None:
     """Let two features share a detection that lies nearer to their middle than to either.
 
-    Images that overlap are detected as one, in the middle.  The two count as one feature that was
-    met there: half of each, with the offset of their middle.
+    Images that overlap are detected as one.  The two count as one feature in their middle.
     """
+    shares, offsets, detections, partner = met
     single = shares > 0
-    for i in np.flatnonzero(shares == 0).tolist():
-        seen = np.flatnonzero(single)
-        if not len(seen):
-            break
-        places = y[seen] + offsets[seen]
-        near = ((places - y[i]) ** 2).sum(axis=1) <= reach[i]
-        middle = places - (y[seen] + y[i]) / 2
-        closer = (middle**2).sum(axis=1) - (offsets[seen] ** 2).sum(axis=1)
+    for i in np.flatnonzero(is_open & ~single).tolist():
+        places = y + offsets
+        near = single & (((places - y[i]) ** 2).sum(axis=1) <= reach[i])
+        middle = places - (y + y[i]) / 2
+        closer = (middle**2).sum(axis=1) - (offsets**2).sum(axis=1)
         k = int(np.argmin(np.where(near, closer, np.inf)))
-        if not near[k] or closer[k] >= 0:
-            continue
-        pair = [i, int(seen[k])]
-        shares[pair] = weights[pair] / 2
-        offsets[pair] = middle[k]
-        partner[pair] = pair[::-1]
-        detections[pair] = detections[pair[1]]
-        single[pair[1]] = False
+        if near[k] and closer[k] < 0:
+            pair = [i, k]
+            shares[pair], offsets[pair] = weights[pair] / 2, middle[k]
+            partner[pair], detections[pair] = pair[::-1], detections[k]
+            single[k] = False
 
 
 def _residuals(
@@ -210,39 +176,89 @@ def _residuals(
     amplitude of its own about `amplitude`, or with that where they are not `unlike`.  What is left
     of the gradient once all are taken off is the pull on this feature alone.
     """
-    n, top = len(y), peak(variance, y.shape[1])
-    away = y[:, None] - y[None]
+    n, top, away = len(y), peak(variance, y.shape[1]), y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
-    rest = sampled[:, 0] - amplitude * bells.sum(axis=1)
-    # at one place features cannot be told apart: they are taken to be alike
-    widened = bells + _ALIKE * top * np.diag(weights)
-    amplitudes = amplitude + (np.linalg.solve(widened, rest) if unlike else np.zeros(n))
-    predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
-    height = amplitudes * weights * top if unlike else rest + amplitude * weights * top
+    rest, amplitudes = sampled[:, 0] - amplitude * bells.sum(axis=1), np.full(n, amplitude)
+    height = rest + amplitude * weights * top
+    if unlike:
+        # nearer than a seventh of C's deviation features cannot be told apart: they are alike
+        amplitudes += np.linalg.solve(bells + 0.01 * top * np.diag(weights), rest)
+        height = amplitudes * weights * top
     # what the better half of the features looks like by itself
     full = float(np.median(np.sort(height)[n // 2 :]))
     if full <= 0:
         return np.zeros(n), np.zeros(y.shape)
     shares = np.clip(height / full, 0.0, 1.0)
     is_met = shares > rules.min_share
+    predicted_gradient = -((amplitudes * bells)[..., None] * away).sum(axis=1) / variance
     pull = sampled[:, 1:] - predicted_gradient
     offsets = variance * pull / np.maximum(height, rules.min_share * full)[:, None]
     return np.where(is_met, shares * weights, 0.0), np.where(is_met[:, None], offsets, 0.0)
 
 
-def _by_calibration(
-    objective: MatchedObjective, T_world_object: Floats, sigmas: Floats
-) -> Floats | None:
-    """By how much features are elsewhere (L, N, 2, Q), in σ_ε, for calibrations that are off."""
-    views = objective.views
-    if not any(view.doubts for view in views):
-        return None
-    points = transform(T_world_object, objective.projection.body.nodes.points)
-    columns = []
+def _surroundings(
+    objective: MatchedObjective,
+    y: Floats,
+    seen: Mask,
+    shares: Floats,
+    detections: Floats,
+    rules: AssociationRules,
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Number of detections of L sensors, their density, those of no feature, and the finest blur.
+
+    All but the first go by the box of the features in view at places y (L, n, 2).
+    """
+    observations = [view.observation for view in objective.views]
+    sigmas = np.array([one.sigma for one in observations])
+    is_flat = objective.projection.dimensions == 1
+    in_view = np.where(seen[..., None], y, np.nan)
+    lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
+    size, middle = upper - lower, (lower + upper) / 2
+    smallest = np.tile(rules.min_region * sigmas[:, None], 2)
+    smallest[is_flat, 1] = sigmas[is_flat]
+    no_box = np.full_like(upper, np.nan)
+    crowd = crowding(detections, lower, upper if rules.crowded else no_box, smallest) * sigmas**2
+    count = np.count_nonzero(~np.isnan(detections[..., 0]), axis=1).astype(np.float64)
+    unmatched = np.zeros(len(sigmas))
+    missing = (seen & (shares == 0)).any(axis=1)
+    if missing.any():
+        half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
+        near = np.abs(detections - middle[:, None]) <= half[:, None]
+        beside = np.count_nonzero(near.all(axis=2), axis=1) - shares.sum(axis=1)
+        unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
+    finest = np.where(seen.any(axis=1), size.max(axis=1) / (DRAWING.widest * sigmas), 1.0)
+    for k, one in enumerate(observations):
+        if one.cell is not None:  # as many equal features as would give the energy of grey values
+            near, far = (corner / one.sigma for corner in one.extent)
+            count[k] = objective.tops[k, 0] / objective.energies[k, 0]
+            crowd[k] = count[k] / np.maximum(far - near, rules.min_region).prod()
+            finest[k] = 1.0
+    return count, crowd, unmatched, finest
+
+
+def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | float) -> Floats:
+    """Detections (...,) per unit of coordinates, in all or in boxes where they are denser.
+
+    Of points (..., M, m), NaN where there are fewer, and boxes (..., m) around predicted features;
+    the side of a region counts as `smallest` at least.
+    """
+    number = np.count_nonzero(points[..., 0] == points[..., 0], axis=-1)
+    extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)
+    sides = np.fmax(upper - lower, smallest)
+    away = np.abs(points - ((lower + upper) / 2)[..., None, :])
+    inside = np.count_nonzero((away <= sides[..., None, :] / 2).all(axis=-1), axis=-1)
+    overall = number / np.fmax(extent, smallest).prod(axis=-1)
+    return np.asarray(np.maximum(overall, inside / sides.prod(axis=-1)))
+
+
+def _by_calibration(objective: MatchedObjective, T_world_object: Floats) -> Floats | None:
+    """By how much calibrations that are off move features (L, N, 2, Q), σ_ε."""
+    columns, views = [], objective.views
     for k, view in enumerate(views):
         if view.doubts:
+            points = transform(T_world_object, objective.projection.body.nodes.points)
             shifts = by_calibration(view.doubts, points)
             own = np.zeros((len(views), len(points), 2, shifts.shape[2]))
-            own[k, :, : shifts.shape[1]] = shifts / sigmas[k]
+            own[k, :, : shifts.shape[1]] = shifts / view.observation.sigma
             columns.append(own)
-    return np.concatenate(columns, axis=-1)
+    return np.concatenate(columns, axis=-1) if columns else None

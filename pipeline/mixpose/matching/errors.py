@@ -4,23 +4,21 @@ At a blur σ a feature r away from its prediction pulls with r exp(−r²/4σ²)
 squares with the loss of Welsch.  Offsets of standard deviation s, weighted so, have the variance q
 with 1/q = 1/s² + 1/2σ².  σ = 1.5 s and s² = q / (1 − q / 2σ²) follow from one another, from σ_ε
 down and from what is known upwards, to where they agree.  Lengths are in σ_ε of their sensor.
+Of noise, squares of residuals and degrees of freedom are added up (2, L): sensor by sensor.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.constants import constant
+from mixpose.density import DRAWING
 from mixpose.matching.matches import Matches
 from mixpose.records import Floats
-
-_NOTHING = 1e-12
-_ALIKE = 1.2  # blurs that differ by less are the same
-_ROUNDS = 4  # from a known noise upwards
-_LEAST_DEGREES = 0.5  # of freedom: fewer are none, but for shares that do not add up to whole ones
 
 
 @dataclass(frozen=True)
@@ -37,42 +35,24 @@ class ErrorRules:
     narrowest: float = constant(
         0.05, "of σ_ε, blur of the last look: what centres of blobs err by at best (0.03 σ_ε)"
     )
-    reach: float = constant(
-        9.0,
-        "σ_ε around features within which detections count: at σ_ε they are drawn to 4.25 √2 = 6, "
-        "and the pose moves by less than the rest",
-    )
     astray: float = constant(
         0.1, "chance that an offset within `met` is no noise: a spot cut, merged or another's"
     )
     met: float = constant(
         3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
     )
-    shared: float = constant(
-        0.5,
-        "of the blur's variance, that of all sensors: what calibrations err by is in no sensor's "
-        "own noise, so that precise ones weigh too much by theirs alone (action cameras)",
-    )
     outlying: float = constant(
         3.5, "standard deviations from which an offset is no noise: by chance 2 in 1000 are beyond"
     )
 
-
-@dataclass(frozen=True)
-class Noise:
-    """Sum of squared offsets in σ_ε, and its degrees of freedom."""
-
-    squares: float = 0.0
-    degrees: float = 0.0
-
     @property
-    def variance(self) -> float:
-        """Mean of the squares."""
-        return self.squares / max(self.degrees, 1e-12)
+    def reach(self) -> float:
+        """σ_ε around features within which detections count: as far as C is drawn, and `met`."""
+        return math.sqrt(2) * DRAWING.reach + self.met
 
-    def joined(self, other: Noise) -> Noise:
-        """Together with another one."""
-        return Noise(self.squares + other.squares, self.degrees + other.degrees)
+
+LEAST_VARIANCE = float(np.finfo(np.float32).eps)
+"""In σ_ε²: densities of single precision do not resolve smaller offsets."""
 
 
 class NoiseEstimate(NamedTuple):
@@ -87,59 +67,56 @@ class NoiseEstimate(NamedTuple):
 def errors_seen(
     matches: Matches, free: int, known: Floats, rules: ErrorRules = ErrorRules()
 ) -> NoiseEstimate:
-    """How large the extraction's errors are.
+    """How large errors are, of matches at a pose fitted to them in so many free directions.
 
-    Parameters
-    ----------
-    matches : Matches
-        At a pose that was fitted to them.
-    free : int
-        Directions in which it was.
-    known : (2, L) array
-        Squares and degrees of freedom of each sensor's noise so far.
-    rules : ErrorRules
+    `known` (2, L) has the squares and degrees of freedom of each sensor's noise so far.
     """
-    before = rules.blur * np.sqrt(pooled(known, rules, rules.typical_degrees))
-    before = np.minimum(np.maximum(before, matches.finest), 1.0)
-    blurs = np.ones(len(matches.dimensions))
+    before = _blurs(pooled(known, rules, rules.typical_degrees), matches, rules)
+    given = before, matches, free, known, rules
+    blurs = np.ones(len(before))
     while True:
-        seen = _seen_at(blurs, before, matches, free, known, rules)
+        seen = _seen_at(blurs, *given)
         if (seen.blurs > 0.9 * blurs).all():
             break
         blurs = np.minimum(seen.blurs, blurs)
-    blurs = before
-    if (seen.blurs <= _ALIKE * blurs).all():
+    if (seen.blurs <= 1.2 * before).all():
         return seen
-    for _ in range(_ROUNDS):
-        narrow = _seen_at(blurs, before, matches, free, known, rules)
-        if (narrow.blurs <= _ALIKE * blurs).all():
+    blurs = before
+    for _ in range(4):  # as a rule it takes one or two
+        narrow = _seen_at(blurs, *given)
+        if (narrow.blurs <= 1.2 * blurs).all():
             break
         blurs = narrow.blurs
     return max(seen, narrow, key=lambda one: log_likelihood(one.blurs, matches, free, rules))
+
+
+def _blurs(variances: Floats, matches: Matches, rules: ErrorRules) -> Floats:
+    """Blurs (L,) that suit a noise."""
+    return np.minimum(np.maximum(rules.blur * np.sqrt(variances), matches.finest), 1.0)
 
 
 def _seen_at(
     blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, m = matches.squared, matches.dimensions
-    variances = blurs * blurs
-    weights = matches.shares * np.exp(squared * (-0.25 / variances)[:, None])
-    coordinates = m * weights.sum(axis=1) + _NOTHING
+    squared, m, squares = matches.squared, matches.dimensions, blurs * blurs
+    weights = matches.shares * np.exp(squared * (-0.25 / squares)[:, None])
+    coordinates = m * weights.sum(axis=1) + 1e-12
     q = (weights * squared).sum(axis=1) / coordinates
     # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
-    factor = 1 / (1 - np.minimum(0.5 * q / variances, 0.5))
+    factor = 1 / (1 - np.minimum(0.5 * q / squares, 0.5))
     # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
     degrees = factor ** (m / 2) * coordinates
     most = float(degrees.sum())
-    left = 1 - free / most if most - free > _LEAST_DEGREES else 0.0
+    # shares do not add up to whole ones: half a degree of freedom is none
+    left = 1 - free / most if most - free > 0.5 else 0.0
     own = np.array([factor * q * degrees if left else 0.0 * q, degrees * left])
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
-    wide += rules.shared * (float(wide @ coordinates) / float(coordinates.sum()) - wide)
-    blurs = np.minimum(np.maximum(rules.blur * np.sqrt(wide), matches.finest), 1.0)
-    return NoiseEstimate(own, variances, blurs, before)
+    # half way to all sensors': what calibrations err by is in no sensor's own noise
+    wide = (wide + float(wide @ coordinates) / float(coordinates.sum())) / 2
+    return NoiseEstimate(own, variances, _blurs(wide, matches, rules), before)
 
 
 def log_likelihood(
@@ -155,19 +132,19 @@ def log_likelihood(
     odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * matches.squared / variances)
     believed = m * matches.shares * odds / (1 + odds)
     logs = believed * np.log(2 * np.pi * variances)
-    price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), _NOTHING)
+    price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), 1e-12)
     return float((matches.shares * np.log1p(odds)).sum()) + price
 
 
 def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
-    """Variances (L,), each drawn to that of all sensors together, in σ_ε².
+    """Variances (L,) of squares and degrees of freedom (2, L), each drawn to that of all sensors.
 
-    Of squares and degrees of freedom (2, L).  `typical` is the weight of the typical variance in
-    that of all sensors, in degrees of freedom.
+    In that the typical variance counts as `typical` degrees of freedom.
     """
     squares, degrees = sums
     total_squares, total_degrees = sums.sum(axis=1).tolist()
     most = total_degrees + typical
-    common = (total_squares + typical * rules.typical**2) / max(most, _NOTHING)
+    common = (total_squares + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    return np.asarray((squares + pull * common) / np.maximum(degrees + pull, _NOTHING))
+    variances = (squares + pull * common) / np.maximum(degrees + pull, 1e-12)
+    return np.asarray(np.maximum(variances, LEAST_VARIANCE))

@@ -20,7 +20,6 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import DetectionModel
-from mixpose.matching import Noise
 from mixpose.objective import View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Mask, PointPattern
@@ -45,10 +44,10 @@ def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeR
     )
 
 
-def noise_ratio(noise: Noise, rules: RangeRules) -> float:
-    """Standard deviation of ranges in σ_ε, as residuals of earlier frames show it."""
-    stated = Noise(rules.stated_degrees, rules.stated_degrees).joined(noise)
-    return max(1.0, float(np.sqrt(stated.variance)))
+def noise_ratio(noise: Floats, rules: RangeRules) -> float:
+    """Standard deviation of ranges in σ_ε, by squares and degrees of freedom (2,) so far."""
+    squares, degrees = noise + rules.stated_degrees
+    return max(1.0, float(np.sqrt(squares / degrees)))
 
 
 class AssociationSum(NamedTuple):

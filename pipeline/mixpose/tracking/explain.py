@@ -9,13 +9,14 @@ from functools import cached_property
 from mixpose.fit import Fit
 from mixpose.judgement import (
     APART,
-    Checks,
     ScoredPose,
     Verdict,
-    assess,
     contradict,
+    convinces,
     decide,
     insert,
+    is_possible,
+    is_sure,
 )
 from mixpose.tracking.claims import Claim, Unclaimed, claims_of
 from mixpose.tracking.frame import Frame
@@ -60,11 +61,17 @@ class Explanation:
     fits: tuple[Fit, ...] = ()
     likelihood: Likelihood | None = None
 
-    @cached_property
-    def checks(self) -> Checks:
-        """What the best pose is worth by itself."""
+    @property
+    def is_possible(self) -> bool:
+        """Whether the best pose is worth telling."""
         rules = self.tracked.rules.acceptance
-        return assess(self.ranked[0], self.frame.free, rules) if self.ranked else Checks(rules)
+        return bool(self.ranked) and is_possible(self.ranked[0], self.frame.free, rules)
+
+    @property
+    def convinces(self) -> bool:
+        """Whether the best pose, near its prediction, needs no other to compare with."""
+        rules = self.tracked.rules.acceptance
+        return bool(self.ranked) and convinces(self.ranked[0], self.frame.free, rules)
 
     @property
     def is_sure(self) -> bool:
@@ -134,7 +141,7 @@ def explain(
             for refine in tracked.refinements:
                 for better in refine(frame, likelihood, judged):
                     consider(better, refine.__name__)
-        if quickly and k == 0 and not (first := explained(1)).checks.convinces:
+        if quickly and k == 0 and not (first := explained(1)).convinces:
             return first
     return explained(len(tracked.proposers))
 
@@ -170,8 +177,7 @@ def _verdict(found: Explanation) -> Verdict:
         if why := reason(frame, best, rivals):
             return replace(verdict, doubt=why)
     # a sure pose that has rivals may have them for a reason that can be told
-    checks = found.checks if best is found.ranked[0] else assess(best, frame.free, rules)
-    if not checks.is_sure:
+    if not is_sure(best, frame.free, rules):
         return verdict
     return verdict.doubted(_doubt(found, best, has_rivals=verdict.status != "ok"))
 

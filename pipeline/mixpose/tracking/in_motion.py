@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mixpose.fit import Fit
-from mixpose.judgement import ScoredPose, nearest_alike
-from mixpose.judgement.moments import inverses
+from mixpose.judgement import ScoredPose, inverses, nearest_alike
 from mixpose.matching import ErrorRules, Matches, associate, errors_seen
 from mixpose.objective import View
 from mixpose.records import Floats, Indices, Mask
@@ -67,7 +66,7 @@ class Offsets(NamedTuple):
         prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
         known = np.zeros(len(prior))
         known[:count] = (expected.velocity - velocity)[free] / fast
-        covariance = inverses((design.T @ design / variance + prior.T @ prior)[None])[0]
+        covariance = inverses(design.T @ design / variance + prior.T @ prior)
         x = covariance @ (design.T @ self.offsets / variance + prior.T @ known)
         return x, covariance, self.offsets - design @ x
 
@@ -123,7 +122,7 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     if not np.isfinite(scale) or scale <= 0:
         return judged
     _, together, _ = met.least_squares(motion.velocity, expected, free, scale)
-    extra = together[:count, :count] - scale * inverses(alone[None])[0]
+    extra = together[:count, :count] - scale * inverses(alone)
     values, vectors = np.linalg.eigh((extra + extra.T) / 2)
     covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
     return replace(judged, covariance=covariance)

@@ -13,7 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.fit import Fit, blur_schedule, fit_near
-from mixpose.judgement import Case, RememberedNoise, ScoredPose, judge, nearest_alike
+from mixpose.judgement import RememberedNoise, ScoredPose, judge, nearest_alike
 from mixpose.objective import NormalPrior
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
 from mixpose.records import Floats
@@ -95,10 +95,18 @@ class MatchedLikelihood:
             motion = motion or frame.expected(T).at(T)
             frame = frame.in_motion(motion)
         prior = frame.prior(T if start.T_moved is None else start.T_moved)
-        case = Case(frame.finest, T, frame.track.residuals, prior, start.left_out)
-        if T is fit.T_world_object and motion is None and not start.left_out:
-            case = replace(case, matches=fit.matches, noise=fit.noise)
-        judged = judge(case, frame.free, frame.rules.judgement)
+        is_seen = T is fit.T_world_object and motion is None and not start.left_out
+        judged = judge(
+            frame.finest,
+            T,
+            frame.free,
+            frame.rules.judgement,
+            before=frame.track.residuals,
+            prior=prior,
+            left_out=start.left_out,
+            matches=fit.matches if is_seen else None,
+            noise=fit.noise if is_seen else None,
+        )
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
 
 
@@ -146,11 +154,11 @@ class AssociationLikelihood:
         covariance = np.zeros((6, 6))
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
-        degrees = rules.ranges.stated_degrees + before.total.degrees
+        degrees = rules.ranges.stated_degrees + float(before.total[1])
         covariance *= model.noise.enlargement(count, degrees)
         log_density = frame.prior(T).log_density
         return replace(
-            judge(Case(frame.finest, T), free, model),
+            judge(frame.finest, T, free, model),
             covariance=covariance,
             log_evidence=float(found.log_odds[0]) + log_density + float(volume),
             noise=RememberedNoise(("",), remembered),

@@ -15,7 +15,7 @@ import numpy as np
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.fit import blur_schedule
-from mixpose.judgement import ScoredPose, assess
+from mixpose.judgement import ScoredPose, convinces, is_sure
 from mixpose.objective import matched_objective
 from mixpose.records import Floats
 from mixpose.rigid import perturb
@@ -48,9 +48,9 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     if not ranked:
         return True
     track, rules, best = frame.track, frame.rules, ranked[0]
-    checks = assess(best, frame.free, rules.acceptance)
-    if checks.convinces or not checks.is_sure:
-        return not checks.convinces
+    given = best, frame.free, rules.acceptance
+    if convinces(*given) or not is_sure(*given):
+        return not convinces(*given)
     if track.believed < rules.proposals.believed or track.misses or track.doubted:
         return True
     before = sum(tally.met for tally in track.tallies.values())

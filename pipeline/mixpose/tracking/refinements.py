@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import fdtri
 
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose
-from mixpose.matching import Matches, pooled
+from mixpose.matching import LEAST_VARIANCE, Matches, pooled
 from mixpose.rigid import perturb
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.in_motion import gauss_newton
@@ -53,7 +53,7 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
             continue
         variance = float(squares.sum() - squares[k]) / rest
         limit = max(rules.disagreeing, float(fdtri(own, rest, model.by_chance)))
-        apart[k] = squares[k] / own > limit * max(variance, model.smallest**2)
+        apart[k] = squares[k] / own > limit * max(variance, LEAST_VARIANCE)
     names = [seen.names[k] for k in np.flatnonzero(apart)]
     return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
 

@@ -165,7 +165,7 @@ def _where_expected(moment: Moment) -> Shares:
         owners = expected_owners(moment.views, places, moment.rules.gate)
     for _ in range(moment.rules.rounds):
         shares = shares.after(_at_once(moment, trusted, owners, places))
-        sure = tuple(k for k, one in shares.found.items() if one.checks.convinces)
+        sure = tuple(k for k, one in shares.found.items() if one.convinces)
         shares = replace(shares, claimed=sure)
         owners = shares.owners(moment)
         trusted = [k for k in sure if _is_touched(moment, k, shares.found[k], owners)]
@@ -209,7 +209,7 @@ def _is_touched(moment: Moment, k: int, one: Explanation, owners: Owners) -> boo
 def _on_the_rest(moment: Moment, shares: Shares, waiting: list[int]) -> Shares:
     """Bodies that are not where they are expected, on what is left, the most evident first."""
     shares = shares.after(_everywhere(moment, shares, waiting)) if waiting else shares
-    while possible := [k for k in waiting if shares.found[k].checks.is_possible]:
+    while possible := [k for k in waiting if shares.found[k].is_possible]:
         winner = _most_evident(moment, shares, possible)
         shares = replace(shares, claimed=(*shares.claimed, winner))
         waiting = [k for k in waiting if k != winner]

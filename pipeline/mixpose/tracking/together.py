@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from mixpose.fit import fit_together
-from mixpose.judgement import Case, judge_together, nearest_alike
+from mixpose.judgement import judge_together, nearest_alike
 from mixpose.objective import SharedDensities, can_be_together, matched_objective
 from mixpose.tracking.frame import Begun, Frame
 from mixpose.tracking.likelihood import MatchedLikelihood, Start
@@ -33,7 +33,7 @@ def begun_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Fra
         first.free,
         first.rules.fit,
     )
-    fits, cases = {}, []
+    fits, cases = {}, []  # of judgement: objective, pose, noise before, prior, what the fit saw
     for k, end in zip(some, ascents, strict=True):
         if end is not None:
             objective, ascent = end
@@ -42,10 +42,8 @@ def begun_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Fra
             start = Start(expected.T_world_object, expected.uncertainty, expected)
             fits[k] = MatchedLikelihood(data).fit(start, ascent)
             T = nearest_alike(fits[k].T_world_object, data.body, data.T_reference)
-            case = Case(data.finest, T, data.track.residuals, data.prior(T))
-            if T is fits[k].T_world_object:
-                case = replace(case, matches=fits[k].matches, noise=fits[k].noise)
-            cases.append(case)
+            seen = (fits[k].matches, fits[k].noise) if T is fits[k].T_world_object else (None, None)
+            cases.append((data.finest, T, data.track.residuals, data.prior(T), *seen))
     judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
     for (k, fit), found in zip(fits.items(), judged, strict=True):
         begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, found))
