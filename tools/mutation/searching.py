@@ -67,7 +67,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-what-is-seen-again-is-surer",
-        "tracking/recognition.py",
+        "tracking/doubt.py",
         "judged.log_evidence - max(gained, 0.0) <=",
         "judged.log_evidence <=",
         "another body that looks alike to one camera is ok after a frame or two",
@@ -230,7 +230,7 @@ _PROPOSALS = (
 _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
-        "tracking/recognition.py",
+        "tracking/doubt.py",
         "and _evidence(there, start) > judged.log_evidence + ahead:",
         "and _evidence(there, start) > 1e9:",
         "the body in a window is taken for the body",
@@ -238,7 +238,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
-        "tracking/recognition.py",
+        "tracking/doubt.py",
         "and _evidence(there, start) > judged.log_evidence + ahead:",
         "and _evidence(there, start) > -1e9:",
         "a flat body with a hidden marker is never sure",
@@ -246,15 +246,15 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-bodies-nearly-flat-are-their-mirror-images",
-        "tracking/recognition.py",
-        "return thickness(body) < _FLAT",
+        "tracking/doubt.py",
+        "return thickness(body) < 1e-6",
         "return thickness(body) < 0.9",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
     ),
     Mutant(
         "tracking-a-body-given-mirrored-passes",
-        "tracking/recognition.py",
+        "tracking/doubt.py",
         "return any(_evidence(mirror, start) > own + ahead for start in starts)",
         "return False",
         "few markers of a body given mirrored are met by chance, and the pose is ok",
@@ -262,7 +262,7 @@ _REFLECTION = (
     ),
     Mutant(
         "tracking-few-markers-are-a-mirror-image",
-        "tracking/recognition.py",
+        "tracking/doubt.py",
         "return any(_evidence(mirror, start) > own + ahead for start in starts)",
         "return any(_evidence(mirror, start) > -1e9 for start in starts)",
         "a body whose markers are hidden beside false points is never sure",

@@ -2,73 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from mixpose.fit import Fit
-from mixpose.judgement import (
-    APART,
-    Checks,
-    ScoredPose,
-    Verdict,
-    assess,
-    contradict,
-    decide,
-    insert,
-)
-from mixpose.tracking.claims import Claim, Unclaimed, claims_of
+from mixpose.judgement import Checks, ScoredPose, Verdict, assess, decide, insert
+from mixpose.records import Mask
+from mixpose.tracking.doubt import doubt_about
 from mixpose.tracking.likelihood import FrameData, Likelihood, Start, likelihood_of
 from mixpose.tracking.proposers.look_alikes import reason
-from mixpose.tracking.recognition import (
-    ALONE,
-    MIRRORED,
-    TRIANGLE,
-    is_alone,
-    is_known,
-    is_reflection,
-)
-from mixpose.tracking.tracked_body import TrackedBody
+
+if TYPE_CHECKING:
+    from mixpose.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What one body makes of what is left of a frame.
+    """What one body makes of what is left of a frame for it."""
 
-    Attributes
-    ----------
-    tracked : TrackedBody
-    frame : FrameData
-    left : Unclaimed
-        What `frame` has of all that was seen.
-    ranked : tuple of ScoredPose
-        Distinct poses, most evident first.
-    tried : int
-        How many of the proposers were asked.
-    fits : tuple of Fit
-        That were judged.
-    likelihood : Likelihood or None
-        None where nothing was seen.
-    """
-
-    tracked: TrackedBody
+    tracked: Tracker
     frame: FrameData
-    left: Unclaimed
-    ranked: tuple[ScoredPose, ...] = ()
-    tried: int = 0
-    fits: tuple[Fit, ...] = ()
-    likelihood: Likelihood | None = None
+    sensors: int = 1  # that had a frame, also those that saw nothing
+    left: Mask = field(default_factory=lambda: np.ones(0, np.bool_))  # (D,), see `Claims.left`
+    ranked: tuple[ScoredPose, ...] = ()  # distinct poses, most evident first
+    tried: int = 0  # of the proposers
+    fits: tuple[Fit, ...] = ()  # that were judged
+    likelihood: Likelihood | None = None  # that they are of
 
     @cached_property
     def checks(self) -> Checks:
         """What the best pose is worth by itself."""
-        rules = self.tracked.rules.acceptance
+        rules = self.frame.rules.acceptance
         return assess(self.ranked[0], self.frame.free, rules) if self.ranked else Checks(rules)
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether the verdict is ok."""
-        return self.verdict.status == "ok"
 
     @property
     def evidence(self) -> float:
@@ -76,41 +45,33 @@ class Explanation:
         return self.ranked[0].log_evidence
 
     @cached_property
-    def claims(self) -> Mapping[str, Claim]:
-        """The detections that the best pose meets, by sensor."""
-        return claims_of(self.ranked[0], self.left)
-
-    @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return _verdict(self)
+        data = self.frame
+        verdict = decide(self.ranked, data.free, data.rules.acceptance)
+        best, has_rivals = verdict.best, verdict.status != "ok"
+        if best is None:
+            return verdict
+        if has_rivals:
+            rivals = [one for one, _ in verdict.kept if one is not best]
+            if why := reason(data, best, rivals):
+                return replace(verdict, doubt=why)
+        # a sure pose that has rivals may have them for a reason that can be told
+        if not assess(best, data.free, data.rules.acceptance).is_sure:
+            return verdict
+        return verdict.doubted(doubt_about(data, best, self.sensors, has_rivals=has_rivals))
 
 
-def explain(
-    tracked: TrackedBody,
-    frame: FrameData,
-    left: Unclaimed,
-    before: Explanation | None = None,
-    *,
-    quickly: bool = False,
-) -> Explanation:
+def explain(begun: Explanation, *, quickly: bool = False) -> Explanation:
     """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
 
-    Parameters
-    ----------
-    tracked : TrackedBody
-    frame : FrameData
-    left : Unclaimed
-        The views of `frame`.
-    before : Explanation or None
-        Of the same frame, by the first proposers, after which the others go on.
-    quickly : bool
-        Whether to stop where the body is not convincing where it is expected.
+    Goes on after the proposers that were tried already; `quickly` stops where the body is not
+    convincing where it is expected.
     """
-    begun = before or Explanation(tracked, frame, left)
-    if not frame.views or begun.tried == len(tracked.proposers):
+    tracked, data = begun.tracked, begun.frame
+    if not data.views or begun.tried == len(tracked.proposers):
         return begun
-    likelihood = begun.likelihood or likelihood_of(frame)
+    likelihood = begun.likelihood or likelihood_of(data)
     ranked, fits = list(begun.ranked), list(begun.fits)
 
     def consider(start: Start, name: str) -> ScoredPose | None:
@@ -119,72 +80,36 @@ def explain(
             return None  # judged before, and by the same prior
         fits.append(fit)
         judged = replace(likelihood.judge(fit, start), proposer=name, blurs=fit.blurs)
-        insert(ranked, judged, tracked.body, frame.free, tracked.rules.acceptance)
+        insert(ranked, judged, tracked.body, data.free, data.rules.acceptance)
         return judged
 
     def explained(tried: int) -> Explanation:
-        return Explanation(tracked, frame, left, tuple(ranked), tried, tuple(fits), likelihood)
+        poses, judged = tuple(ranked), tuple(fits)
+        return replace(begun, ranked=poses, tried=tried, fits=judged, likelihood=likelihood)
 
     for k, propose in enumerate(tracked.proposers[begun.tried :], begun.tried):
-        for start in propose(frame, ranked):
+        for start in propose(data, ranked):
             judged = consider(start, propose.__name__)
             if judged is None:
                 continue
             for refine in tracked.refinements:
-                for better in refine(frame, likelihood, judged):
+                for better in refine(data, likelihood, judged):
                     consider(better, refine.__name__)
         if quickly and k == 0 and not (first := explained(1)).checks.convinces:
             return first
     return explained(len(tracked.proposers))
 
 
-def explain_by(
-    tracked: TrackedBody,
-    frame: FrameData,
-    left: Unclaimed,
-    poses: Sequence[ScoredPose],
-    *,
-    fitted: bool,
+def judged_by(
+    other: Explanation, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> Explanation:
-    """Poses judged by other views, and fitted to them, most evident first."""
-    ranked: list[ScoredPose] = []
-    likelihood = likelihood_of(frame)
-    for one in poses if frame.views else ():
-        start = Start(one.T_world_object, frame.close if fitted else None, left_out=one.left_out)
+    """Poses judged by another frame, and `fitted` to it, most evident first."""
+    data, ranked = other.frame, list[ScoredPose]()
+    likelihood = likelihood_of(data)
+    for one in poses if data.views else ():
+        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
         fit = likelihood.fit(start)
         blurs = fit.blurs or one.blurs
         judged = replace(likelihood.judge(fit, start), proposer=one.proposer, blurs=blurs)
-        insert(ranked, judged, tracked.body, frame.free, tracked.rules.acceptance)
-    return Explanation(tracked, frame, left, tuple(ranked), len(tracked.proposers))
-
-
-def _verdict(found: Explanation) -> Verdict:
-    frame, rules = found.frame, found.tracked.rules.acceptance
-    verdict = decide(found.ranked, frame.free, rules)
-    best = verdict.best
-    if best is None:
-        return verdict
-    if verdict.status != "ok":
-        rivals = [one for one, _ in verdict.kept if one is not best]
-        if why := reason(frame, best, rivals):
-            return replace(verdict, doubt=why)
-    # a sure pose that has rivals may have them for a reason that can be told
-    checks = found.checks if best is found.ranked[0] else assess(best, frame.free, rules)
-    if not checks.is_sure:
-        return verdict
-    return verdict.doubted(_doubt(found, best, has_rivals=verdict.status != "ok"))
-
-
-def _doubt(found: Explanation, best: ScoredPose, *, has_rivals: bool) -> str:
-    """Why a pose that is sure by itself is in doubt all the same; empty where it is not."""
-    frame, rules = found.frame, found.tracked.rules
-    if is_reflection(frame, best):
-        return MIRRORED
-    before, noise = frame.track.residuals.total, rules.judgement.noise
-    if contradict(best, before, frame.track.agreed, rules.acceptance, noise):
-        return APART
-    if has_rivals:
-        return ""
-    if not is_known(frame, best):
-        return TRIANGLE
-    return ALONE if is_alone(frame, best, found.left.sensors) else ""
+        insert(ranked, judged, data.body, data.free, data.rules.acceptance)
+    return replace(other, ranked=tuple(ranked), tried=len(other.tracked.proposers))

@@ -13,16 +13,15 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement import AcceptanceRules
 from mixpose.objective import View, project_body
-from mixpose.records import PointPattern
+from mixpose.records import Estimate, Mask
 from mixpose.sensors import Sensor
-from mixpose.tracking.scene import Outcome, Scene
+from mixpose.tracking.scene import Scene
 from mixpose.tracking.track import Prediction, SensorTally, Track
 
 Box: TypeAlias = tuple[int, int, int, int]
@@ -31,30 +30,23 @@ Observe: TypeAlias = Callable[[Mapping[str, Box]], list[View]]
 
 
 @dataclass(frozen=True)
-class GatingRules:
-    """How far around a prediction features are looked for."""
+class Expectation:
+    """A body in front of cameras, and how far around a prediction its features are looked for."""
 
+    body: Body
+    cameras: Mapping[str, Sensor]  # by name; with two coordinates, in px
+    free: Mask  # (6,), directions that are estimated
     reach: float = constant(
         4.0, "standard deviations of the prediction, and of features that have a spread"
     )
     min_margin_px: float = constant(40.0, "around the predicted features: a spot and its ground")
-
-
-@dataclass(frozen=True)
-class Expectation:
-    """A body in front of cameras."""
-
-    body: Body
-    cameras: Mapping[str, Sensor]  # by name; with two coordinates, in px
-    free: NDArray[np.bool_]  # (6,), directions that are estimated
-    rules: GatingRules = GatingRules()
 
     @cached_property
     def _feature_reach(self) -> float:
         """How far a feature's image reaches: less than half way to that of its neighbour."""
         points = self.body.nodes.points
         apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
-        return float(apart / 2 + self.rules.reach * self.body.spread)
+        return float(apart / 2 + self.reach * self.body.spread)
 
     def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
         """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
@@ -70,8 +62,8 @@ class Expectation:
         uncertainty = np.array([one.uncertainty for one in predictions])
         by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self.free) ** 2)
         scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
-        rims = np.maximum(scales * self._feature_reach, self.rules.min_margin_px)
-        margins = self.rules.reach * np.sqrt(by_pose) + rims[..., None, None]
+        rims = np.maximum(scales * self._feature_reach, self.min_margin_px)
+        margins = self.reach * np.sqrt(by_pose) + rims[..., None, None]
         seen = at.seen[..., None]
         lower = np.where(seen, at.y - margins, np.inf).min(axis=(1, 2)).tolist()
         upper = np.where(seen, at.y + margins, -np.inf).max(axis=(1, 2)).tolist()
@@ -101,11 +93,9 @@ def are_as_good(tallies: Tallies, before: Tallies) -> bool:
 
 def have_fewer(views: Sequence[View], before: Tallies) -> bool:
     """Whether a camera has fewer detections than it met features in the frame before."""
+    seen = {view.name: view.observation.points for view in views if view.name in before}
     return any(
-        isinstance(view.observation.pattern, PointPattern)
-        and view.name in before
-        and len(view.observation.pattern.points) < before[view.name].met
-        for view in views
+        points is not None and len(points) < before[name].met for name, points in seen.items()
     )
 
 
@@ -113,12 +103,8 @@ def have_fewer(views: Sequence[View], before: Tallies) -> bool:
 class WindowedScene:
     """A scene that looks where its bodies are expected, and at all there is if that is too little.
 
-    Attributes
-    ----------
-    scene : Scene
-    expectations : tuple of Expectation
-        One per body; their cameras are those whose features in a part of the image are those of
-        the whole image.
+    The cameras of its expectations, one per body, are those whose features in a part of the image
+    are those of the whole image.
     """
 
     scene: Scene
@@ -136,41 +122,34 @@ class WindowedScene:
         time_s: float | None,
         observe: Observe,
         images: Collection[str],
-    ) -> tuple[list[Outcome], list[View]]:
+    ) -> tuple[tuple[Track, ...], list[Estimate], list[View]]:
         """Estimate a frame: around the predictions if that convinces, else from all that is there.
 
-        Parameters
-        ----------
-        tracks, frame, time_s
-            As of `Scene.advance`.
-        observe : callable
-            From boxes of pixels by camera to the views of all sensors; cameras without a box are
-            seen whole.
-        images : collection of str
-            Cameras of which the frame has an image.
+        As `Scene.advance`, of views that `observe` makes of boxes of pixels by camera; cameras
+        without a box are seen whole, and only those in `images` can have one.
         """
-        if self._are_followed(tracks):
-            windows = self._windows(tracks, frame, time_s, images)
-            views = observe(windows) if windows else []
-            if windows and not any(have_fewer(views, track.tallies) for track in tracks):
-                outcomes = self.scene.advance(tracks, frame, time_s, views)
-                after = [one.track for one in outcomes]
-                if self._are_followed(after) and all(
-                    are_as_good(now.tallies, then.tallies)
-                    for now, then in zip(after, tracks, strict=True)
+        windows = self._windows(tracks, frame, time_s, images) if self._are_met(tracks) else {}
+        if windows:
+            views = observe(windows)
+            if not any(have_fewer(views, track.tallies) for track in tracks):
+                after, estimates = self.scene.advance(tracks, frame, time_s, views)
+                pairs = zip(after, tracks, strict=True)
+                if self._are_met(after) and all(
+                    are_as_good(now.tallies, then.tallies) for now, then in pairs
                 ):
-                    return outcomes, views
+                    return after, estimates, views
         views = observe({})
-        return self.scene.advance(tracks, frame, time_s, views), views
+        return *self.scene.advance(tracks, frame, time_s, views), views
 
-    def _are_followed(self, tracks: Sequence[Track]) -> bool:
+    def _are_met(self, tracks: Sequence[Track]) -> bool:
         """Whether the last frame was sure of all bodies, and met most of each."""
-        bodies = zip(self.scene.bodies, self.expectations, tracks, strict=True)
         return all(
             not track.misses
             and not track.doubted
             and is_convincing(track.tallies, expected.cameras, tracked.rules.acceptance)
-            for tracked, expected, track in bodies
+            for tracked, expected, track in zip(
+                self.scene.bodies, self.expectations, tracks, strict=True
+            )
         )
 
     def _windows(
@@ -178,11 +157,8 @@ class WindowedScene:
     ) -> dict[str, Box]:
         """In which part of each image the bodies are expected, one window around all of them."""
         windows: dict[str, Box] = {}
-        if not images:
-            return windows
-        for tracked, expected, track in zip(
-            self.scene.bodies, self.expectations, tracks, strict=True
-        ):
+        each = zip(self.scene.bodies, self.expectations, tracks, strict=True)
+        for tracked, expected, track in each if images else ():
             for name, box in expected.windows(tracked.predictions(track, frame, time_s)).items():
                 if name in images:
                     a, b, c, d = windows.get(name, box)

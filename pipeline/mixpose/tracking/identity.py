@@ -12,7 +12,6 @@ x coordinate (then y, then z) of their origins.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,124 +20,76 @@ from mixpose.records import Floats
 from mixpose.tracking.explain import Explanation
 from mixpose.tracking.likelihood import FrameData
 
-_EVEN = float(np.log(0.5))  # odds of an exchange where nobody knows, against the likelier way
+Rivals = dict[int, list[tuple[int, float]]]
 
 
-@dataclass(frozen=True)
-class Identities:
-    """The outcome for one group of identical bodies.
-
-    Attributes
-    ----------
-    poses : mapping of int to int
-        The member that found the pose that each member gets; none for those without a pose.
-    exchanged : mapping of int to sequence of (int, float)
-        By member in doubt: members whose poses it may have instead, and the odds of each.
-    """
-
-    poses: Mapping[int, int]
-    exchanged: Mapping[int, Sequence[tuple[int, float]]]
-
-
-def identify(group: Sequence[int], explained: Mapping[int, Explanation]) -> Identities:
+def identify(
+    group: Sequence[int], found: Mapping[int, Explanation]
+) -> tuple[dict[int, int], Rivals]:
     """Tell which of some identical bodies has which pose.
 
-    Where two were lost together for so long that no velocity is believed any more, they may have
-    changed places, wherever they were before.
+    Returns the member that found what each member gets; and of members in doubt those whose poses
+    they may have instead, with odds: their own, where they may have none.
     """
-    data = {k: explained[k].frame for k in group}
-    bests = {k: explained[k].verdict.best for k in group}
-    found = {k: best.T_world_object for k, best in bests.items() if best is not None}
-    rules = explained[group[0]].tracked.rules
-    known = [k for k in group if data[k].predictions]
-    finders = sorted(found, key=lambda k: tuple(np.round(found[k][:3, 3], 6)))
+    bests = {k: found[k].verdict.best for k in group}
+    poses = {k: best.T_world_object for k, best in bests.items() if best is not None}
+    finders = sorted(poses, key=lambda k: tuple(np.round(poses[k][:3, 3], 6)))
+    known = [k for k in group if found[k].frame.predictions]
     if not finders:
-        return Identities({}, {})
-    likely = _likelihoods(known, finders, found, data)
-    poses = _assigned(group, known, finders, likely)
-    lost = {k for k in known if data[k].track.misses > rules.motion.coasting}
-    limit = float(np.log(rules.acceptance.rival))
-    return Identities(poses, _exchanges(known, poses, finders, likely, limit, lost))
-
-
-def _likelihoods(
-    known: Sequence[int],
-    finders: Sequence[int],
-    found: Mapping[int, Floats],
-    data: Mapping[int, FrameData],
-) -> Floats:
-    """Log density of each pose (columns) for each body that was known (rows), where it counts.
-
-    It is not worked out where the pose is far from all that was predicted: there it is that of
-    a surprise.
-    """
-    likely = np.zeros((len(known), len(finders)))
-    for i, k in enumerate(known):
-        one = data[k]
-        surprise = _surprise(one)
-        for j, finder in enumerate(finders):
-            T = found[finder]
-            near = any(_may_be(T, p.T_world_object, p.uncertainty) for p in one.predictions)
-            likely[i, j] = one.prior(T).log_density if near else surprise
-    return likely
-
-
-def _surprise(data: FrameData) -> float:
-    """Log density of a pose that is where nothing was predicted."""
-    chance = min(data.rules.motion.surprise * (1 + data.track.misses), 1.0)
-    return float(np.log(chance)) + data.anywhere.log_density
-
-
-def _may_be(T: Floats, T_predicted: Floats, uncertainty: Floats) -> bool:
-    """Whether a position is within ten standard deviations of a prediction."""
-    spread = np.maximum(uncertainty[:3], 1e-12)
-    return bool((np.abs(T[:3, 3] - T_predicted[:3, 3]) < 10 * spread).all())
-
-
-def _assigned(
-    group: Sequence[int], known: Sequence[int], finders: Sequence[int], likely: Floats
-) -> dict[int, int]:
-    """Poses for known bodies, as likely as can be; then for the others, in order."""
-    poses: dict[int, int] = {}
+        return {k: k for k in group}, {}
+    likely = np.array([_log_densities(found[k].frame, [poses[j] for j in finders]) for k in known])
+    has: dict[int, int] = {}  # number of the pose of a member, among those found
     if known:
-        for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
-            poses[known[i]] = finders[j]
-    left = [finder for finder in finders if finder not in poses.values()]
-    rest = [k for k in group if k not in known and k not in poses]
-    poses.update(zip(rest, left, strict=False))
-    return poses
+        rows, columns = linear_sum_assignment(likely, maximize=True)
+        has = {known[i]: int(j) for i, j in zip(rows, columns, strict=True)}
+    spare = [j for j in range(len(finders)) if j not in has.values()]
+    has |= dict(zip([k for k in group if k not in known], spare, strict=False))
+    given = {k: finders[j] for k, j in has.items()}
+    without = iter([k for k in group if k not in given.values()])
+    assigned = {k: given[k] if k in given else next(without) for k in group}
+    return assigned, _exchanges(known, has, finders, likely, found) if known else {}
 
 
 def _exchanges(
     known: Sequence[int],
-    poses: Mapping[int, int],
+    has: Mapping[int, int],
     finders: Sequence[int],
     likely: Floats,
-    limit: float,
-    lost: set[int],
-) -> dict[int, list[tuple[int, float]]]:
+    found: Mapping[int, Explanation],
+) -> Rivals:
     """Members whose poses might be each other's; one without a pose might have any other's."""
-    exchanged: dict[int, list[tuple[int, float]]] = {}
-    row = {k: i for i, k in enumerate(known)}
-    column = {finder: j for j, finder in enumerate(finders)}
-    for a in known:
-        for b in known:
-            if a == b or a not in poses:
-                continue
-            mine, theirs = column[poses[a]], column.get(poses.get(b, -1))
-            if theirs is None:
-                # b has none: a's pose may be b's, and a the one that is lost
-                odds = likely[row[b], mine] - likely[row[a], mine]
-            elif a < b:
-                odds = likely[row[a], theirs] + likely[row[b], mine]
-                odds -= likely[row[a], mine] + likely[row[b], theirs]
-            else:
-                continue
-            if {a, b} <= lost:
-                odds = max(odds, _EVEN)
-            if odds > limit:
-                share = float(np.exp(min(odds, 0.0)))
-                exchanged.setdefault(a, []).append((poses.get(b, poses[a]), share))
-                if theirs is not None:
-                    exchanged.setdefault(b, []).append((poses[a], share))
+    rules = found[known[0]].frame.rules
+    # a member without a pose has one that says nothing
+    columns = [has.get(k, len(finders)) for k in known]
+    of = np.pad(likely, ((0, 0), (0, 1)))[:, columns]
+    odds = of + of.T - of.diagonal() - of.diagonal()[:, None]
+    # no velocity is believed any more: they may have changed places, wherever they were before
+    lost = np.array([found[k].frame.track.misses > rules.motion.coasting for k in known])
+    odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
+    exchanged: Rivals = {}
+    for i, j in zip(*np.nonzero(odds > np.log(rules.acceptance.rival)), strict=True):
+        a, b = known[i], known[j]
+        if a != b and a in has:
+            share = float(np.exp(min(odds[i, j], 0.0)))
+            exchanged.setdefault(a, []).append((finders[has[b if b in has else a]], share))
     return exchanged
+
+
+def _log_densities(data: FrameData, poses: Sequence[Floats]) -> list[float]:
+    """Log density of poses for a body that was known, where it counts.
+
+    It is not worked out where the pose is more than ten standard deviations from all that was
+    predicted: there it is that of a surprise.
+    """
+    chance = min(data.rules.motion.surprise * (1 + data.track.misses), 1.0)
+    surprise = float(np.log(chance)) + data.anywhere.log_density
+
+    def is_near(T: Floats) -> bool:
+        return any(
+            (
+                np.abs(T - one.T_world_object)[:3, 3] < 10 * np.maximum(one.uncertainty[:3], 1e-12)
+            ).all()
+            for one in data.predictions
+        )
+
+    return [data.prior(T).log_density if is_near(T) else surprise for T in poses]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,53 +12,53 @@ from mixpose.body import Body
 from mixpose.judgement import APART, ScoredPose, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
+from mixpose.tracking.doubt import is_known
 from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import FrameData
-from mixpose.tracking.recognition import is_known
 from mixpose.tracking.track import Found, SensorTally, Track, follow
-from mixpose.tracking.tracked_body import TrackedBody
 
 
 def estimate_of(
-    tracked: TrackedBody,
     data: FrameData,
     views: Sequence[View],
     verdict: Verdict,
-    ranked: Sequence[ScoredPose],
+    shown: ScoredPose | None,
+    *,
+    after: Track,
+    instance: int | None,
 ) -> Estimate:
-    """The estimate of a frame, with reports of the best pose, believed or not."""
-    body, best = tracked.body, verdict.best
-    told = best or next(iter(ranked), None)
-    hypotheses = [Hypothesis(one.T_world_object, weight) for one, weight in verdict.kept]
+    """The estimate of a frame, with reports of the pose that is shown, believed or not."""
+    best, offsets = verdict.best, _offsets(shown, data.body) if shown else {}
     reports = {view.name: SensorReport(False) for view in views}
-    reports |= told.sensors if told else {}
-    offsets = _offsets(told, body) if told else {}
+    if shown:
+        reports |= shown.sensors
     for name, one in offsets.items():
         lengths = np.linalg.norm(one.offsets, axis=1).tolist()
-        labels = [body.labels[i] for i in one.features]
-        by_label = zip(labels, lengths, one.met, strict=True)
-        residuals = {label: length if met else None for label, length, met in by_label}
+        rows = zip(one.features.tolist(), lengths, one.met.tolist(), strict=True)
+        residuals = {data.body.labels[i]: length if met else None for i, length, met in rows}
         reports[name] = replace(reports[name], residuals=residuals)
+    rivals = verdict.kept if verdict.status == "ambiguous" else ()
     return Estimate(
         frame=data.frame,
         time_s=data.time_s,
-        object=body.name,
+        object=data.body.name,
         status=verdict.status,
         T_world_object=best.T_world_object if best else None,
         covariance=best.covariance if best else None,
-        score=told.score if told else 0.0,
+        score=shown.score if shown else 0.0,
         sensors=reports,
-        hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),
-        instance=tracked.instance,
+        hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
+        instance=instance,
         proposer=best.proposer if best else "",
         blurs=best.blurs if best else (),
         guesses=data.log.report,
+        delays=after.delays.seconds(),
         doubt=verdict.doubt,
         offsets=offsets,
     )
 
 
-def _offsets(judged: ScoredPose, body: Body) -> dict[str, Offsets]:
+def _offsets(judged: ScoredPose, body: Body) -> Mapping[str, Offsets]:
     """By how much each sensor met the features of a body whose features are points."""
     if len(body.nodes.points) != len(body):
         return {}
@@ -74,24 +74,24 @@ def _offsets(judged: ScoredPose, body: Body) -> dict[str, Offsets]:
     return offsets
 
 
-def followed(tracked: TrackedBody, data: FrameData, verdict: Verdict) -> Track:
+def followed(data: FrameData, verdict: Verdict) -> Track:
     """The track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
     if best is None:
-        clutter = track.clutter.learnt(data.views, tracked.rules.static)
+        clutter = track.clutter.learnt(data.views, data.rules.static)
         return replace(track.missed(data.log.state, clutter), doubted=True)
     found = []
     for one, weight in verdict.kept:
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
-        spread = one.spread if tracked.options.fuse else None
         momentary = np.diagonal(one.covariance - one.persistent)
         deviation = np.sqrt(momentary) if is_timed(data.views) else None
+        spread = one.spread if data.options.fuse else None
         found.append(Found(one.T_world_object, belief, spread, deviation))
     used = best.used
     met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
     tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
-    least = tracked.rules.acceptance.agreeing
+    least = data.rules.acceptance.agreeing
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     return replace(

@@ -9,55 +9,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 from mixpose.judgement import ScoredPose, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate
-from mixpose.tracking.doubt import may_be_another
-from mixpose.tracking.explain import Explanation
+from mixpose.tracking.doubt import look_alike_of
+from mixpose.tracking.explain import Explanation, explain
 from mixpose.tracking.identity import identify
 from mixpose.tracking.outcome import estimate_of, followed
 from mixpose.tracking.rules import SceneRules
-from mixpose.tracking.sharing import Moment, shared_out
+from mixpose.tracking.sharing import Sharing
 from mixpose.tracking.track import Companion, Track
-from mixpose.tracking.tracked_body import TrackedBody
 
-
-class Outcome(NamedTuple):
-    """A frame of one body: what is known after it, and its estimate."""
-
-    track: Track
-    estimate: Estimate
-
-
-@dataclass(frozen=True)
-class Decided:
-    """A body's poses, its verdict by itself, and what is told where others cast doubt."""
-
-    explained: Explanation
-    verdict: Verdict
-    told: Verdict
-
-    def doubted(self, rivals: Sequence[tuple[ScoredPose, float]]) -> Decided:
-        """The same, told to be ambiguous with poses that it may have instead, and their odds."""
-        best = self.verdict.best
-        if best is None:
-            return self
-        # odds that it has none, as its pose is another's, stand beside the poses
-        total = sum(weight for _, weight in self.verdict.kept) + sum(odds for _, odds in rivals)
-        kept = [*self.verdict.kept, *((one, odds) for one, odds in rivals if one is not best)]
-        kept = [(one, weight / total) for one, weight in kept]
-        first = next(pair for pair in kept if pair[0] is best)
-        kept = [first, *sorted((p for p in kept if p is not first), key=lambda p: -p[1])]
-        return replace(self, told=Verdict("ambiguous", best, kept))
+if TYPE_CHECKING:
+    from mixpose.tracking.tracker import Tracker
 
 
 @dataclass(frozen=True)
 class Scene:
     """All bodies that are before the sensors, in the order of their pose lines."""
 
-    bodies: tuple[TrackedBody, ...]
+    bodies: tuple[Tracker, ...]
     rules: SceneRules = SceneRules()
 
     def begin(self) -> tuple[Track, ...]:
@@ -66,86 +39,92 @@ class Scene:
 
     def advance(
         self, tracks: Sequence[Track], frame: int, time_s: float | None, views: Sequence[View]
-    ) -> list[Outcome]:
-        """Estimate one frame of every body.
+    ) -> tuple[tuple[Track, ...], list[Estimate]]:
+        """Estimate one frame of every body: tracks for the next, and estimates without latency.
 
-        Parameters
-        ----------
-        tracks : sequence of Track
-            One per body.
-        frame : int
-        time_s : float or None
-        views : sequence of View
-            All sensors with a frame; those that saw nothing are reported and left out.
-
-        Returns
-        -------
-        list of Outcome
-            Tracks for the next frame, and estimates without their latency.
+        `views` are all sensors with a frame; those that saw nothing are reported and left out.
         """
-        seen = tuple(view for view in views if not view.observation.is_empty)
-        moment = Moment(self.bodies, tracks, frame, time_s, seen, len(views), self.rules)
-        found = shared_out(moment).found
-        decided = self._doubted(self._identified(found), found)
-        outcomes = []
-        for k, tracked in enumerate(self.bodies):
-            data, verdict = found[k].frame, decided[k].verdict
-            ranked = decided[k].explained.ranked
-            after = followed(tracked, data, verdict)
-            estimate = estimate_of(tracked, data, views, decided[k].told, ranked)
-            outcomes.append(Outcome(after, replace(estimate, delays=after.delays.seconds())))
-        return self._acquainted(outcomes)
-
-    def _identified(self, found: Mapping[int, Explanation]) -> list[Decided]:
-        """Poses of identical bodies given to those that they belong to, with doubts."""
-        decided = [
-            Decided(found[k], found[k].verdict, found[k].verdict) for k in range(len(self.bodies))
-        ]
-        for group in self._identical():
-            told = identify(group, found)
-            before = {k: decided[k] for k in group}
-            spare = [before[k] for k in group if k not in told.poses.values()]
-            for k in group:
-                decided[k] = before[told.poses[k]] if k in told.poses else spare.pop(0)
-            for k, rivals in told.exchanged.items():
-                others = [(before[finder].verdict.best, odds) for finder, odds in rivals]
-                decided[k] = decided[k].doubted([(b, odds) for b, odds in others if b is not None])
-        return decided
-
-    def _identical(self) -> list[list[int]]:
-        """Numbers of the bodies that are identical, group by group."""
-        alike: dict[int, list[int]] = {}
-        for k, tracked in enumerate(self.bodies):
-            alike.setdefault(id(tracked.body), []).append(k)
-        return [group for group in alike.values() if len(group) > 1]
-
-    def _doubted(self, decided: list[Decided], found: Mapping[int, Explanation]) -> list[Decided]:
-        """The same; in doubt where the pose might as well be another body's, or another one."""
-        if len(self.bodies) == 1:  # three markers of it are in doubt in any case
-            return decided
-        sure = [one.told.status == "ok" for one in decided]
-        after = list(decided)
-        for k, one in enumerate(decided):
-            best = one.verdict.best
-            if sure[k] and best is not None:
-                verdict = one.verdict.doubted(may_be_another(k, best, self.bodies, found, sure))
-                after[k] = replace(one, verdict=verdict, told=verdict)
-        return after
-
-    def _acquainted(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """The same, and where bodies are beside each other; identical ones may be exchanged."""
-        sure = {
-            tracked.label: one.estimate.T_world_object
-            for tracked, one in zip(self.bodies, outcomes, strict=True)
-            if tracked.instance is None and one.estimate.status == "ok"
-        }
         if len(self.bodies) == 1:
-            return list(outcomes)
-        after = []
-        for tracked, (track, estimate) in zip(self.bodies, outcomes, strict=True):
-            known, T = dict(track.companions), sure.get(tracked.label)
-            for label, T_other in sure.items() if T is not None else ():
-                if label != tracked.label and T is not None and T_other is not None:
+            data = self.bodies[0].data(tracks[0], frame, time_s, views)
+            found = {0: explain(Explanation(self.bodies[0], data, len(views)))}
+        else:
+            seen = [view for view in views if not view.observation.is_empty]
+            sharing = Sharing(self.bodies, tracks, frame, time_s, seen, len(views), self.rules)
+            found = sharing.explained()
+        finders, rivals = self._identified(found)
+        verdicts = {k: found[finders[k]].verdict for k in found}
+        told = {k: _in_doubt(verdicts[k], rivals.get(k, ())) for k in found}
+        for k, why in self._look_alikes(told, found).items():
+            verdicts[k] = told[k] = verdicts[k].doubted(why)
+        after, estimates = [], []
+        for k, tracked in enumerate(self.bodies):
+            shown = told[k].best or next(iter(found[finders[k]].ranked), None)
+            after.append(followed(found[k].frame, verdicts[k]))
+            given = found[k].frame, views, told[k], shown
+            estimates.append(estimate_of(*given, after=after[k], instance=tracked.instance))
+        return self._acquainted(after, estimates), estimates
+
+    def _identified(
+        self, found: Mapping[int, Explanation]
+    ) -> tuple[dict[int, int], dict[int, list[tuple[ScoredPose, float]]]]:
+        """By body, the one that found what it gets, and poses that it may have, with odds."""
+        groups: dict[int, list[int]] = {}
+        for k, tracked in enumerate(self.bodies):
+            groups.setdefault(id(tracked.body), []).append(k)
+        finders, rivals = {k: k for k in found}, {}
+        for group in groups.values():
+            if len(group) > 1:
+                given, exchanged = identify(group, found)
+                finders |= given
+                for k, others in exchanged.items():
+                    poses = [(found[j].verdict.best, odds) for j, odds in others]
+                    rivals[k] = [(pose, odds) for pose, odds in poses if pose is not None]
+        return finders, rivals
+
+    def _look_alikes(
+        self, told: Mapping[int, Verdict], found: Mapping[int, Explanation]
+    ) -> dict[int, str]:
+        """Why sure poses might as well be another body's that is not surely elsewhere."""
+        doubts = {}
+        sure = {k: verdict.best for k, verdict in told.items() if verdict.status == "ok"}
+        for k, best in sure.items() if len(self.bodies) > 1 else ():
+            # a body's own markers may repeat themselves: then it may be turned another way
+            others = [
+                found[j].frame
+                for j, other in enumerate(self.bodies)
+                if j == k or not (j in sure or other.body is self.bodies[k].body)
+            ]
+            if best is not None and (why := look_alike_of(found[k].frame, best, others)):
+                doubts[k] = why
+        return doubts
+
+    def _acquainted(
+        self, tracks: Sequence[Track], estimates: Sequence[Estimate]
+    ) -> tuple[Track, ...]:
+        """The tracks, and where bodies are beside each other; identical ones may be exchanged."""
+        sure = {
+            tracked.label: one.T_world_object
+            for tracked, one in zip(self.bodies, estimates, strict=True)
+            if tracked.instance is None and one.status == "ok"
+        }
+        after = list(tracks)
+        for k, tracked in enumerate(self.bodies):
+            T, known = sure.get(tracked.label), dict(tracks[k].companions)
+            for label, T_other in sure.items():
+                if T is not None and T_other is not None and label != tracked.label:
                     known[label] = Companion.joined(known.get(label), T, T_other, tracked.body)
-            after.append(Outcome(replace(track, companions=known), estimate))
-        return after
+                    after[k] = replace(tracks[k], companions=known)
+        return tuple(after)
+
+
+def _in_doubt(verdict: Verdict, rivals: Sequence[tuple[ScoredPose, float]]) -> Verdict:
+    """The same, told to be ambiguous with poses that it may have instead, and their odds."""
+    best = verdict.best
+    if best is None or not rivals:
+        return verdict
+    # odds that it has none, as its pose is another's, stand beside the poses
+    total = sum(weight for _, weight in [*verdict.kept, *rivals])
+    kept = [*verdict.kept, *((pose, odds) for pose, odds in rivals if pose is not best)]
+    kept = [(pose, weight / total) for pose, weight in kept]
+    kept.sort(key=lambda pair: (pair[0] is not best, -pair[1]))
+    return Verdict("ambiguous", best, kept)
