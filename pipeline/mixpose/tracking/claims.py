@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
@@ -60,9 +61,8 @@ class Claims:
 
     def features(self, body: Body, T_world_object: Floats) -> Floats:
         """Where the sensors have the features of a body at a pose (n, 3)."""
-        at = project_body(tuple(view.sensor for view in self.views), body).project(
-            T_world_object[None]
-        )
+        sensors = tuple(view.sensor for view in self.views)
+        at = project_body(sensors, body).project(T_world_object[None])
         rows, features = np.nonzero(at.seen[:, 0])
         sigmas = np.array([view.observation.sigma for view in self.views])
         return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])
@@ -72,7 +72,9 @@ class Claims:
 
         `places` (n, 3) of features are by body; all are assigned at once, as near as can be.
         """
-        whose, at = _by_body(places)
+        if not places:
+            return self
+        whose, at = _joined({k: [some] for k, some in places.items()})
         owners = self.owners.copy()
         for sensor in np.unique(at[:, 2]):
             rows, columns = (np.flatnonzero(some[:, 2] == sensor) for some in (self.places, at))
@@ -97,7 +99,9 @@ class Claims:
 
     def taken(self, met: Mapping[int, Met]) -> Claims:
         """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
-        whose, _, numbers, squared = _all_met(met)
+        if not met:
+            return self
+        whose, numbers, _, squared = _joined(met)
         owners = self.owners.copy()
         # what is written last stays: the nearest, and of equals the first
         order = np.argsort(squared, kind="stable")[::-1]
@@ -113,10 +117,10 @@ class Claims:
         feature within `touching` σ_ε that has no other detection: nothing was found there, or the
         same spot, to which the owner is nearer.
         """
-        whose, at, numbers, squared = _all_met(met)
+        whose, numbers, at, squared = _joined(met)
         first = self.owners[numbers] == whose
         loose = first & (squared > pulled)
-        lost, places = _by_body(unmet)
+        lost, places = _joined({k: [some] for k, some in unmet.items()})
         others, theirs = np.concatenate([at[~first], places]), np.append(whose[~first], lost)
         near = _squared(self.places[numbers[loose]], others) < touching**2
         both = (near & (theirs != whose[loose][:, None])).any(axis=1)
@@ -148,19 +152,10 @@ def places_of(sensors: int | Indices, y: Floats) -> Floats:
     return places
 
 
-def _by_body(places: Mapping[int, Floats]) -> tuple[Indices, Floats]:
-    """Bodies (K,) and all their places (K, 3)."""
-    whose = [np.full(len(some), k) for k, some in places.items()]
-    nothing = np.zeros(0, np.intp), np.zeros((0, 3))
-    return np.concatenate([nothing[0], *whose]), np.concatenate([nothing[1], *places.values()])
-
-
-def _all_met(met: Mapping[int, Met]) -> tuple[Indices, Floats, Indices, Floats]:
-    """Bodies (K,), places (K, 3), detections (K,) and squared offsets (K,) of all that is met."""
-    whose, places = _by_body({k: some[1] for k, some in met.items()})
-    numbers = [np.zeros(0, np.intp), *(some[0] for some in met.values())]
-    squared = [np.zeros(0), *(some[2] for some in met.values())]
-    return whose, places, np.concatenate(numbers), np.concatenate(squared)
+def _joined(arrays: Mapping[int, Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
+    """Bodies (K,), and their arrays (K, ...) one after the other."""
+    whose = np.repeat(list(arrays), [len(first) for first, *_ in arrays.values()])
+    return [whose, *map(np.concatenate, zip(*arrays.values(), strict=True))]
 
 
 def _squared(points: Floats, places: Floats) -> Floats:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import expit
 
-from mixpose.body import Body
 from mixpose.judgement import APART, ScoredPose, Verdict
+from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Hypothesis, Offsets, SensorReport
 from mixpose.tracking.doubt import is_known
@@ -28,20 +29,21 @@ def estimate_of(
     instance: int | None,
 ) -> Estimate:
     """The estimate of a frame, with reports of the pose that is shown, believed or not."""
-    best, offsets = verdict.best, _offsets(shown, data.body) if shown else {}
+    body, best = data.body, verdict.best
     reports = {view.name: SensorReport(False) for view in views}
-    if shown:
-        reports |= shown.sensors
-    for name, one in offsets.items():
-        lengths = np.linalg.norm(one.offsets, axis=1).tolist()
-        rows = zip(one.features.tolist(), lengths, one.met.tolist(), strict=True)
-        residuals = {data.body.labels[i]: length if met else None for i, length, met in rows}
-        reports[name] = replace(reports[name], residuals=residuals)
+    reports |= shown.sensors if shown else {}
+    are_points = shown is not None and len(body.nodes.points) == len(body)
+    if shown is not None and are_points:
+        used = shown.used
+        lengths = (used.sigmas[:, None] * np.sqrt(used.squared)).tolist()
+        for name, row, k, in_view in zip(used.names, lengths, used.shares > 0, used.weights > 0):
+            residuals = {body.labels[i]: row[i] if k[i] else None for i in np.flatnonzero(in_view)}
+            reports[name] = replace(reports[name], residuals=residuals)
     rivals = verdict.kept if verdict.status == "ambiguous" else ()
     return Estimate(
         frame=data.frame,
         time_s=data.time_s,
-        object=data.body.name,
+        object=body.name,
         status=verdict.status,
         T_world_object=best.T_world_object if best else None,
         covariance=best.covariance if best else None,
@@ -54,15 +56,13 @@ def estimate_of(
         guesses=data.log.report,
         delays=after.delays.seconds(),
         doubt=verdict.doubt,
-        offsets=offsets,
+        measured=partial(_offsets, shown.used) if shown is not None and are_points else dict,
     )
 
 
-def _offsets(judged: ScoredPose, body: Body) -> Mapping[str, Offsets]:
+def _offsets(used: Matches) -> dict[str, Offsets]:
     """By how much each sensor met the features of a body whose features are points."""
-    if len(body.nodes.points) != len(body):
-        return {}
-    used, offsets = judged.used, {}
+    offsets = {}
     for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
         features = np.flatnonzero(used.weights[k])
         offsets[name] = Offsets(

@@ -23,9 +23,7 @@ class ProposalRules:
     kept: int = constant(5, "of these, starts that descend")
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(
-        3.0,
-        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
-        "at which drawn ones are scored; one that was searched for, by its square",
+        3.0, "how much surer, and narrower blurred, drawn poses are than starts; searched: squared"
     )
     blurs: tuple[float, ...] = constant(
         (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
@@ -44,22 +42,18 @@ class LookAlikeRules:
         "looked for: features that lie like others, the other tilt, the mirror image",
     )
     alike: float = constant(
-        0.05,
-        "of the smaller body's radius, how far features may be off their partners: bodies are as "
-        "rigid as that",
+        0.05, "of the smaller radius, how far features may be off their partners: as bodies give"
     )
     fewer: float = constant(
-        1.5,
-        "features fewer that a look-alike may meet to be a rival still: each is worth four of the "
-        "log odds, or so",
+        1.5, "features fewer that a rival may meet: each is worth four of the log odds, or so"
     )
     flat: float = constant(
         0.15, "thickness of a body against its smaller width below which it may be tilted"
     )
     by_chance: float = constant(
         14.0,
-        "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
-        "been met anywhere: five features by two cameras, where three always lie alike",
+        "coordinates met beyond the six of a pose, up to which the mirror image may be met "
+        "anywhere: five features by two cameras, where three always lie alike",
     )
 
 
@@ -85,30 +79,17 @@ class SceneRules:
     """How detections are shared out, and when bodies are in doubt for each other's sake."""
 
     gate: float = constant(
-        6.0,
-        "σ_ε around expected features within which detections are the body's: they are met "
-        "within 2.2, and a steady prediction errs by less than the rest",
-    )
-    rounds: int = constant(
-        3, "times that detections are shared out again: neighbours' neighbours are settled by then"
+        6.0, "σ_ε around expected features: met within 2.2, a steady prediction errs by the rest"
     )
     rival: float = constant(
-        0.5,
-        "share of the detections of one body, met by another too, from which it is either the "
-        "one or the other; below, their images only touch",
+        0.5, "share of detections met by two bodies from which it is one or the other; less: touch"
     )
     touching: float = constant(
-        3.0,
-        "σ_ε between a spot and another body's feature that is seen nowhere else: images of "
-        "spots run together at twice their width",
+        3.0, "σ_ε from a spot to another body's lost feature: images run together at two widths"
     )
     pulled: float = constant(
-        0.1,
-        "squared offset in σ_ε² from which such a spot is taken for both: two and a half "
-        "times what blobs have (0.2²)",
+        0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
     )
     thorough: int = constant(
-        10,
-        "frames of which one is searched thoroughly for a body that is away while others are "
-        "there: a third of a second of video; the rest have the budget of live streams",
+        10, "frames for one thorough search for a body that is away while others are there: 1/3 s"
     )

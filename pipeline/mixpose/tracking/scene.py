@@ -11,12 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from mixpose.judgement import ScoredPose, Verdict
+from mixpose.judgement import Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.tracking.doubt import look_alike_of
 from mixpose.tracking.explain import Explanation, explain
-from mixpose.tracking.identity import identify
+from mixpose.tracking.identity import Rivals, identify
 from mixpose.tracking.outcome import estimate_of, followed
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Sharing
@@ -53,7 +53,7 @@ class Scene:
             found = sharing.explained()
         finders, rivals = self._identified(found)
         verdicts = {k: found[finders[k]].verdict for k in found}
-        told = {k: _in_doubt(verdicts[k], rivals.get(k, ())) for k in found}
+        told = {k: _in_doubt(verdicts[k], rivals.get(k, [])) for k in found}
         for k, why in self._look_alikes(told, found).items():
             verdicts[k] = told[k] = verdicts[k].doubted(why)
         after, estimates = [], []
@@ -66,19 +66,16 @@ class Scene:
 
     def _identified(
         self, found: Mapping[int, Explanation]
-    ) -> tuple[dict[int, int], dict[int, list[tuple[ScoredPose, float]]]]:
+    ) -> tuple[dict[int, int], dict[int, Rivals]]:
         """By body, the one that found what it gets, and poses that it may have, with odds."""
+        finders, rivals = {k: k for k in found}, dict[int, Rivals]()
         groups: dict[int, list[int]] = {}
         for k, tracked in enumerate(self.bodies):
             groups.setdefault(id(tracked.body), []).append(k)
-        finders, rivals = {k: k for k in found}, {}
         for group in groups.values():
             if len(group) > 1:
                 given, exchanged = identify(group, found)
-                finders |= given
-                for k, others in exchanged.items():
-                    poses = [(found[j].verdict.best, odds) for j, odds in others]
-                    rivals[k] = [(pose, odds) for pose, odds in poses if pose is not None]
+                finders, rivals = finders | given, rivals | exchanged
         return finders, rivals
 
     def _look_alikes(
@@ -117,7 +114,7 @@ class Scene:
         return tuple(after)
 
 
-def _in_doubt(verdict: Verdict, rivals: Sequence[tuple[ScoredPose, float]]) -> Verdict:
+def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
     """The same, told to be ambiguous with poses that it may have instead, and their odds."""
     best = verdict.best
     if best is None or not rivals:

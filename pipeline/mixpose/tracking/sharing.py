@@ -11,17 +11,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mixpose.objective import SharedDensities, View
+from mixpose.fit import fit_together
+from mixpose.judgement import Case, judge_together, nearest_alike
+from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Indices, Mask
 from mixpose.tracking.claims import MERGED, Claims, Met, overlap
 from mixpose.tracking.explain import Explanation, explain, judged_by
-from mixpose.tracking.likelihood import FrameData
+from mixpose.tracking.in_motion import is_timed
+from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Start
 from mixpose.tracking.rules import SceneRules
-from mixpose.tracking.together import begun_together
 from mixpose.tracking.track import Prediction, Track
 
 if TYPE_CHECKING:
@@ -56,16 +58,12 @@ class Sharing:
 
     def _where_expected(self) -> None:
         """Bodies that are where they are expected, all at once, until nothing changes hands."""
-        some = [
-            k
-            for k, track in enumerate(self.tracks)
-            if track.branches and track.misses == 0 and not track.doubted
-        ]
         places = {}
-        for k in some:
-            first = self.bodies[k].predictions(self.tracks[k], self.frame, self.time_s)[0]
-            places[k] = self._nobody.features(self.bodies[k].body, first.T_world_object)
-        claims = self._nobody.expected(places, self.rules.gate)
+        for k, track in enumerate(self.tracks):
+            if track.branches and not track.misses and not track.doubted:
+                first = self.bodies[k].predictions(track, self.frame, self.time_s)[0]
+                places[k] = self._nobody.features(self.bodies[k].body, first.T_world_object)
+        some, claims = list(places), self._nobody.expected(places, self.rules.gate)
         for _ in range(3):  # neighbours' neighbours are settled by then
             self.found |= self._at_once(some, claims, places)
             self.claimed = [k for k, one in self.found.items() if one.checks.convinces]
@@ -79,23 +77,21 @@ class Sharing:
     ) -> dict[int, Explanation]:
         """Bodies around their predictions, by what others leave.
 
-        Those that nothing of the others' is near to look at all that is there, and are fitted
-        together.
+        Those that nothing of the others' is near to see all that is there, and climb together.
         """
-        left = {k: claims.left(k) for k in some}
-        frames = {k: self._data(k, left[k]) for k in some}
+        begun = {k: self._begun(k, claims.left(k)) for k in some}
         alike = [
             k
-            for k in some
+            for k, one in begun.items()
             if len(some) > 1
-            and len(frames[k].views) == len(self.views)
-            and self._shared is not None
-            and not claims.are_near(~left[k], places[k], self._reach(k))
+            and len(one.frame.views) == len(self.views)
+            and not claims.are_near(~one.left, places[k], self._reach(k))
         ]
         if alike and self._shared is not None:
-            begun = begun_together([frames[k] for k in alike], self._shared)
-            frames.update(zip(alike, begun, strict=True))
-        return {k: explain(self._begun(k, frames[k], left[k]), quickly=True) for k in some}
+            frames = climbed_together([begun[k].frame for k in alike], self._shared)
+            for k, frame in zip(alike, frames, strict=True):
+                begun[k] = replace(begun[k], frame=frame)
+        return {k: explain(one, quickly=True) for k, one in begun.items()}
 
     def _is_touched(self, k: int, claims: Claims) -> bool:
         """Whether detections come to or go from a body that it may meet."""
@@ -120,30 +116,29 @@ class Sharing:
         for k in some:
             body = self.bodies[k].body
             is_twin = self._is_forgotten(k) and sum(one.body is body for one in self.bodies) > 1
-            if is_twin and id(body) in twins:
-                whole = self._data(k, self._nobody.left(k))
+            if not is_twin:
+                self.found[k] = self._everywhere(k, claims.left(k), self.tracks[k])
+            elif id(body) in twins:
+                whole = self._begun(k, self._nobody.left(k)).frame
                 self.found[k] = replace(twins[id(body)], tracked=self.bodies[k], frame=whole)
-                continue
-            self.found[k] = self._everywhere(k, claims.left(k), is_twin=is_twin)
-            if is_twin:
-                twins[id(body)] = self.found[k]
+            else:
+                anywhere = replace(self.tracks[k], branches=())
+                one = self._everywhere(k, claims.left(k), anywhere)
+                own = self._begun(k, one.left, beside=one.frame.beside, log=one.frame.log)
+                self.found[k] = twins[id(body)] = replace(one, frame=own.frame)
 
-    def _everywhere(self, k: int, left: Mask, *, is_twin: bool) -> Explanation:
+    def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers, after those that were asked already where the same is left."""
-        tracked, track = self.bodies[k], self.tracks[k]
         before, beside = self.found.get(k), self._companion(k)
         if before and beside is before.frame.beside and np.array_equal(before.left, left):
             return explain(before)
-        own = replace(self._data(k, left), beside=beside)
-        data = own
-        if is_twin:
-            data = replace(self._data(k, left, replace(track, branches=())), beside=beside)
-        is_away = track.misses > tracked.rules.motion.coasting
+        begun = self._begun(k, left, track, beside=beside)
         # bodies that are there are not held up
-        if is_away and self.claimed and track.misses % self.rules.thorough != 0:
-            data = replace(data, options=replace(data.options, search="live"))
-        found = explain(self._begun(k, data, left))
-        return replace(found, frame=replace(own, log=data.log)) if is_twin else found
+        is_away = track.misses > self.bodies[k].rules.motion.coasting and self.claimed
+        if is_away and track.misses % self.rules.thorough:
+            options = replace(begun.frame.options, search="live")
+            begun = replace(begun, frame=replace(begun.frame, options=options))
+        return explain(begun)
 
     def _most_evident(self, possible: Sequence[int]) -> int:
         """The body that is believed next: with it, all that compete explain most."""
@@ -170,9 +165,10 @@ class Sharing:
     def _without_merged(self) -> None:
         """Take from bodies what may be their feature and another's in one spot, and fit again."""
         met = {k: self._met(k) for k in self.claimed}
-        unmet = {k: self._nobody.unmet_by(self.found[k].ranked[0]) for k in self.claimed}
-        rules, claims = self.rules, self._claims(self.claimed)
-        self.merged = claims.merged(met, unmet, rules.touching, rules.pulled)
+        unmet = {k: self._nobody.unmet_by(self.found[k].ranked[0]) for k in met}
+        if met:
+            touching, pulled = self.rules.touching, self.rules.pulled
+            self.merged = self._claims(self.claimed).merged(met, unmet, touching, pulled)
         if len(self.merged):
             self._judge_again(self.claimed, fitted=True)
 
@@ -210,16 +206,14 @@ class Sharing:
     ) -> Explanation:
         """The poses of a body by what is left for it by now, and fitted to that."""
         before = self.found[k].frame
-        data = replace(self._data(k, left), beside=beside or before.beside, log=before.log)
-        return judged_by(self._begun(k, data, left), self.found[k].ranked, fitted=fitted)
+        begun = self._begun(k, left, beside=beside or before.beside, log=before.log)
+        return judged_by(begun, self.found[k].ranked, fitted=fitted)
 
-    def _begun(self, k: int, data: FrameData, left: Mask) -> Explanation:
-        return Explanation(self.bodies[k], data, self.sensors, left)
-
-    def _data(self, k: int, left: Mask, track: Track | None = None) -> FrameData:
+    def _begun(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Explanation:
         """What is left of the frame for a body, and what is known before it."""
-        views = self._nobody.part(left)
-        return self.bodies[k].data(track or self.tracks[k], self.frame, self.time_s, views)
+        track, views = track or self.tracks[k], self._nobody.part(left)
+        data = self.bodies[k].data(track, self.frame, self.time_s, views)
+        return Explanation(self.bodies[k], replace(data, **known), self.sensors, left)
 
     @cached_property
     def _nobody(self) -> Claims:
@@ -235,9 +229,8 @@ class Sharing:
         return self._nobody.met_by(self.found[k].ranked[0], self.found[k].left)
 
     def _overlap(self, a: int, b: int) -> float:
-        if not self.found[a].ranked or not self.found[b].ranked:
-            return 0.0
-        return overlap(self._met(a), self._met(b))
+        are_there = self.found[a].ranked and self.found[b].ranked
+        return overlap(self._met(a), self._met(b)) if are_there else 0.0
 
     @cached_property
     def _shared(self) -> SharedDensities | None:
@@ -259,3 +252,42 @@ class Sharing:
 def _width(expected: Prediction) -> float:
     """How little a prediction tells: the logarithm of the volume that it leaves."""
     return float(np.log(expected.uncertainty).sum())
+
+
+def climbed_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
+    """The frames of several bodies with what is climbed from their first predictions, and judged.
+
+    Their sensors are the same, of which `shared` has all that they see; what is not a body's own is
+    out of its reach.
+    """
+    begun = list(frames)
+    for k, one in enumerate(frames):
+        if not is_timed(one.views):
+            objective = matched_objective(one.views, one.body, one.sigmas, shared=shared)
+            begun[k] = replace(one, begun=Begun(objective))
+    some = [
+        k
+        for k, one in enumerate(begun)
+        if one.begun and one.options.objective == "matched" and can_be_together(one.body)
+    ]
+    if len(some) < 2:
+        return begun
+    objectives = [begun[k].finest for k in some]
+    starts = [begun[k].predictions[0].T_world_object for k in some]
+    free, rules = begun[some[0]].free, begun[some[0]].rules
+    fits, cases = {}, []
+    for k, end in zip(some, fit_together(objectives, starts, free, rules.fit), strict=True):
+        if end is not None:
+            data = begun[k] = replace(begun[k], begun=Begun(end[0]))
+            expected = data.predictions[0]
+            start = Start(expected.T_world_object, expected.uncertainty, expected)
+            fit = fits[k] = MatchedLikelihood(data).fit(start, end[1])
+            T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+            case = Case(data.finest, T, data.track.residuals, data.prior(T))
+            if T is fit.T_world_object:
+                case = replace(case, matches=fit.matches, noise=fit.noise)
+            cases.append(case)
+    judged = judge_together(cases, free, rules.judgement) if cases else []
+    for (k, fit), pose in zip(fits.items(), judged, strict=True):
+        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, pose))
+    return begun
