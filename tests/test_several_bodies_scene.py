@@ -24,8 +24,8 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, PointPattern
 from mixpose.search import SearchResult, search_frame
-from mixpose.tracking import Scene, SceneRules, Track
-from mixpose.tracking.claims import Claims, Met, overlap, places_of
+from mixpose.tracking import Scene, Track
+from mixpose.tracking.claims import Claims, places_of
 from mixpose.tracking.sharing import Sharing
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
@@ -232,10 +232,6 @@ def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
     assert estimates[1].status == "ok"
 
 
-def met(numbers: list[int], places: list[list[float]], squared: list[float]) -> Met:
-    return np.array(numbers), places_of(0, np.array(places)), np.array(squared)
-
-
 def spots(*points: list[float]) -> Claims:
     pattern = PointPattern(np.array(points), np.ones(len(points)))
     return Claims.none([View("left", CAMERAS["left"], Observation(pattern, 1.0))])
@@ -243,17 +239,9 @@ def spots(*points: list[float]) -> Claims:
 
 def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
     claims = spots([0.0, 0.0], [50.0, 0.0])
-    first = met([0, 1], [[0.4, 0.0], [50.0, 0.0]], [0.16, 0.0])
-    second = met([0], [[0.1, 0.0]], [0.01])
+    first, second = (np.array([0, 1]), np.array([0.16, 0.0])), (np.array([0]), np.array([0.01]))
     assert claims.taken({0: first, 1: second}).owners.tolist() == [1, 0]
     assert claims.taken({1: second, 0: first}).owners.tolist() == [1, 0]
-    assert overlap(first, second) == 1.0
-
-
-def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
-    bodies = {0: met([0], [[-1.5, 0.0]], [2.25]), 1: met([0], [[1.5, 0.0]], [2.25])}
-    claims, rules = spots([0.0, 0.0]).taken(bodies), SceneRules()
-    assert claims.merged(bodies, {}, rules.touching, rules.pulled).tolist() == [0]
 
 
 def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:

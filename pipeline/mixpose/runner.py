@@ -211,7 +211,7 @@ def _estimates(
     watch: Watch | None,
     remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
-    windowed, tracks = WindowedScene.of(scene, _windowed(session)), memory.tracks
+    windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()

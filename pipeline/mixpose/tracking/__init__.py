@@ -12,7 +12,6 @@ from mixpose.tracking.gating import have_fewer as have_fewer
 from mixpose.tracking.gating import is_convincing as is_convincing
 from mixpose.tracking.in_motion import UNKNOWN_S as UNKNOWN_S
 from mixpose.tracking.rules import Rules as Rules
-from mixpose.tracking.rules import SceneRules as SceneRules
 from mixpose.tracking.scene import Scene as Scene
 from mixpose.tracking.track import Companion as Companion
 from mixpose.tracking.track import Prediction as Prediction

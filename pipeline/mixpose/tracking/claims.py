@@ -1,4 +1,4 @@
-"""Whose each detection is: a body's, nobody's so far, or two bodies' in one.
+"""Whose each detection is: a body's, or nobody's so far.
 
 No detection belongs to two bodies.  What belongs to another is left out of what a body sees: from
 its density, so that it does not pull, and from the clutter that its evidence is weighed against.
@@ -8,22 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
 from mixpose.judgement import ScoredPose
-from mixpose.matching import Matches
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask
 
-FREE, MERGED = -1, -2  # owners of what is nobody's so far, and of two bodies' features in one spot
+FREE = -1  # owner of what is nobody's so far
 
-# what a pose meets: detections (K,), where it expects them (K, 3), squared offsets (K,) in σ_ε²
-Met: TypeAlias = tuple[Indices, Floats, Floats]
+Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +33,7 @@ class Claims:
     views: tuple[View, ...]  # of L sensors
     places: Floats  # (D, 3)
     begins: Indices  # (L + 1,), where the detections of each sensor begin
-    owners: Indices  # (D,), the number of a body, FREE or MERGED
+    owners: Indices  # (D,), the number of a body, or FREE
 
     @classmethod
     def none(cls, views: Sequence[View]) -> Claims:
@@ -74,8 +71,8 @@ class Claims:
         """
         if not places:
             return self
-        whose, at = _joined({k: [some] for k, some in places.items()})
-        owners = self.owners.copy()
+        whose = np.repeat(list(places), [len(some) for some in places.values()])
+        at, owners = np.concatenate(list(places.values())), self.owners.copy()
         for sensor in np.unique(at[:, 2]):
             rows, columns = (np.flatnonzero(some[:, 2] == sensor) for some in (self.places, at))
             squared = np.minimum(_squared(self.places[rows], at[columns]), gate**2)
@@ -86,62 +83,27 @@ class Claims:
 
     def met_by(self, pose: ScoredPose, left: Mask) -> Met:
         """What a pose meets of the detections that are left for its body."""
-        met = pose.used.detections >= 0
-        sensors, places = self._expected(pose.used, met)
-        kept = np.flatnonzero(left)
-        first = np.searchsorted(kept, self.begins)[sensors]
-        return kept[first + pose.used.detections[met]], places, pose.used.squared[met]
-
-    def unmet_by(self, pose: ScoredPose) -> Floats:
-        """Where a pose has features that nothing was found at (n, 3)."""
-        seen = pose.matches
-        return self._expected(seen, (seen.weights > 0) & (seen.shares == 0))[1]
+        used, kept = pose.used, np.flatnonzero(left)
+        numbers = {view.name: k for k, view in enumerate(self.views)}
+        first = np.searchsorted(kept, self.begins[[numbers[name] for name in used.names]])
+        met = used.detections >= 0
+        return kept[(first[:, None] + used.detections)[met]], used.squared[met]
 
     def taken(self, met: Mapping[int, Met]) -> Claims:
         """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
         if not met:
             return self
-        whose, numbers, _, squared = _joined(met)
+        whose = np.repeat(list(met), [len(numbers) for numbers, _ in met.values()])
+        numbers, squared = map(np.concatenate, zip(*met.values(), strict=True))
         owners = self.owners.copy()
         # what is written last stays: the nearest, and of equals the first
         order = np.argsort(squared, kind="stable")[::-1]
         owners[numbers[order]] = whose[order]
         return replace(self, owners=owners)
 
-    def merged(
-        self, met: Mapping[int, Met], unmet: Mapping[int, Floats], touching: float, pulled: float
-    ) -> Indices:
-        """Detections that may be features of two bodies in one spot.
-
-        Their owner meets them loosely, by a squared offset over `pulled` σ_ε², and another has a
-        feature within `touching` σ_ε that has no other detection: nothing was found there, or the
-        same spot, to which the owner is nearer.
-        """
-        whose, numbers, at, squared = _joined(met)
-        first = self.owners[numbers] == whose
-        loose = first & (squared > pulled)
-        lost, places = _joined({k: [some] for k, some in unmet.items()})
-        others, theirs = np.concatenate([at[~first], places]), np.append(whose[~first], lost)
-        near = _squared(self.places[numbers[loose]], others) < touching**2
-        both = (near & (theirs != whose[loose][:, None])).any(axis=1)
-        return np.unique(numbers[loose][both])
-
     def are_near(self, chosen: Mask, places: Floats, reach: float) -> bool:
         """Whether some detections (D,) lie within reach, in σ_ε, of places (n, 3)."""
         return bool((_squared(self.places[chosen], places) < reach**2).any())
-
-    def _expected(self, seen: Matches, chosen: Mask) -> tuple[Indices, Floats]:
-        """Sensors (K,) of features (L, N) of matches, and their places (K, 3)."""
-        numbers = {view.name: k for k, view in enumerate(self.views)}
-        rows = np.nonzero(chosen)[0]
-        sensors = np.array([numbers[name] for name in seen.names])[rows]
-        return sensors, places_of(sensors, seen.places[chosen] / seen.sigmas[rows, None])
-
-
-def overlap(a: Met, b: Met) -> float:
-    """Share of the detections of the one that meets fewer that both meet."""
-    fewer = min(len(np.unique(detections)) for detections, *_ in (a, b))
-    return len(np.intersect1d(a[0], b[0])) / max(fewer, 1)
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:
@@ -150,12 +112,6 @@ def places_of(sensors: int | Indices, y: Floats) -> Floats:
     places[:, : y.shape[1]] = y
     places[:, 2] = 1e6 * np.asarray(sensors)
     return places
-
-
-def _joined(arrays: Mapping[int, Sequence[NDArray[Any]]]) -> list[NDArray[Any]]:
-    """Bodies (K,), and their arrays (K, ...) one after the other."""
-    whose = np.repeat(list(arrays), [len(first) for first, *_ in arrays.values()])
-    return [whose, *map(np.concatenate, zip(*arrays.values(), strict=True))]
 
 
 def _squared(points: Floats, places: Floats) -> Floats:

@@ -1,15 +1,12 @@
-"""Why a pose that is sure by itself is in doubt: what was seen may not be the body, or not so.
+"""Why a pose that is sure by itself is in doubt: what was seen may not be the body.
 
-A body is known once more than three markers are met, which other things have in the same places,
-too, and stays so while it is followed.  What looks like the body by chance does so for several
-frames, and what the track expects then tells nothing.
+A body is known once more than three markers are met, which other things, or another body of the
+session, have in the same places, too; and stays so while it is followed.  What looks like it by
+chance does so for several frames, and what the track expects then tells nothing.
 
 Where features are missed, and detections about the body belong to none, its mirror image is a
 rival: reflected in the plane nearest to the features met, which it leaves where they are.  Where
 few are met, it is looked for everywhere, in the first frames.
-
-A body of which three markers are met looks like every body that has three markers in the same
-places.  Where such another body of the session is not surely somewhere else, it is a rival, too.
 """
 
 from __future__ import annotations
@@ -66,19 +63,21 @@ def is_known(data: FrameData, judged: ScoredPose) -> bool:
 
 def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
-    body, rules, seen = data.body, data.rules, judged.matches
-    if "mirrored" not in rules.look_alikes.kinds or not body.is_exact or _is_flat(body):
+    rules, seen, T = data.rules, judged.matches, judged.T_world_object
+    if "mirrored" not in rules.look_alikes.kinds or not data.body.is_exact or _is_flat(data.body):
         return False
     ahead, met = rules.acceptance.standing_out, seen.met_by
     # of these the mirror image may meet more than the body
     if np.minimum(seen.missed, seen.unmatched_nearby).sum() > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
-        near = _numbers(sharp if sharp.sum() >= 3 else met > 0)
-        there = replace(data, body=mirror_image(body, near), begun=None)
-        start = Start(judged.T_world_object, data.close)
-        if _meets(there, data, start) and _evidence(there, start) > judged.log_evidence + ahead:
-            return True
+        there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
+        # no rival meets less than a quarter of what the body meets; values grow as the square
+        value, own = (one.finest.value(T[None])[0] for one in (there, data))
+        if value > own / 16:
+            start = Start(T, data.close)
+            if _evidence(there, start) > judged.log_evidence + ahead:
+                return True
     if not _is_by_chance(data, judged):
         return False
     # wherever it is found, and nothing known of either
@@ -87,8 +86,7 @@ def is_reflection(data: FrameData, judged: ScoredPose) -> bool:
     options = replace(data.options, search="live")
     nothing = replace(data, predictions=(), beside=None, begun=None)
     alone = replace(nothing, track=track, log=SearchLog(), options=options)
-    own = _evidence(alone, Start(judged.T_world_object))
-    mirror = replace(alone, body=mirror_image(body, _numbers(met >= 0)))
+    own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     least = own - rules.search.outdone
     starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
     return any(_evidence(mirror, start) > own + ahead for start in starts)
@@ -126,16 +124,6 @@ def _is_flat(body: Body) -> bool:
     return thickness(body) < 1e-6
 
 
-def _meets(mirror: FrameData, data: FrameData, start: Start) -> bool:
-    """Whether the mirror image meets a quarter of what the body meets, where a fit begins.
-
-    The features met lie about the plane that it is reflected in, or it is no rival: then its value
-    is a hundredth of the body's, and that grows as the square of the features met.
-    """
-    values = [one.finest.value(start.T_world_object[None])[0] for one in (mirror, data)]
-    return bool(values[0] > values[1] / 16)
-
-
 def _is_by_chance(data: FrameData, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
     rules, seen = data.rules, judged.matches
@@ -153,5 +141,7 @@ def _evidence(data: FrameData, start: Start) -> float:
     return likelihood.judge(likelihood.fit(start), start).log_evidence
 
 
-def _numbers(mask: Mask) -> frozenset[int]:
-    return frozenset(np.flatnonzero(mask).tolist())
+def _mirrored(data: FrameData, chosen: Mask) -> FrameData:
+    """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
+    near = frozenset(np.flatnonzero(chosen).tolist())
+    return replace(data, body=mirror_image(data.body, near), begun=None)

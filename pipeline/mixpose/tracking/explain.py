@@ -100,16 +100,13 @@ def explain(begun: Explanation, *, quickly: bool = False) -> Explanation:
     return explained(len(tracked.proposers))
 
 
-def judged_by(
-    other: Explanation, poses: Sequence[ScoredPose], *, fitted: bool = False
-) -> Explanation:
-    """Poses judged by another frame, and `fitted` to it, most evident first."""
+def judged_by(other: Explanation, poses: Sequence[ScoredPose]) -> Explanation:
+    """Poses judged by another frame as they are, most evident first."""
     data, ranked = other.frame, list[ScoredPose]()
     likelihood = likelihood_of(data)
     for one in poses if data.views else ():
-        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
-        fit = likelihood.fit(start)
-        blurs = fit.blurs or one.blurs
-        judged = replace(likelihood.judge(fit, start), proposer=one.proposer, blurs=blurs)
+        start = Start(one.T_world_object, left_out=one.left_out)
+        judged = likelihood.judge(likelihood.fit(start), start)
+        judged = replace(judged, proposer=one.proposer, blurs=one.blurs)
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return replace(other, ranked=tuple(ranked), tried=len(other.tracked.proposers))

@@ -1,8 +1,4 @@
-"""Where a track expects the body in its cameras, and whether it was met there.
-
-A frame of which only that was looked at, and whose poses are not as convincing as those before it,
-is looked at again as a whole.
-"""
+"""Where tracks expect bodies in images; what was met there convinces, or all is looked at."""
 
 from __future__ import annotations
 
@@ -49,11 +45,10 @@ class Expectation:
         return float(apart / 2 + self.reach * self.body.spread)
 
     def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
-        """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
+        """Box of pixels (u0, v0, u1, v1) that holds what each camera will see, ends exclusive.
 
-        It holds all features that a camera will see, four standard deviations of the prediction,
-        and the features' images, but at least 40 px, around them.  Cameras that will not see the
-        body have none; a body of one feature, whose size in the image nothing tells, neither.
+        Cameras that will not see the body have none; a body of one feature, whose size in the image
+        nothing tells, neither.
         """
         if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
             return {}
@@ -103,17 +98,11 @@ def have_fewer(views: Sequence[View], before: Tallies) -> bool:
 class WindowedScene:
     """A scene that looks where its bodies are expected, and at all there is if that is too little.
 
-    The cameras of its expectations, one per body, are those whose features in a part of the image
-    are those of the whole image.
+    Its cameras are those whose features in a part of the image are those of the whole image.
     """
 
     scene: Scene
-    expectations: tuple[Expectation, ...]
-
-    @classmethod
-    def of(cls, scene: Scene, cameras: Mapping[str, Sensor]) -> WindowedScene:
-        """A scene before cameras that may be looked at in part."""
-        return cls(scene, tuple(Expectation(one.body, cameras, one.free) for one in scene.bodies))
+    cameras: Mapping[str, Sensor]  # by name
 
     def advance(
         self,
@@ -128,15 +117,17 @@ class WindowedScene:
         As `Scene.advance`, of views that `observe` makes of boxes of pixels by camera; cameras
         without a box are seen whole, and only those in `images` can have one.
         """
-        windows = self._windows(tracks, frame, time_s, images) if self._are_met(tracks) else {}
+        windows = {}
+        if images and self._are_met(tracks):
+            windows = self._windows(tracks, frame, time_s)
+            windows = {name: box for name, box in windows.items() if name in images}
         if windows:
             views = observe(windows)
             if not any(have_fewer(views, track.tallies) for track in tracks):
                 after, estimates = self.scene.advance(tracks, frame, time_s, views)
                 pairs = zip(after, tracks, strict=True)
-                if self._are_met(after) and all(
-                    are_as_good(now.tallies, then.tallies) for now, then in pairs
-                ):
+                as_good = all(are_as_good(now.tallies, then.tallies) for now, then in pairs)
+                if as_good and self._are_met(after):
                     return after, estimates, views
         views = observe({})
         return *self.scene.advance(tracks, frame, time_s, views), views
@@ -144,23 +135,21 @@ class WindowedScene:
     def _are_met(self, tracks: Sequence[Track]) -> bool:
         """Whether the last frame was sure of all bodies, and met most of each."""
         return all(
-            not track.misses
-            and not track.doubted
-            and is_convincing(track.tallies, expected.cameras, tracked.rules.acceptance)
-            for tracked, expected, track in zip(
-                self.scene.bodies, self.expectations, tracks, strict=True
-            )
+            not (track.misses or track.doubted)
+            and is_convincing(track.tallies, self.cameras, tracked.rules.acceptance)
+            for tracked, track in zip(self.scene.bodies, tracks, strict=True)
         )
 
-    def _windows(
-        self, tracks: Sequence[Track], frame: int, time_s: float | None, images: Collection[str]
-    ) -> dict[str, Box]:
+    @cached_property
+    def _expectations(self) -> list[Expectation]:
+        return [Expectation(one.body, self.cameras, one.free) for one in self.scene.bodies]
+
+    def _windows(self, tracks: Sequence[Track], frame: int, time_s: float | None) -> dict[str, Box]:
         """In which part of each image the bodies are expected, one window around all of them."""
         windows: dict[str, Box] = {}
-        each = zip(self.scene.bodies, self.expectations, tracks, strict=True)
-        for tracked, expected, track in each if images else ():
-            for name, box in expected.windows(tracked.predictions(track, frame, time_s)).items():
-                if name in images:
-                    a, b, c, d = windows.get(name, box)
-                    windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])
+        for k, tracked in enumerate(self.scene.bodies):
+            predictions = tracked.predictions(tracks[k], frame, time_s)
+            for name, box in self._expectations[k].windows(predictions).items():
+                a, b, c, d = windows.get(name, box)
+                windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])
         return windows

@@ -84,12 +84,6 @@ class SceneRules:
     rival: float = constant(
         0.5, "share of detections met by two bodies from which it is one or the other; less: touch"
     )
-    touching: float = constant(
-        3.0, "σ_ε from a spot to another body's lost feature: images run together at two widths"
-    )
-    pulled: float = constant(
-        0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
-    )
     thorough: int = constant(
         10, "frames for one thorough search for a body that is away while others are there: 1/3 s"
     )

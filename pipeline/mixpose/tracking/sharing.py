@@ -18,8 +18,8 @@ import numpy as np
 from mixpose.fit import fit_together
 from mixpose.judgement import Case, judge_together, nearest_alike
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
-from mixpose.records import Floats, Indices, Mask
-from mixpose.tracking.claims import MERGED, Claims, Met, overlap
+from mixpose.records import Floats, Mask
+from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.explain import Explanation, explain, judged_by
 from mixpose.tracking.in_motion import is_timed
 from mixpose.tracking.likelihood import Begun, FrameData, MatchedLikelihood, Start
@@ -43,7 +43,6 @@ class Sharing:
     rules: SceneRules
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
-    merged: Indices = field(default_factory=lambda: np.zeros(0, np.intp))  # spots of two bodies
 
     def explained(self) -> dict[int, Explanation]:
         """The poses of all bodies."""
@@ -51,8 +50,10 @@ class Sharing:
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
-        self._without_merged()
-        self._judge_again(self.found)
+        claims = self._claims(self.claimed)
+        for k, one in self.found.items():
+            if not np.array_equal(one.left, claims.left(k)):
+                self.found[k] = self._again(k, claims.left(k))
         self._beside_others(away)
         return self.found
 
@@ -162,26 +163,6 @@ class Sharing:
         rest = self._again(other, claims.left(other)).ranked
         return self.found[keeps].evidence + max([0.0, *(one.log_evidence for one in rest[:1])])
 
-    def _without_merged(self) -> None:
-        """Take from bodies what may be their feature and another's in one spot, and fit again."""
-        met = {k: self._met(k) for k in self.claimed}
-        unmet = {k: self._nobody.unmet_by(self.found[k].ranked[0]) for k in met}
-        if met:
-            touching, pulled = self.rules.touching, self.rules.pulled
-            self.merged = self._claims(self.claimed).merged(met, unmet, touching, pulled)
-        if len(self.merged):
-            self._judge_again(self.claimed, fitted=True)
-
-    def _judge_again(self, some: Iterable[int], *, fitted: bool = False) -> None:
-        """Judge poses for which other detections are left by now, and fit them to these."""
-        claims = self._claims(self.claimed)
-        for k in some:
-            left = claims.left(k)
-            if not np.array_equal(left, self.found[k].left):
-                again = self._again(k, left, fitted=fitted)
-                if again.ranked or not fitted:
-                    self.found[k] = again
-
     def _beside_others(self, some: Iterable[int]) -> None:
         """Bodies that are not sure, by what was found beside them since they looked."""
         for k in some:
@@ -201,13 +182,11 @@ class Sharing:
                 told.append(Prediction(*known.expected(T, tracked.body, tracked.rules.motion), 1.0))
         return min(told, key=_width, default=None)
 
-    def _again(
-        self, k: int, left: Mask, beside: Prediction | None = None, *, fitted: bool = False
-    ) -> Explanation:
-        """The poses of a body by what is left for it by now, and fitted to that."""
+    def _again(self, k: int, left: Mask, beside: Prediction | None = None) -> Explanation:
+        """The poses of a body by what is left for it by now."""
         before = self.found[k].frame
         begun = self._begun(k, left, beside=beside or before.beside, log=before.log)
-        return judged_by(begun, self.found[k].ranked, fitted=fitted)
+        return judged_by(begun, self.found[k].ranked)
 
     def _begun(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Explanation:
         """What is left of the frame for a body, and what is known before it."""
@@ -221,16 +200,17 @@ class Sharing:
 
     def _claims(self, claimed: Sequence[int]) -> Claims:
         """Whose each detection is, if some bodies have what they meet."""
-        claims = self._nobody.taken({k: self._met(k) for k in claimed})
-        claims.owners[self.merged] = MERGED
-        return claims
+        return self._nobody.taken({k: self._met(k) for k in claimed})
 
     def _met(self, k: int) -> Met:
         return self._nobody.met_by(self.found[k].ranked[0], self.found[k].left)
 
     def _overlap(self, a: int, b: int) -> float:
-        are_there = self.found[a].ranked and self.found[b].ranked
-        return overlap(self._met(a), self._met(b)) if are_there else 0.0
+        """Share of the detections of the one that meets fewer that both meet."""
+        if not self.found[a].ranked or not self.found[b].ranked:
+            return 0.0
+        one, other = (set(self._met(k)[0].tolist()) for k in (a, b))
+        return len(one & other) / max(min(len(one), len(other)), 1)
 
     @cached_property
     def _shared(self) -> SharedDensities | None:

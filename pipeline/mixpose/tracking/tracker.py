@@ -51,10 +51,9 @@ class Tracker:
         rules: Rules = Rules(),
         instance: int | None = None,
     ) -> Self:
-        """Prepare tracking of a body, which is at T_start (4, 4) about the first frame, if given.
+        """Prepare tracking of a body, near T_start (4, 4) in the first frame, if that is given.
 
-        `rotation_deg` and `distance` are half-widths of where to look around the start; None: as
-        the rules of motion have them.
+        Half-widths of where to look around it are those of the rules of motion where None.
         """
         motion = rules.motion
         start = per_kind(body, motion.start_distance, motion.start_rotation_deg)
@@ -100,9 +99,9 @@ class Tracker:
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
     ) -> FrameData:
         """A frame, and what is known before it; sensors that saw nothing are left out."""
-        views = [view for view in views if not view.observation.is_empty]
+        seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
-        views = track.delays.applied(views, time_s, track.seconds_until(time_s))
+        views = track.delays.applied(seen, time_s, track.seconds_until(time_s))
         data = FrameData(
             views=views,
             body=self.body,
@@ -116,10 +115,10 @@ class Tracker:
             frame=frame,
             time_s=time_s,
         )
-        if predictions and is_timed(views):
-            T = predictions[0].T_world_object
-            return data.in_motion(data.expected(T).at(T))
-        return data
+        if not predictions or not is_timed(views):
+            return data
+        T = predictions[0].T_world_object
+        return data.in_motion(data.expected(T).at(T))
 
 
 def estimate_pose(
@@ -128,7 +127,7 @@ def estimate_pose(
     start: Floats | None = None,
     options: EstimatorOptions | None = None,
 ) -> Estimate:
-    """Estimate one pose, as of frame 0, near T_world_object (4, 4) at the start or anywhere.
+    """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
 
     Raises
     ------
