@@ -271,7 +271,7 @@ _RANGE_POSTERIOR = (
 _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         "residuals=best.noise if is_ok else track.residuals,",
         "residuals=best.noise,",
         "residuals of a wrong pose make the frames after it unsure",
@@ -279,7 +279,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sensors-left-out-are-tallied",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         "used = best.used\n",
         "used = best.matches\n",
         "the next frame is looked at as a whole although all is well",
@@ -295,7 +295,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sure-frames-have-rivals",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         'rivals = verdict.kept if verdict.status == "ambiguous" else ()',
         "rivals = verdict.kept",
         "frames that are sure list hypotheses",

@@ -179,7 +179,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-live-search-forgets",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         "track.missed(data.log.state, clutter)",
         "track.missed(track.search, clutter)",
         "a live search tries the same guesses in every frame",

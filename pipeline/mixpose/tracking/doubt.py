@@ -30,10 +30,7 @@ MIRRORED = "it shows the body's mirror image"
 
 
 def doubt_about(data: FrameData, best: ScoredPose, sensors: int, *, has_rivals: bool) -> str:
-    """Why a pose that is sure by itself is in doubt all the same; empty where it is not.
-
-    `sensors` had a frame, also those that saw nothing.
-    """
+    """Why a pose is in doubt, of a moment at which some sensors had a frame; empty if it is not."""
     rules, track = data.rules, data.track
     if is_reflection(data, best):
         return MIRRORED

@@ -45,10 +45,9 @@ class Expectation:
         return float(apart / 2 + self.reach * self.body.spread)
 
     def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
-        """Box of pixels (u0, v0, u1, v1) that holds what each camera will see, ends exclusive.
+        """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
 
-        Cameras that will not see the body have none; a body of one feature, whose size in the image
-        nothing tells, neither.
+        There is none where the body is not in view, or has one feature: nothing tells how large.
         """
         if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
             return {}
@@ -112,10 +111,9 @@ class WindowedScene:
         observe: Observe,
         images: Collection[str],
     ) -> tuple[tuple[Track, ...], list[Estimate], list[View]]:
-        """Estimate a frame: around the predictions if that convinces, else from all that is there.
+        """As `Scene.advance`: around the predictions if that convinces, else of all there is.
 
-        As `Scene.advance`, of views that `observe` makes of boxes of pixels by camera; cameras
-        without a box are seen whole, and only those in `images` can have one.
+        `observe` makes views of boxes by camera, of `images` only; without a box they are whole.
         """
         windows = {}
         if images and self._are_met(tracks):

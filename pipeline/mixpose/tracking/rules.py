@@ -38,8 +38,7 @@ class LookAlikeRules:
     """Which look-alikes of a body are rivals; see `mixpose.body.look_alikes`."""
 
     kinds: tuple[str, ...] = constant(
-        ("congruent", "tilted", "mirrored"),
-        "looked for: features that lie like others, the other tilt, the mirror image",
+        ("congruent", "tilted", "mirrored"), "features like others, other tilt, mirror image"
     )
     alike: float = constant(
         0.05, "of the smaller radius, how far features may be off their partners: as bodies give"
@@ -52,8 +51,7 @@ class LookAlikeRules:
     )
     by_chance: float = constant(
         14.0,
-        "coordinates met beyond the six of a pose, up to which the mirror image may be met "
-        "anywhere: five features by two cameras, where three always lie alike",
+        "coordinates met beyond six up to which its mirror image may be: 5 features, 2 cameras",
     )
 
 

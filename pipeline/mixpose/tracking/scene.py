@@ -3,27 +3,40 @@
 The poses of a moment are proposed, fitted and judged body by body, on what others leave; identical
 bodies are told apart; and each track follows its body.  A scene is a value: `advance` takes tracks
 and a frame and returns the next tracks with the estimates.
+
+Nothing in a frame tells identical bodies apart; only where they were before does.  The poses of a
+frame are given to them so that all together are most likely by what was predicted.  Where two of
+them might as well have changed places, because they met or were lost together, both are in doubt
+in that frame, with each other's pose among their hypotheses; afterwards they go on as assigned.
+
+Bodies that nothing was known of before get the poses that are left in the order of the world's
+x coordinate (then y, then z) of their origins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeAlias
 
-from mixpose.judgement import Verdict
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from mixpose.judgement import ScoredPose, Verdict
 from mixpose.objective import View
 from mixpose.records import Estimate
 from mixpose.tracking.doubt import look_alike_of
-from mixpose.tracking.explain import Explanation, explain
-from mixpose.tracking.identity import Rivals, identify
-from mixpose.tracking.outcome import estimate_of, followed
+from mixpose.tracking.explain import Explanation, estimate_of, explain, followed
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Sharing
 from mixpose.tracking.track import Companion, Track
 
 if TYPE_CHECKING:
     from mixpose.tracking.tracker import Tracker
+
+# poses that a body may have instead of its own, with odds; its own, with those that it has none
+Rivals: TypeAlias = list[tuple[ScoredPose, float]]
 
 
 @dataclass(frozen=True)
@@ -51,7 +64,10 @@ class Scene:
             seen = [view for view in views if not view.observation.is_empty]
             sharing = Sharing(self.bodies, tracks, frame, time_s, seen, len(views), self.rules)
             found = sharing.explained()
-        finders, rivals = self._identified(found)
+        finders, rivals = {k: k for k in found}, dict[int, Rivals]()
+        for group in self._identical:
+            given, exchanged = identify(group, found)
+            finders, rivals = finders | given, rivals | exchanged
         verdicts = {k: found[finders[k]].verdict for k in found}
         told = {k: _in_doubt(verdicts[k], rivals.get(k, [])) for k in found}
         for k, why in self._look_alikes(told, found).items():
@@ -60,23 +76,18 @@ class Scene:
         for k, tracked in enumerate(self.bodies):
             shown = told[k].best or next(iter(found[finders[k]].ranked), None)
             after.append(followed(found[k].frame, verdicts[k]))
-            given = found[k].frame, views, told[k], shown
-            estimates.append(estimate_of(*given, after=after[k], instance=tracked.instance))
+            estimate = estimate_of(found[k].frame, views, told[k], shown)
+            delays = after[k].delays.seconds()
+            estimates.append(replace(estimate, instance=tracked.instance, delays=delays))
         return self._acquainted(after, estimates), estimates
 
-    def _identified(
-        self, found: Mapping[int, Explanation]
-    ) -> tuple[dict[int, int], dict[int, Rivals]]:
-        """By body, the one that found what it gets, and poses that it may have, with odds."""
-        finders, rivals = {k: k for k in found}, dict[int, Rivals]()
+    @cached_property
+    def _identical(self) -> list[list[int]]:
+        """Numbers of the bodies that are identical, group by group."""
         groups: dict[int, list[int]] = {}
         for k, tracked in enumerate(self.bodies):
             groups.setdefault(id(tracked.body), []).append(k)
-        for group in groups.values():
-            if len(group) > 1:
-                given, exchanged = identify(group, found)
-                finders, rivals = finders | given, rivals | exchanged
-        return finders, rivals
+        return [group for group in groups.values() if len(group) > 1]
 
     def _look_alikes(
         self, told: Mapping[int, Verdict], found: Mapping[int, Explanation]
@@ -125,3 +136,37 @@ def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
     kept = [(pose, weight / total) for pose, weight in kept]
     kept.sort(key=lambda pair: (pair[0] is not best, -pair[1]))
     return Verdict("ambiguous", best, kept)
+
+
+def identify(
+    group: Sequence[int], found: Mapping[int, Explanation]
+) -> tuple[dict[int, int], dict[int, Rivals]]:
+    """Tell which of some identical bodies found the pose of each, and which are in doubt."""
+    bests = {k: best for k in group if (best := found[k].verdict.best) is not None}
+    finders = sorted(bests, key=lambda k: tuple(np.round(bests[k].T_world_object[:3, 3], 6)))
+    poses, known = [bests[k] for k in finders], [k for k in group if found[k].frame.predictions]
+    data = [found[k].frame for k in known]
+    # by body (rows) and pose; in the last column none, which says nothing
+    likely = np.zeros((len(known), len(poses) + 1))
+    for row, one in zip(likely, data, strict=True):
+        row[:-1] = [one.prior(pose.T_world_object).log_density for pose in poses]
+    rows, columns = linear_sum_assignment(likely[:, :-1], maximize=True)
+    pose_of = {known[i]: int(j) for i, j in zip(rows, columns, strict=True)}
+    spare = [j for j in range(len(poses)) if j not in pose_of.values()]
+    pose_of |= dict(zip([k for k in group if k not in known], spare, strict=False))
+    without = iter([k for k in group if k not in bests])
+    assigned = {k: finders[pose_of[k]] if k in pose_of else next(without) for k in group}
+    # how much likelier two bodies (rows, columns) are with each other's poses
+    given = likely[:, [pose_of.get(k, -1) for k in known]]
+    odds = given + given.T - given.diagonal() - given.diagonal()[:, None]
+    # no velocity is believed any more: they may have changed places, wherever they were before
+    lost = np.array([one.track.misses > one.rules.motion.coasting for one in data], np.bool_)
+    odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
+    rivals: dict[int, Rivals] = {}
+    limit = np.log(found[group[0]].frame.rules.acceptance.rival)
+    for i, j in zip(*np.nonzero(odds > limit), strict=True):
+        if i != j and known[i] in pose_of:
+            other = pose_of.get(known[j], pose_of[known[i]])
+            share = float(np.exp(min(odds[i, j], 0.0)))
+            rivals.setdefault(known[i], []).append((poses[other], share))
+    return assigned, rivals

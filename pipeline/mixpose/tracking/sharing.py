@@ -60,10 +60,10 @@ class Sharing:
     def _where_expected(self) -> None:
         """Bodies that are where they are expected, all at once, until nothing changes hands."""
         places = {}
-        for k, track in enumerate(self.tracks):
+        for k, (tracked, track) in enumerate(zip(self.bodies, self.tracks, strict=True)):
             if track.branches and not track.misses and not track.doubted:
-                first = self.bodies[k].predictions(track, self.frame, self.time_s)[0]
-                places[k] = self._nobody.features(self.bodies[k].body, first.T_world_object)
+                first = tracked.predictions(track, self.frame, self.time_s)[0]
+                places[k] = self._nobody.features(tracked.body, first.T_world_object)
         some, claims = list(places), self._nobody.expected(places, self.rules.gate)
         for _ in range(3):  # neighbours' neighbours are settled by then
             self.found |= self._at_once(some, claims, places)
@@ -86,7 +86,7 @@ class Sharing:
             for k, one in begun.items()
             if len(some) > 1
             and len(one.frame.views) == len(self.views)
-            and not claims.are_near(~one.left, places[k], self._reach(k))
+            and not self._are_near(k, ~one.left, places[k])
         ]
         if alike and self._shared is not None:
             frames = climbed_together([begun[k].frame for k in alike], self._shared)
@@ -96,9 +96,8 @@ class Sharing:
 
     def _is_touched(self, k: int, claims: Claims) -> bool:
         """Whether detections come to or go from a body that it may meet."""
-        changed = self.found[k].left ^ claims.left(k)
         places = claims.features(self.bodies[k].body, self.found[k].ranked[0].T_world_object)
-        return claims.are_near(changed, places, self._reach(k))
+        return self._are_near(k, self.found[k].left ^ claims.left(k), places)
 
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
@@ -177,7 +176,7 @@ class Sharing:
         tracked, told = self.bodies[k], []
         for j in self.claimed:
             known = self.tracks[k].companions.get(self.bodies[j].label)
-            if known is not None and self.found[j].verdict.status == "ok":
+            if known and self.found[j].verdict.status == "ok":
                 T = self.found[j].ranked[0].T_world_object
                 told.append(Prediction(*known.expected(T, tracked.body, tracked.rules.motion), 1.0))
         return min(told, key=_width, default=None)
@@ -215,18 +214,18 @@ class Sharing:
     @cached_property
     def _shared(self) -> SharedDensities | None:
         """The densities of all that is seen; None where a sensor has no single detections."""
-        if any(view.observation.points is None for view in self.views):
-            return None
-        return SharedDensities.drawn(self.views)
+        are_single = all(view.observation.points is not None for view in self.views)
+        return SharedDensities.drawn(self.views) if are_single else None
 
     def _is_forgotten(self, k: int) -> bool:
         """Whether where the body was says nothing any more: no velocity is believed then."""
         track = self.tracks[k]
         return not track.branches or track.misses > self.bodies[k].rules.motion.coasting
 
-    def _reach(self, k: int) -> float:
-        """How far from features of body k, in σ_ε, detections pull."""
-        return self.bodies[k].rules.judgement.noise.errors.reach
+    def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
+        """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
+        reach = self.bodies[k].rules.judgement.noise.errors.reach
+        return self._nobody.are_near(chosen, places, reach)
 
 
 def _width(expected: Prediction) -> float:
@@ -237,19 +236,15 @@ def _width(expected: Prediction) -> float:
 def climbed_together(frames: Sequence[FrameData], shared: SharedDensities) -> list[FrameData]:
     """The frames of several bodies with what is climbed from their first predictions, and judged.
 
-    Their sensors are the same, of which `shared` has all that they see; what is not a body's own is
-    out of its reach.
+    `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
-    begun = list(frames)
+    begun, some = list(frames), []
     for k, one in enumerate(frames):
         if not is_timed(one.views):
-            objective = matched_objective(one.views, one.body, one.sigmas, shared=shared)
-            begun[k] = replace(one, begun=Begun(objective))
-    some = [
-        k
-        for k, one in enumerate(begun)
-        if one.begun and one.options.objective == "matched" and can_be_together(one.body)
-    ]
+            drawn = matched_objective(one.views, one.body, one.sigmas, shared=shared)
+            begun[k] = replace(one, begun=Begun(drawn))
+            if one.options.objective == "matched" and can_be_together(one.body):
+                some.append(k)
     if len(some) < 2:
         return begun
     objectives = [begun[k].finest for k in some]

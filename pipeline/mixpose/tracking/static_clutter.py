@@ -34,10 +34,7 @@ class StaticClutter:
     places: Mapping[str, tuple[Floats, Indices]] = field(default_factory=dict)
 
     def learnt(self, views: Sequence[View], rules: StaticRules) -> StaticClutter:
-        """What is remembered after one more frame without the body.
-
-        A place that was seen as often as not is forgotten.
-        """
+        """After one more frame without the body; what was seen as often as not is forgotten."""
         places = dict(self.places)
         for view in views:
             points = view.observation.points

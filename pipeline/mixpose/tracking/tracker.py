@@ -51,10 +51,7 @@ class Tracker:
         rules: Rules = Rules(),
         instance: int | None = None,
     ) -> Self:
-        """Prepare tracking of a body, near T_start (4, 4) in the first frame, if that is given.
-
-        Half-widths of where to look around it are those of the rules of motion where None.
-        """
+        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
         motion = rules.motion
         start = per_kind(body, motion.start_distance, motion.start_rotation_deg)
         if distance is not None:
