@@ -287,7 +287,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-start-widths-ignored",
-        "tracking/tracker.py",
+        "tracking/scene.py",
         "start[:3] = distance",
         "start[:3] *= 1.0",
         "how far off a start may be does nothing",

@@ -13,9 +13,9 @@ from mixpose.tracking.gating import is_convincing as is_convincing
 from mixpose.tracking.in_motion import UNKNOWN_S as UNKNOWN_S
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import Scene as Scene
+from mixpose.tracking.scene import Tracker as Tracker
+from mixpose.tracking.scene import estimate_pose as estimate_pose
 from mixpose.tracking.track import Companion as Companion
 from mixpose.tracking.track import Prediction as Prediction
 from mixpose.tracking.track import Track as Track
 from mixpose.tracking.track import predict as predict
-from mixpose.tracking.tracker import Tracker as Tracker
-from mixpose.tracking.tracker import estimate_pose as estimate_pose

@@ -1,4 +1,4 @@
-"""Whose each detection is: a body's, or nobody's so far.
+"""Whose each detection is: a body's, nobody's so far, or two bodies' in one.
 
 No detection belongs to two bodies.  What belongs to another is left out of what a body sees: from
 its density, so that it does not pull, and from the clutter that its evidence is weighed against.
@@ -18,7 +18,7 @@ from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask
 
-FREE = -1  # owner of what is nobody's so far
+FREE, MERGED = -1, -2  # owners of what is nobody's so far, and of two bodies' features in one spot
 
 Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
 
@@ -33,7 +33,7 @@ class Claims:
     views: tuple[View, ...]  # of L sensors
     places: Floats  # (D, 3)
     begins: Indices  # (L + 1,), where the detections of each sensor begin
-    owners: Indices  # (D,), the number of a body, or FREE
+    owners: Indices  # (D,), the number of a body, FREE or MERGED
 
     @classmethod
     def none(cls, views: Sequence[View]) -> Claims:
@@ -89,7 +89,7 @@ class Claims:
         met = used.detections >= 0
         return kept[(first[:, None] + used.detections)[met]], used.squared[met]
 
-    def taken(self, met: Mapping[int, Met]) -> Claims:
+    def taken(self, met: Mapping[int, Met], merged: Sequence[int]) -> Claims:
         """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
         if not met:
             return self
@@ -99,11 +99,13 @@ class Claims:
         # what is written last stays: the nearest, and of equals the first
         order = np.argsort(squared, kind="stable")[::-1]
         owners[numbers[order]] = whose[order]
+        owners[merged] = MERGED
         return replace(self, owners=owners)
 
-    def are_near(self, chosen: Mask, places: Floats, reach: float) -> bool:
-        """Whether some detections (D,) lie within reach, in σ_ε, of places (n, 3)."""
-        return bool((_squared(self.places[chosen], places) < reach**2).any())
+    def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
+        """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
+        near = _squared(self.places[chosen], places) < reach**2
+        return np.flatnonzero(chosen)[near.any(axis=1)]
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:

@@ -22,7 +22,7 @@ from mixpose.tracking.proposers.look_alikes import reason
 from mixpose.tracking.track import Found, SensorTally, Track, follow
 
 if TYPE_CHECKING:
-    from mixpose.tracking.tracker import Tracker
+    from mixpose.tracking.scene import Tracker
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,6 @@ class Explanation:
         rules = self.frame.rules.acceptance
         return assess(self.ranked[0], self.frame.free, rules) if self.ranked else Checks(rules)
 
-    @property
-    def evidence(self) -> float:
-        """Log odds of the best pose."""
-        return self.ranked[0].log_evidence
-
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
@@ -68,10 +63,9 @@ class Explanation:
 
 
 def explain(begun: Explanation, *, quickly: bool = False) -> Explanation:
-    """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
+    """Propose, fit and judge poses, from the first proposer on that was not tried yet.
 
-    Goes on after the proposers that were tried already; `quickly` stops where the body is not
-    convincing where it is expected.
+    `quickly` stops where the body is not convincing where it is expected.
     """
     tracked, data = begun.tracked, begun.frame
     if not data.views or begun.tried == len(tracked.proposers):
@@ -105,14 +99,17 @@ def explain(begun: Explanation, *, quickly: bool = False) -> Explanation:
     return explained(len(tracked.proposers))
 
 
-def judged_by(other: Explanation, poses: Sequence[ScoredPose]) -> Explanation:
-    """Poses judged by another frame as they are, most evident first."""
+def judged_by(
+    other: Explanation, poses: Sequence[ScoredPose], *, fitted: bool = False
+) -> Explanation:
+    """Poses judged by another frame, and `fitted` to it, most evident first."""
     data, ranked = other.frame, list[ScoredPose]()
     likelihood = likelihood_of(data)
     for one in poses if data.views else ():
-        start = Start(one.T_world_object, left_out=one.left_out)
-        judged = likelihood.judge(likelihood.fit(start), start)
-        judged = replace(judged, proposer=one.proposer, blurs=one.blurs)
+        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
+        fit = likelihood.fit(start)
+        judged, blurs = likelihood.judge(fit, start), fit.blurs or one.blurs
+        judged = replace(judged, proposer=one.proposer, blurs=blurs)
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return replace(other, ranked=tuple(ranked), tried=len(other.tracked.proposers))
 

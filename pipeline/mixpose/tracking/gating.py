@@ -22,7 +22,6 @@ from mixpose.tracking.track import Prediction, SensorTally, Track
 
 Box: TypeAlias = tuple[int, int, int, int]
 Tallies: TypeAlias = Mapping[str, SensorTally]
-Observe: TypeAlias = Callable[[Mapping[str, Box]], list[View]]
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class WindowedScene:
         tracks: Sequence[Track],
         frame: int,
         time_s: float | None,
-        observe: Observe,
+        observe: Callable[[Mapping[str, Box]], list[View]],
         images: Collection[str],
     ) -> tuple[tuple[Track, ...], list[Estimate], list[View]]:
         """As `Scene.advance`: around the predictions if that convinces, else of all there is.

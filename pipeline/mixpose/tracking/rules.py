@@ -40,15 +40,11 @@ class LookAlikeRules:
     kinds: tuple[str, ...] = constant(
         ("congruent", "tilted", "mirrored"), "features like others, other tilt, mirror image"
     )
-    alike: float = constant(
-        0.05, "of the smaller radius, how far features may be off their partners: as bodies give"
-    )
+    alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
     fewer: float = constant(
         1.5, "features fewer that a rival may meet: each is worth four of the log odds, or so"
     )
-    flat: float = constant(
-        0.15, "thickness of a body against its smaller width below which it may be tilted"
-    )
+    flat: float = constant(0.15, "thickness by smaller width below which a body may be tilted")
     by_chance: float = constant(
         14.0,
         "coordinates met beyond six up to which its mirror image may be: 5 features, 2 cameras",
@@ -81,6 +77,12 @@ class SceneRules:
     )
     rival: float = constant(
         0.5, "share of detections met by two bodies from which it is one or the other; less: touch"
+    )
+    touching: float = constant(
+        3.0, "σ_ε from a spot to another body's feature: images run together at twice their width"
+    )
+    pulled: float = constant(
+        0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
     )
     thorough: int = constant(
         10, "frames for one thorough search for a body that is away while others are there: 1/3 s"

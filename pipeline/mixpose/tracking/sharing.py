@@ -27,7 +27,7 @@ from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Prediction, Track
 
 if TYPE_CHECKING:
-    from mixpose.tracking.tracker import Tracker
+    from mixpose.tracking.scene import Tracker
 
 
 @dataclass
@@ -43,6 +43,7 @@ class Sharing:
     rules: SceneRules
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
+    merged: list[int] = field(default_factory=list)  # detections that are two bodies' in one
 
     def explained(self) -> dict[int, Explanation]:
         """The poses of all bodies."""
@@ -50,10 +51,8 @@ class Sharing:
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
-        claims = self._claims(self.claimed)
-        for k, one in self.found.items():
-            if not np.array_equal(one.left, claims.left(k)):
-                self.found[k] = self._again(k, claims.left(k))
+        self._leave_merged()
+        self._judge_again(self.found)
         self._beside_others(away)
         return self.found
 
@@ -69,7 +68,8 @@ class Sharing:
             self.found |= self._at_once(some, claims, places)
             self.claimed = [k for k, one in self.found.items() if one.checks.convinces]
             claims = self._claims(self.claimed)
-            some = [k for k in self.claimed if self._is_touched(k, claims)]
+            changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
+            some = [k for k in changed if self._are_near(k, changed[k], self._features(k))]
             if not some:
                 break
 
@@ -94,11 +94,6 @@ class Sharing:
                 begun[k] = replace(begun[k], frame=frame)
         return {k: explain(one, quickly=True) for k, one in begun.items()}
 
-    def _is_touched(self, k: int, claims: Claims) -> bool:
-        """Whether detections come to or go from a body that it may meet."""
-        places = claims.features(self.bodies[k].body, self.found[k].ranked[0].T_world_object)
-        return self._are_near(k, self.found[k].left ^ claims.left(k), places)
-
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
         self._look(waiting)
@@ -118,14 +113,13 @@ class Sharing:
             is_twin = self._is_forgotten(k) and sum(one.body is body for one in self.bodies) > 1
             if not is_twin:
                 self.found[k] = self._everywhere(k, claims.left(k), self.tracks[k])
-            elif id(body) in twins:
-                whole = self._begun(k, self._nobody.left(k)).frame
-                self.found[k] = replace(twins[id(body)], tracked=self.bodies[k], frame=whole)
-            else:
+                continue
+            if id(body) not in twins:
                 anywhere = replace(self.tracks[k], branches=())
-                one = self._everywhere(k, claims.left(k), anywhere)
-                own = self._begun(k, one.left, beside=one.frame.beside, log=one.frame.log)
-                self.found[k] = twins[id(body)] = replace(one, frame=own.frame)
+                twins[id(body)] = self._everywhere(k, claims.left(k), anywhere)
+            one = twins[id(body)]
+            own = self._begun(k, one.left, beside=one.frame.beside, log=one.frame.log)
+            self.found[k] = replace(one, tracked=self.bodies[k], frame=own.frame)
 
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers, after those that were asked already where the same is left."""
@@ -142,7 +136,7 @@ class Sharing:
 
     def _most_evident(self, possible: Sequence[int]) -> int:
         """The body that is believed next: with it, all that compete explain most."""
-        first = max(possible, key=lambda k: self.found[k].evidence)
+        first = max(possible, key=lambda k: self.found[k].ranked[0].log_evidence)
         for other in possible:
             same = self.bodies[first].body is self.bodies[other].body
             if other == first or (same and all(map(self._is_forgotten, (first, other)))):
@@ -159,8 +153,31 @@ class Sharing:
         One that the rest says nothing for is taken to be away, which has the odds of clutter.
         """
         claims = self._claims([*(k for k in self.claimed if k != keeps), keeps])
-        rest = self._again(other, claims.left(other)).ranked
-        return self.found[keeps].evidence + max([0.0, *(one.log_evidence for one in rest[:1])])
+        rest = self._again(other, claims.left(other)).ranked[:1]
+        kept = self.found[keeps].ranked[0].log_evidence
+        return kept + max([0.0, *(one.log_evidence for one in rest)])
+
+    def _leave_merged(self) -> None:
+        """Take from bodies what they meet loosely beside another's feature, and fit them again."""
+        claims = self._claims(self.claimed)
+        places = {k: self._features(k) for k in self.claimed}
+        for k in self.claimed:
+            numbers, squared = self._met(k)
+            loose = np.isin(np.arange(len(claims.owners)), numbers[squared > self.rules.pulled])
+            others = np.concatenate([places[k][:0], *(places[j] for j in places if j != k)])
+            near = claims.near(loose & (claims.owners == k), others, self.rules.touching)
+            self.merged += near.tolist()
+        if self.merged:
+            self._judge_again(self.claimed, fitted=True)
+
+    def _judge_again(self, some: Iterable[int], *, fitted: bool = False) -> None:
+        """Judge poses for which other detections are left by now, and fit them to these."""
+        claims = self._claims(self.claimed)
+        for k in some:
+            left = claims.left(k)
+            if not np.array_equal(left, self.found[k].left):
+                again = self._again(k, left, fitted=fitted)
+                self.found[k] = again if again.ranked or not fitted else self.found[k]
 
     def _beside_others(self, some: Iterable[int]) -> None:
         """Bodies that are not sure, by what was found beside them since they looked."""
@@ -181,11 +198,13 @@ class Sharing:
                 told.append(Prediction(*known.expected(T, tracked.body, tracked.rules.motion), 1.0))
         return min(told, key=_width, default=None)
 
-    def _again(self, k: int, left: Mask, beside: Prediction | None = None) -> Explanation:
-        """The poses of a body by what is left for it by now."""
+    def _again(
+        self, k: int, left: Mask, beside: Prediction | None = None, *, fitted: bool = False
+    ) -> Explanation:
+        """The poses of a body by what is left for it by now, and fitted to that."""
         before = self.found[k].frame
         begun = self._begun(k, left, beside=beside or before.beside, log=before.log)
-        return judged_by(begun, self.found[k].ranked)
+        return judged_by(begun, self.found[k].ranked, fitted=fitted)
 
     def _begun(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Explanation:
         """What is left of the frame for a body, and what is known before it."""
@@ -199,7 +218,7 @@ class Sharing:
 
     def _claims(self, claimed: Sequence[int]) -> Claims:
         """Whose each detection is, if some bodies have what they meet."""
-        return self._nobody.taken({k: self._met(k) for k in claimed})
+        return self._nobody.taken({k: self._met(k) for k in claimed}, self.merged)
 
     def _met(self, k: int) -> Met:
         return self._nobody.met_by(self.found[k].ranked[0], self.found[k].left)
@@ -222,10 +241,13 @@ class Sharing:
         track = self.tracks[k]
         return not track.branches or track.misses > self.bodies[k].rules.motion.coasting
 
+    def _features(self, k: int) -> Floats:
+        return self._nobody.features(self.bodies[k].body, self.found[k].ranked[0].T_world_object)
+
     def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
         """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
         reach = self.bodies[k].rules.judgement.noise.errors.reach
-        return self._nobody.are_near(chosen, places, reach)
+        return len(self._nobody.near(chosen, places, reach)) > 0
 
 
 def _width(expected: Prediction) -> float:
