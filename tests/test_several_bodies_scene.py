@@ -251,7 +251,7 @@ def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
     # the other's first marker is farther off, and 3 px beside that of the tool for one camera
     eye = -left.T_sensor_world[:3, :3].T @ left.T_sensor_world[:3, 3]
     behind = eye + 1.2 * (first[:3, 3] - eye) + [0.0, 4.0, 0.0]
-    poses = [first, at(*behind, turn=1.0)]
+    poses = [first, at(behind[0], behind[1], behind[2], 1.0)]
     views = views_of(bodies, poses, 0)
     seen = views[0].observation.points
     assert seen is not None

@@ -23,7 +23,8 @@ class ProposalRules:
     kept: int = constant(5, "of these, starts that descend")
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(
-        3.0, "how much surer, and narrower blurred, drawn poses are than starts; searched: squared"
+        3.0,
+        "how much surer, and at a narrower blur, drawn poses are than starts; searched: squared",
     )
     blurs: tuple[float, ...] = constant(
         (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
@@ -47,7 +48,7 @@ class LookAlikeRules:
     flat: float = constant(0.15, "thickness by smaller width below which a body may be tilted")
     by_chance: float = constant(
         14.0,
-        "coordinates met beyond six up to which its mirror image may be: 5 features, 2 cameras",
+        "coordinates met beyond six up to which it may be by chance: 5 features, 2 cameras",
     )
 
 
@@ -73,10 +74,10 @@ class SceneRules:
     """How detections are shared out, and when bodies are in doubt for each other's sake."""
 
     gate: float = constant(
-        6.0, "σ_ε around expected features: met within 2.2, a steady prediction errs by the rest"
+        6.0, "σ_ε around expected features: they are met within 2.2, predictions err by the rest"
     )
     rival: float = constant(
-        0.5, "share of detections met by two bodies from which it is one or the other; less: touch"
+        0.5, "share of its detections that another meets from which it is the one or the other"
     )
     touching: float = constant(
         3.0, "σ_ε from a spot to another body's feature: images run together at twice their width"
@@ -85,5 +86,5 @@ class SceneRules:
         0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
     )
     thorough: int = constant(
-        10, "frames for one thorough search for a body that is away while others are there: 1/3 s"
+        10, "frames, of which one is searched thoroughly for a body that is away, others not: 1/3 s"
     )
