@@ -1,7 +1,6 @@
 """Detections that stay where they are, frame after frame, while the body is lost.
 
-Lamps, screws and reflections do not move; a body that is looked for will.  What is static is
-searched last.  A body that stands still is found all the same, only later.
+What is static, as lamps are, is searched last: a body that stands still is only found later.
 """
 
 from __future__ import annotations
