@@ -6,6 +6,7 @@ Scenes are drawn here from the cameras' geometry alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,9 @@ from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.records import Estimate, Floats, PointPattern
 from mixpose.search import SearchResult, search_frame
-from mixpose.tracking import Scene, SceneRules, Track
-from mixpose.tracking.claims import Claim, expected_owners, merged_spots, overlap, owners_of
-from mixpose.tracking.sharing import Moment, evidence_of_both, shared_out
+from mixpose.tracking import Scene, Track
+from mixpose.tracking.claims import Claims, places_of
+from mixpose.tracking.sharing import Sharing
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
 
@@ -64,10 +65,10 @@ def test_bodies_found_from_nothing_are_those_that_are_there() -> None:
     bodies = [body("tool", TOOL), body("other", OTHER)]
     poses = [at(-100, turn=0.4), at(110, 30, turn=-0.8)]
     scene = scene_of(*bodies)
-    outcomes = scene.advance(scene.begin(), 0, None, views_of(bodies, poses, 1))
-    for outcome, T in zip(outcomes, poses, strict=True):
-        assert outcome.estimate.status == "ok"
-        away, angle = off(outcome.estimate, T)
+    _, estimates = scene.advance(scene.begin(), 0, None, views_of(bodies, poses, 1))
+    for estimate, T in zip(estimates, poses, strict=True):
+        assert estimate.status == "ok"
+        away, angle = off(estimate, T)
         assert away < 1.0  # 0.2 px are 0.24 mm at this distance
         assert angle < 1.0
 
@@ -76,18 +77,18 @@ def test_a_body_that_is_not_there_is_not_found_on_its_twin() -> None:
     bodies = [body("rod", TOOL)]
     one = bodies[0]
     scene = scene_of(one, one)
-    outcomes = scene.advance(scene.begin(), 0, None, views_of(bodies, [at(20)], 2))
-    assert [outcome.estimate.status for outcome in outcomes] == ["ok", "lost"]
+    _, estimates = scene.advance(scene.begin(), 0, None, views_of(bodies, [at(20)], 2))
+    assert [estimate.status for estimate in estimates] == ["ok", "lost"]
 
 
 def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> None:
     # three markers of four are where three of five are; without them nothing speaks for the small
     small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
     scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
-    moment = Moment(scene.bodies, scene.begin(), 0, None, tuple(views), 2, scene.rules)
-    shares = shared_out(moment)
-    keeps, hidden = shares.found[1].evidence, shares.found[0].ranked[:1]
-    assert evidence_of_both(moment, shares, 1, 0) == pytest.approx(keeps, abs=1e-6)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    found = sharing.explained()
+    keeps, hidden = found[1].ranked[0].log_evidence, found[0].ranked[:1]
+    assert sharing.evidence_of_both(1, 0) == pytest.approx(keeps, abs=1e-6)
     assert not hidden or hidden[0].log_evidence < 0.0
 
 
@@ -96,10 +97,10 @@ def test_identical_bodies_found_from_nothing_are_numbered_along_x() -> None:
     poses = [at(150, turn=1.0), at(-140, 10), at(5, 40, turn=-0.7)]
     scene = scene_of(one, one, one)
     views = views_of([one] * 3, poses, 3)
-    outcomes = scene.advance(scene.begin(), 0, None, views)
-    x = [outcome.estimate.T_world_object[0, 3] for outcome in outcomes]  # type: ignore[index]
+    _, estimates = scene.advance(scene.begin(), 0, None, views)
+    x = [estimate.T_world_object[0, 3] for estimate in estimates]  # type: ignore[index]
     assert x == pytest.approx([-140, 5, 150], abs=2)
-    assert [outcome.estimate.instance for outcome in outcomes] == [0, 1, 2]
+    assert [estimate.instance for estimate in estimates] == [0, 1, 2]
 
 
 def followed(scene: Scene, one: Body, path: Sequence[Sequence[Floats]]) -> list[list[Estimate]]:
@@ -107,9 +108,8 @@ def followed(scene: Scene, one: Body, path: Sequence[Sequence[Floats]]) -> list[
     found = []
     for frame, poses in enumerate(path):
         views = views_of([one] * len(poses), poses, frame)
-        outcomes = scene.advance(tracks, frame, None, views)
-        tracks = [outcome.track for outcome in outcomes]
-        found.append([outcome.estimate for outcome in outcomes])
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        found.append(estimates)
     return found
 
 
@@ -146,10 +146,10 @@ def test_a_body_met_by_markers_that_another_has_too_is_in_doubt_while_that_is_no
     part = body("part", shared[:3])
     T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
     scene = scene_of(one, other)
-    alone = scene.advance(scene.begin(), 0, None, views_of([part], [T], 5))
-    assert "ok" not in [outcome.estimate.status for outcome in alone]
-    both = scene.advance(scene.begin(), 0, None, views_of([one, other], [T, elsewhere], 6))
-    assert [outcome.estimate.status for outcome in both] == ["ok", "ok"]
+    _, alone = scene.advance(scene.begin(), 0, None, views_of([part], [T], 5))
+    assert "ok" not in [estimate.status for estimate in alone]
+    _, both = scene.advance(scene.begin(), 0, None, views_of([one, other], [T, elsewhere], 6))
+    assert [estimate.status for estimate in both] == ["ok", "ok"]
 
 
 def test_three_markers_of_a_body_that_gives_way_may_be_three_of_its_others() -> None:
@@ -162,10 +162,9 @@ def test_three_markers_of_a_body_that_gives_way_may_be_three_of_its_others() -> 
     # three of its markers, then all of them, then three again while it is followed
     for frame, shown in enumerate((part, seen, seen, part)):
         views = views_of([shown, other], [at(2.0 * frame), there], frame)
-        outcomes = scene.advance(tracks, frame, None, views)
-        tracks = tuple(one.track for one in outcomes)
-        told.append(outcomes[0].estimate.status)
-        assert outcomes[1].estimate.status == "ok"
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        told.append(estimates[0].status)
+        assert estimates[1].status == "ok"
     assert told[0] != "ok"
     assert told[1:] == ["ok"] * 3
 
@@ -190,16 +189,15 @@ def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
     tracks = scene.begin()
     for frame in range(12):
         views = views_of([tool], [at(2.0 * frame)], frame)
-        outcomes = scene.advance(tracks, frame, None, views)
-        tracks = tuple(one.track for one in outcomes)
-        assert outcomes[1].estimate.status == "lost"
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        assert estimates[1].status == "lost"
     thorough = [frame for frame, most in zip(frames, asked, strict=True) if most == np.inf]
     # as long as it may be near, and again after ten frames without it
     assert sorted(set(thorough)) == [0, 1, 2, 3, 4, 5, 10]
     assert sorted(set(frames)) == list(range(12))
     views = views_of([tool, other], [at(24.0), at(150.0, 60.0)], 12)
-    outcomes = scene.advance(tracks, 12, None, views)
-    assert [one.estimate.status for one in outcomes] == ["ok", "ok"]
+    _, estimates = scene.advance(tracks, 12, None, views)
+    assert [one.status for one in estimates] == ["ok", "ok"]
 
 
 def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -> None:
@@ -209,19 +207,18 @@ def test_a_body_alone_in_its_session_is_in_doubt_on_three_markers_of_another() -
     tracks = scene.begin()
     for frame in range(4):
         # the tool is there, and the twin is not
-        (outcome,) = scene.advance(tracks, frame, None, views_of([tool], [at(2.0 * frame)], frame))
-        tracks = (outcome.track,)
-        assert outcome.estimate.status != "ok"
+        views = views_of([tool], [at(2.0 * frame)], frame)
+        tracks, (estimate,) = scene.advance(tracks, frame, None, views)
+        assert estimate.status != "ok"
     for frame in range(4, 8):
         views = views_of([twin], [at(2.0 * frame)], frame)
-        (outcome,) = scene.advance(tracks, frame, None, views)
-        tracks = (outcome.track,)
-        assert outcome.estimate.status == "ok"
+        tracks, (estimate,) = scene.advance(tracks, frame, None, views)
+        assert estimate.status == "ok"
     # once it was known it stays so while it is followed, also by three
     three = body("twin", twin.means[:3])
     views = views_of([three], [at(16.0)], 8)
-    (outcome,) = scene.advance(tracks, 8, None, views)
-    assert outcome.track.known
+    (track,), _ = scene.advance(tracks, 8, None, views)
+    assert track.known
 
 
 def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
@@ -230,42 +227,53 @@ def test_a_body_met_by_markers_that_repeat_themselves_is_in_doubt() -> None:
     one, other, part = body("one", whole), body("other", OTHER), body("part", isosceles)
     T, elsewhere = at(-60, turn=0.3), at(170, -60, 40, 1.2)
     scene = scene_of(one, other)
-    outcomes = scene.advance(scene.begin(), 0, None, views_of([part, other], [T, elsewhere], 5))
-    assert outcomes[0].estimate.status != "ok"
-    assert outcomes[1].estimate.status == "ok"
+    views = views_of([part, other], [T, elsewhere], 5)
+    _, estimates = scene.advance(scene.begin(), 0, None, views)
+    assert estimates[0].status != "ok"
+    assert estimates[1].status == "ok"
 
 
-def claim(numbers: list[int], places: list[list[float]], squared: list[float]) -> Claim:
-    return Claim(np.array(numbers), np.array(places), np.array(squared))
-
-
-def spots(*points: list[float]) -> list[View]:
+def spots(*points: list[float]) -> Claims:
     pattern = PointPattern(np.array(points), np.ones(len(points)))
-    return [View("left", CAMERAS["left"], Observation(pattern, 1.0))]
+    return Claims.none([View("left", CAMERAS["left"], Observation(pattern, 1.0))])
 
 
 def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
-    views = spots([0.0, 0.0], [50.0, 0.0])
-    first = {"left": claim([0, 1], [[0.4, 0.0], [50.0, 0.0]], [0.16, 0.0])}
-    second = {"left": claim([0], [[0.1, 0.0]], [0.01])}
-    assert owners_of(views, {0: first, 1: second})["left"].tolist() == [1, 0]
-    assert owners_of(views, {1: second, 0: first})["left"].tolist() == [1, 0]
-    assert overlap(first, second) == 1.0
+    claims = spots([0.0, 0.0], [50.0, 0.0])
+    first, second = (np.array([0, 1]), np.array([0.16, 0.0])), (np.array([0]), np.array([0.01]))
+    assert claims.taken({0: first, 1: second}, []).owners.tolist() == [1, 0]
+    assert claims.taken({1: second, 0: first}, []).owners.tolist() == [1, 0]
 
 
 def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
-    views = spots([0.0, 0.0])
-    first = {"left": claim([0], [[-1.5, 0.0]], [2.25])}
-    second = {"left": claim([0], [[1.5, 0.0]], [2.25])}
-    rules = SceneRules()
-    merged = merged_spots(views, {0: first, 1: second}, {}, rules.touching, rules.pulled)
-    assert merged["left"].tolist() == [0]
+    bodies, left = [body("tool", TOOL), body("other", OTHER)], CAMERAS["left"]
+    first = at(-60.0)
+    # the other's first marker is farther off, and 3 px beside that of the tool for one camera
+    eye = -left.T_sensor_world[:3, :3].T @ left.T_sensor_world[:3, 3]
+    behind = eye + 1.2 * (first[:3, 3] - eye) + [0.0, 4.0, 0.0]
+    poses = [first, at(behind[0], behind[1], behind[2], 1.0)]
+    views = views_of(bodies, poses, 0)
+    seen = views[0].observation.points
+    assert seen is not None
+    spots = [left.project(T[None, :3, 3])[0][0] for T in poses]
+    near = [int(np.linalg.norm(seen - spot, axis=1).argmin()) for spot in spots]
+    assert 2.0 < np.linalg.norm(spots[0] - spots[1]) < 4.0
+    # seen as one spot, in the middle
+    points = np.concatenate([np.delete(seen, near, axis=0), [(spots[0] + spots[1]) / 2]])
+    pattern = PointPattern(points, np.ones(len(points)))
+    views[0] = replace(views[0], observation=Observation(pattern, 1.5))
+    scene = scene_of(*bodies)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    found = sharing.explained()
+    assert sharing.merged == [len(points) - 1]
+    assert not found[0].left[len(points) - 1]
+    assert not found[1].left[len(points) - 1]
 
 
 def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:
-    views = spots([0.0, 0.0], [3.0, 0.0], [100.0, 0.0])
-    places = {0: {"left": np.array([[0.5, 0.0]])}, 1: {"left": np.array([[2.0, 0.0]])}}
-    assert expected_owners(views, places, 6.0)["left"].tolist() == [0, 1, -1]
+    claims = spots([0.0, 0.0], [3.0, 0.0], [100.0, 0.0])
+    places = {0: places_of(0, np.array([[0.5, 0.0]])), 1: places_of(0, np.array([[2.0, 0.0]]))}
+    assert claims.expected(places, 6.0).owners.tolist() == [0, 1, -1]
 
 
 def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:

@@ -14,7 +14,7 @@ from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.recognition import _is_flat
+from mixpose.tracking.doubt import _is_flat
 
 Floats = NDArray[np.float64]
 

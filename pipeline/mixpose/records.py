@@ -8,7 +8,7 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
@@ -226,8 +226,8 @@ class Estimate:
         part of the pose line.
     doubt : str
         Why a frame is ambiguous, other than for its rivals; no part of it either.
-    offsets : mapping of str to Offsets
-        By sensor, of the best pose.
+    measured : callable
+        Works out `offsets`.
     """
 
     frame: int
@@ -246,7 +246,12 @@ class Estimate:
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
     doubt: str = field(default="", compare=False)
-    offsets: Mapping[str, Offsets] = field(default_factory=dict, compare=False, repr=False)
+    measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)
+
+    @property
+    def offsets(self) -> Mapping[str, Offsets]:
+        """By how much each sensor met the features of the best pose."""
+        return self.measured()
 
     @property
     def label(self) -> str:

@@ -211,22 +211,21 @@ def _estimates(
     watch: Watch | None,
     remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
-    windowed, tracks = WindowedScene.of(scene, _windowed(session)), memory.tracks
+    windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
             with one_blas_thread():
-                outcomes, views = windowed.advance(
+                tracks, estimates, views = windowed.advance(
                     tracks,
                     frame_set.number,
                     frame_set.time_s,
                     partial(observe, session, frame_set),
                     _images(frame_set),
                 )
-            tracks = tuple(one.track for one in outcomes)
             latency_ms = 1e3 * (time.perf_counter() - began)
-            for k, outcome in enumerate(outcomes):
-                estimate = _with_silent_sensors(outcome.estimate, session.sensors)
+            for k, one in enumerate(estimates):
+                estimate = _with_silent_sensors(one, session.sensors)
                 estimate = replace(estimate, latency_ms=latency_ms)
                 if watch is not None:
                     watch(frame_set, views, estimate)

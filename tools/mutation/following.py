@@ -162,7 +162,7 @@ _GATING = (
     Mutant(
         "tracking-windows-of-an-exact-prediction",
         "tracking/gating.py",
-        "margins = self.rules.reach * np.sqrt(by_pose)",
+        "margins = self.reach * np.sqrt(by_pose)",
         "margins = 0 * np.sqrt(by_pose)",
         "a body that moves otherwise than predicted is cut off",
         (_WINDOWS,),
@@ -178,8 +178,8 @@ _GATING = (
     Mutant(
         "tracking-windows-of-points",
         "tracking/gating.py",
-        "np.maximum(scales * self._feature_reach, self.rules.min_margin_px)",
-        "np.maximum(0 * scales, self.rules.min_margin_px)",
+        "np.maximum(scales * self._feature_reach, self.min_margin_px)",
+        "np.maximum(0 * scales, self.min_margin_px)",
         "features that are large in the image are cut off",
         (_WINDOWS,),
     ),
@@ -202,8 +202,8 @@ _GATING = (
     Mutant(
         "tracking-fewer-detections-go-unnoticed",
         "tracking/gating.py",
-        "and len(view.observation.pattern.points) < before[view.name].met",
-        "and len(view.observation.pattern.points) < 0",
+        "points is not None and len(points) < before[name].met",
+        "points is not None and len(points) < 0",
         "a window that cuts features off is not noticed",
         (_WINDOWS,),
     ),
@@ -271,7 +271,7 @@ _RANGE_POSTERIOR = (
 _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         "residuals=best.noise if is_ok else track.residuals,",
         "residuals=best.noise,",
         "residuals of a wrong pose make the frames after it unsure",
@@ -279,7 +279,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sensors-left-out-are-tallied",
-        "tracking/outcome.py",
+        "tracking/explain.py",
         "used = best.used\n",
         "used = best.matches\n",
         "the next frame is looked at as a whole although all is well",
@@ -287,7 +287,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-start-widths-ignored",
-        "tracking/tracked_body.py",
+        "tracking/scene.py",
         "start[:3] = distance",
         "start[:3] *= 1.0",
         "how far off a start may be does nothing",
@@ -295,9 +295,9 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sure-frames-have-rivals",
-        "tracking/outcome.py",
-        'hypotheses=tuple(hypotheses) if verdict.status == "ambiguous" else (),',
-        "hypotheses=tuple(hypotheses),",
+        "tracking/explain.py",
+        'rivals = verdict.kept if verdict.status == "ambiguous" else ()',
+        "rivals = verdict.kept",
         "frames that are sure list hypotheses",
         (_TRACK,),
     ),

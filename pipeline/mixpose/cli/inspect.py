@@ -66,8 +66,7 @@ def inspect_frame(
     views = observe(session, frame_set)
     scene = scene_of(session)
     if poses is None:
-        outcomes = scene.advance(scene.begin(), number, frame_set.time_s, views)
-        estimates = [one.estimate for one in outcomes]
+        _, estimates = scene.advance(scene.begin(), number, frame_set.time_s, views)
     else:
         estimates = _from_file(poses, session, number)
     bodies = [tracked.body for tracked in scene.bodies]

@@ -21,7 +21,7 @@ from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.overlap import self_overlap
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Pattern, PointPattern
+from mixpose.records import Floats, Mask, Pattern, PointPattern
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,17 @@ class Observation:
     def dimension(self) -> int:
         """m, the number of sensor coordinates."""
         return self.pattern.dimension
+
+    @property
+    def points(self) -> Floats | None:
+        """Single detections (M, m); None for a grid of values."""
+        return self.pattern.points if isinstance(self.pattern, PointPattern) else None
+
+    def only(self, chosen: Mask) -> Observation:
+        """With some of its detections (M,)."""
+        assert isinstance(self.pattern, PointPattern)
+        part = PointPattern(self.pattern.points[chosen], self.pattern.weights[chosen])
+        return replace(self, pattern=part)
 
     @property
     def cell(self) -> float | None:

@@ -2,37 +2,20 @@
 
 from __future__ import annotations
 
-from mixpose.body import ASIDE
-from mixpose.tracking.gating import (
-    Expectation,
-    WindowedScene,
-    are_as_good,
-    have_fewer,
-    is_convincing,
-)
-from mixpose.tracking.rules import Rules, SceneRules
-from mixpose.tracking.scene import Outcome, Scene
-from mixpose.tracking.track import UNKNOWN_S, Companion, Prediction, Track, predict
-from mixpose.tracking.tracked_body import TrackedBody
-from mixpose.tracking.tracker import Tracker, estimate_pose
-
-__all__ = [
-    "ASIDE",
-    "UNKNOWN_S",
-    "Companion",
-    "Expectation",
-    "Outcome",
-    "Prediction",
-    "Rules",
-    "Scene",
-    "SceneRules",
-    "Track",
-    "TrackedBody",
-    "Tracker",
-    "WindowedScene",
-    "are_as_good",
-    "estimate_pose",
-    "have_fewer",
-    "is_convincing",
-    "predict",
-]
+from mixpose.body import ASIDE as ASIDE
+from mixpose.tracking.explain import Explanation as Explanation
+from mixpose.tracking.explain import explain as explain
+from mixpose.tracking.gating import Expectation as Expectation
+from mixpose.tracking.gating import WindowedScene as WindowedScene
+from mixpose.tracking.gating import are_as_good as are_as_good
+from mixpose.tracking.gating import have_fewer as have_fewer
+from mixpose.tracking.gating import is_convincing as is_convincing
+from mixpose.tracking.rules import Rules as Rules
+from mixpose.tracking.scene import Scene as Scene
+from mixpose.tracking.scene import Tracker as Tracker
+from mixpose.tracking.scene import estimate_pose as estimate_pose
+from mixpose.tracking.track import UNKNOWN_S as UNKNOWN_S
+from mixpose.tracking.track import Companion as Companion
+from mixpose.tracking.track import Prediction as Prediction
+from mixpose.tracking.track import Track as Track
+from mixpose.tracking.track import predict as predict

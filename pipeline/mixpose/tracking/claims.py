@@ -2,252 +2,121 @@
 
 No detection belongs to two bodies.  What belongs to another is left out of what a body sees: from
 its density, so that it does not pull, and from the clutter that its evidence is weighed against.
-
-Owners are arrays, by sensor: for each detection the number of its body, FREE or MERGED.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from mixpose.density import Observation
+from mixpose.body import Body
 from mixpose.judgement import ScoredPose
-from mixpose.objective import View
-from mixpose.records import Floats, PointPattern
+from mixpose.objective import View, project_body
+from mixpose.records import Floats, Indices, Mask
 
-Owners: TypeAlias = dict[str, NDArray[np.intp]]
-Places: TypeAlias = Mapping[str, Floats]
+FREE, MERGED = -1, -2  # owners of what is nobody's so far, and of two bodies' features in one spot
 
-FREE, MERGED = -1, -2
-"""Owners of detections that are nobody's so far, and that are two bodies' features in one spot."""
+Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
 
 
-class Claim(NamedTuple):
-    """The detections that a pose meets in one sensor: which, where it expects them, how far off."""
+@dataclass(frozen=True, eq=False)
+class Claims:
+    """Whose the D detections of all sensors are; sensors without single detections have none.
 
-    detections: NDArray[np.intp]
-    places: Floats
-    squared: Floats
-
-
-Claims: TypeAlias = Mapping[str, Claim]
-
-
-@dataclass(frozen=True)
-class Unclaimed:
-    """What others leave for a body.
-
-    Attributes
-    ----------
-    views : tuple of View
-    kept : mapping of str to (K,) int
-        By sensor, the detections that are left, by their numbers in the whole view.
-    sensors : int
-        That had a frame, also those that saw nothing.
+    Places are in σ_ε of their sensor, with a third coordinate that keeps sensors apart.
     """
 
-    views: tuple[View, ...]
-    kept: Mapping[str, NDArray[np.intp]]
-    sensors: int
+    views: tuple[View, ...]  # of L sensors
+    places: Floats  # (D, 3)
+    begins: Indices  # (L + 1,), where the detections of each sensor begin
+    owners: Indices  # (D,), the number of a body, FREE or MERGED
 
     @classmethod
-    def whole(cls, views: Sequence[View]) -> Unclaimed:
-        """All that is seen."""
-        return left_for(FREE, views, nobody(views), len(views))
+    def none(cls, views: Sequence[View]) -> Claims:
+        """Before anything is known."""
+        seen = [view.observation for view in views]
+        points = [np.zeros((0, 2)) if one.points is None else one.points for one in seen]
+        begins = np.cumsum([0, *map(len, points)])
+        of = [places_of(k, points[k] / one.sigma) for k, one in enumerate(seen)]
+        return cls(tuple(views), np.concatenate(of), begins, np.full(begins[-1], FREE))
+
+    def left(self, k: int) -> Mask:
+        """What others leave for body k (D,)."""
+        return np.asarray((self.owners == FREE) | (self.owners == k))
+
+    def part(self, left: Mask) -> list[View]:
+        """The views with some of their detections (D,)."""
+        masks = np.split(left, self.begins[1:-1])
+        return [
+            view if mask.all() else replace(view, observation=view.observation.only(mask))
+            for view, mask in zip(self.views, masks, strict=True)
+        ]
+
+    def features(self, body: Body, T_world_object: Floats) -> Floats:
+        """Where the sensors have the features of a body at a pose (n, 3)."""
+        sensors = tuple(view.sensor for view in self.views)
+        at = project_body(sensors, body).project(T_world_object[None])
+        rows, features = np.nonzero(at.seen[:, 0])
+        sigmas = np.array([view.observation.sigma for view in self.views])
+        return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])
+
+    def expected(self, places: Mapping[int, Floats], gate: float) -> Claims:
+        """Each detection is that of the feature, `gate` σ_ε off at most, that it is expected of.
+
+        `places` (n, 3) of features are by body; all are assigned at once, as near as can be.
+        """
+        if not places:
+            return self
+        whose = np.repeat(list(places), [len(some) for some in places.values()])
+        at, owners = np.concatenate(list(places.values())), self.owners.copy()
+        for sensor in np.unique(at[:, 2]):
+            rows, columns = (np.flatnonzero(some[:, 2] == sensor) for some in (self.places, at))
+            squared = np.minimum(_squared(self.places[rows], at[columns]), gate**2)
+            i, j = linear_sum_assignment(squared)
+            near = squared[i, j] < gate**2
+            owners[rows[i[near]]] = whose[columns[j[near]]]
+        return replace(self, owners=owners)
+
+    def met_by(self, pose: ScoredPose, left: Mask) -> Met:
+        """What a pose meets of the detections that are left for its body."""
+        used, kept = pose.used, np.flatnonzero(left)
+        numbers = {view.name: k for k, view in enumerate(self.views)}
+        first = np.searchsorted(kept, self.begins[[numbers[name] for name in used.names]])
+        met = used.detections >= 0
+        return kept[(first[:, None] + used.detections)[met]], used.squared[met]
+
+    def taken(self, met: Mapping[int, Met], merged: Sequence[int]) -> Claims:
+        """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
+        if not met:
+            return self
+        whose = np.repeat(list(met), [len(numbers) for numbers, _ in met.values()])
+        numbers, squared = map(np.concatenate, zip(*met.values(), strict=True))
+        owners = self.owners.copy()
+        # what is written last stays: the nearest, and of equals the first
+        order = np.argsort(squared, kind="stable")[::-1]
+        owners[numbers[order]] = whose[order]
+        owners[merged] = MERGED
+        return replace(self, owners=owners)
+
+    def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
+        """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
+        near = _squared(self.places[chosen], places) < reach**2
+        return np.flatnonzero(chosen)[near.any(axis=1)]
 
 
-def _patterns(views: Sequence[View]) -> Iterator[tuple[View, PointPattern]]:
-    """Views with single detections."""
-    for view in views:
-        if isinstance(view.observation.pattern, PointPattern):
-            yield view, view.observation.pattern
-
-
-def nobody(views: Sequence[View]) -> Owners:
-    """Owners before anything is known; sensors without single detections have none."""
-    return {view.name: np.full(len(seen.points), FREE) for view, seen in _patterns(views)}
-
-
-def _is_left(k: int, own: NDArray[np.intp]) -> NDArray[np.bool_]:
-    return np.asarray((own == FREE) | (own == k))
-
-
-def left_for(k: int, views: Sequence[View], owners: Owners, sensors: int) -> Unclaimed:
-    """What others leave for body k."""
-    kept = {
-        view.name: np.flatnonzero(_is_left(k, owners[view.name])) for view, _ in _patterns(views)
-    }
-    some = [_part(view, kept[view.name]) if view.name in kept else view for view in views]
-    return Unclaimed(tuple(some), kept, sensors)
-
-
-def _part(view: View, kept: NDArray[np.intp]) -> View:
-    seen, pattern = view.observation, view.observation.pattern
-    if not isinstance(pattern, PointPattern) or len(kept) == len(pattern.points):
-        return view
-    part = PointPattern(pattern.points[kept], pattern.weights[kept])
-    return replace(view, observation=Observation(part, seen.sigma, seen.intrinsic))
-
-
-def claims_of(judged: ScoredPose, left: Unclaimed) -> dict[str, Claim]:
-    """The detections that a pose meets, numbered as in the whole views."""
-    claims, used = {}, judged.used
-    for k, (name, m) in enumerate(zip(used.names, used.dimensions)):
-        if name in left.kept:
-            met = used.detections[k] >= 0
-            numbers = left.kept[name][used.detections[k, met]]
-            claims[name] = Claim(numbers, used.places[k, met, :m], used.squared[k, met])
-    return claims
-
-
-def unmet_places(judged: ScoredPose) -> dict[str, Floats]:
-    """Where a pose has features that nothing was found at, by sensor."""
-    seen = judged.matches
-    unmet = (seen.weights > 0) & (seen.shares == 0)
-    sensors = enumerate(zip(seen.names, seen.dimensions))
-    return {name: seen.places[k, unmet[k], :m] for k, (name, m) in sensors}
-
-
-def expected_owners(views: Sequence[View], places: Mapping[int, Places], gate: float) -> Owners:
-    """Owners by where features are expected: each detection is that of the feature it is nearest.
-
-    Parameters
-    ----------
-    views : sequence of View
-    places : mapping of int to mapping of str to (n, m) array
-        By body and sensor.
-    gate : float
-        How far at most, in σ_ε.
-    """
-    owners = nobody(views)
-    for view, pattern in _patterns(views):
-        own = [by_sensor[view.name] for by_sensor in places.values()]
-        whose = np.repeat(list(places), [len(y) for y in own])
-        if not len(whose) or not len(pattern.points):
-            continue
-        squared = _squared(pattern.points, np.concatenate(own))
-        most = (gate * view.observation.sigma) ** 2
-        rows, columns = linear_sum_assignment(np.minimum(squared, most))
-        near = squared[rows, columns] < most
-        owners[view.name][rows[near]] = whose[columns[near]]
-    return owners
-
-
-def owners_of(views: Sequence[View], claims: Mapping[int, Claims]) -> Owners:
-    """Owners by what poses meet; of a detection that two meet, the one that it lies nearer to."""
-    owners = nobody(views)
-    for name, own in owners.items():
-        if some := _claimed(name, claims):
-            whose, numbers, _, squared = some
-            # what is written last stays: the nearest, and of equals the first
-            order = np.argsort(squared, kind="stable")[::-1]
-            own[numbers[order]] = whose[order]
-    return owners
-
-
-def _claimed(
-    name: str, claims: Mapping[int, Claims]
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats] | None:
-    """All claims in one sensor: bodies (K,), detections (K,), places (K, m), squared offsets."""
-    some = {k: by_sensor[name] for k, by_sensor in claims.items() if name in by_sensor}
-    if not some:
-        return None
-    whose = np.repeat(list(some), [len(claim.detections) for claim in some.values()])
-    detections, places, squared = map(np.concatenate, zip(*some.values(), strict=True))
-    return whose, detections, places, squared
-
-
-def merged_spots(
-    views: Sequence[View],
-    claims: Mapping[int, Claims],
-    unmet: Mapping[int, Places],
-    touching: float,
-    pulled: float,
-) -> dict[str, NDArray[np.intp]]:
-    """Detections that may be features of two bodies in one spot, by sensor.
-
-    One body meets it loosely, and another has a feature beside it that has no other detection:
-    nothing was found there, or the same spot, to which the other is nearer.
-
-    Parameters
-    ----------
-    views : sequence of View
-    claims, unmet
-        By body.
-    touching : float
-        How near the other's feature is at most, in σ_ε.
-    pulled : float
-        Squared offset in σ_ε² from which a detection is met loosely.
-    """
-    merged: dict[str, NDArray[np.intp]] = {}
-    owners = owners_of(views, claims)
-    for view, pattern in _patterns(views):
-        some = _claimed(view.name, claims)
-        if some is None:
-            continue
-        whose, numbers, at, squared = some
-        first = owners[view.name][numbers] == whose
-        loose = first & (squared > pulled)
-        lost = {k: places[view.name] for k, places in unmet.items() if view.name in places}
-        others = np.concatenate([at[~first], *lost.values()])
-        numbered = [np.full(len(places), k) for k, places in lost.items()]
-        theirs = np.concatenate([whose[~first], *numbered])
-        squares = _squared(pattern.points[numbers[loose]], others)
-        near = squares < (touching * view.observation.sigma) ** 2
-        both = (near & (theirs != whose[loose][:, None])).any(axis=1)
-        if both.any():
-            merged[view.name] = np.unique(numbers[loose][both])
-    return merged
-
-
-def overlap(a: Claims, b: Claims) -> float:
-    """Share of the detections of the one that claims fewer that both claim."""
-    both = sum(len(np.intersect1d(a[n].detections, b[n].detections)) for n in a.keys() & b.keys())
-    fewer = min(sum(len(np.unique(c.detections)) for c in claims.values()) for claims in (a, b))
-    return both / max(fewer, 1)
-
-
-def is_changed(k: int, left: Unclaimed, owners: Owners) -> bool:
-    """Whether other detections than those are left for body k by now."""
-    return any(
-        not np.array_equal(kept, np.flatnonzero(_is_left(k, owners[name])))
-        for name, kept in left.kept.items()
-    )
-
-
-def is_reached(
-    k: int, views: Sequence[View], left: Unclaimed, owners: Owners, places: Places, reach: float
-) -> bool:
-    """Whether detections come to or go from body k within a reach, in σ_ε, of places."""
-    for view, pattern in _patterns(views):
-        changed = _is_left(k, owners[view.name])
-        changed[left.kept[view.name]] ^= True
-        if _is_near(view, pattern.points[changed], places[view.name], reach):
-            return True
-    return False
-
-
-def hides_near(views: Sequence[View], left: Unclaimed, places: Places, reach: float) -> bool:
-    """Whether a detection that is left out lies within reach, in σ_ε, of places (n, m)."""
-    return any(
-        _is_near(
-            view, np.delete(seen.points, left.kept[view.name], axis=0), places[view.name], reach
-        )
-        for view, seen in _patterns(views)
-    )
-
-
-def _is_near(view: View, points: Floats, places: Floats, reach: float) -> bool:
-    return bool((_squared(points, places) < (reach * view.observation.sigma) ** 2).any())
+def places_of(sensors: int | Indices, y: Floats) -> Floats:
+    """Places (K, 3) of points (K, m) in σ_ε: what two sensors see is far apart."""
+    places = np.zeros((len(y), 3))
+    places[:, : y.shape[1]] = y
+    places[:, 2] = 1e6 * np.asarray(sensors)
+    return places
 
 
 def _squared(points: Floats, places: Floats) -> Floats:
-    """Squared distances (K, n) of points (K, m) and places (n, m)."""
+    """Squared distances (K, n) of points (K, 3) and places (n, 3)."""
     away = points[:, None] - places
     return np.asarray((away * away).sum(axis=2))

@@ -1,59 +1,144 @@
-"""Poses that may be another body, or another way up: all that is met is a part that both have.
+"""Why a pose that is sure by itself is in doubt: what was seen may not be the body.
 
-A body of which three markers are met looks like every body that has three markers in the same
-places.  Where such another one of the session is not surely somewhere else, its pose there is a
-rival: if that explains the frame about as well, the body is in doubt.
+A body is known once more than three markers are met, which other things, or another body of the
+session, have in the same places, too; and stays so while it is followed.  What looks like it by
+chance does so for several frames, and what the track expects then tells nothing.
+
+Where features are missed, and detections about the body belong to none, its mirror image is a
+rival: reflected in the plane nearest to the features met, which it leaves where they are.  Where
+few are met, it is looked for everywhere, in the first frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from mixpose.body import like_features, tolerance_of
-from mixpose.judgement import ScoredPose
-from mixpose.tracking.explain import Explanation, explain_by
-from mixpose.tracking.proposers import met_features
-from mixpose.tracking.tracked_body import TrackedBody
+from mixpose.body import Body, like_features, mirror_image, thickness, tolerance_of
+from mixpose.judgement import APART, ScoredPose, contradict, is_far_off
+from mixpose.records import Mask
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.proposers import candidates_of, met_features, starts_at
+from mixpose.tracking.track import Track
+
+TRIANGLE = "three markers are met, which other things may have alike"
+ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
+MIRRORED = "it shows the body's mirror image"
 
 
-def may_be_another(
-    k: int,
-    best: ScoredPose,
-    members: Sequence[TrackedBody],
-    found: Mapping[int, Explanation],
-    elsewhere: Sequence[bool],
-) -> str:
-    """Why a pose of member k might as well be one of another body, or another of its own.
+def doubt_about(data: Frame, best: ScoredPose, sensors: int, *, has_rivals: bool) -> str:
+    """Why a pose is in doubt, of a moment at which some sensors had a frame; empty if it is not."""
+    rules, track = data.rules, data.track
+    if is_reflection(data, best):
+        return MIRRORED
+    noise = rules.judgement.noise
+    if contradict(best, track.residuals.total, track.agreed, rules.acceptance, noise):
+        return APART
+    if has_rivals:
+        return ""
+    if not is_known(data, best):
+        return TRIANGLE
+    is_alone = sensors > 1 and np.count_nonzero(best.matches.met) == 1
+    return ALONE if is_alone and _is_from_doubt(data, best) else ""
 
-    Empty where it might not.
 
-    Parameters
-    ----------
-    k : int
-    best : ScoredPose
-    members : sequence of TrackedBody
-    found : mapping of int to Explanation
-        Of the frame as it is left for each.
-    elsewhere : sequence of bool
-        Which members are surely where they are.
+def is_known(data: Frame, judged: ScoredPose) -> bool:
+    """Whether a pose is the body's, by what it meets or by where it was expected."""
+    if (judged.matches.dimensions == 1).any():
+        return True  # ranges are no markers in space
+    others = np.sort(judged.matches.met_by)[:-3]
+    # one sensor of several may meet a marker by chance
+    if not len(others) or others.sum() >= max(len(data.views) / 2, 1):
+        return True
+    if not data.track.known or data.track.misses:
+        return False
+    return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())
+
+
+def is_reflection(data: Frame, judged: ScoredPose) -> bool:
+    """Whether the frame shows the body's mirror image rather than the body."""
+    rules, seen, T = data.rules, judged.matches, judged.T_world_object
+    if "mirrored" not in rules.look_alikes.kinds or not data.body.is_exact or _is_flat(data.body):
+        return False
+    ahead, met = rules.acceptance.standing_out, seen.met_by
+    # of these the mirror image may meet more than the body
+    if np.minimum(seen.missed, seen.unmatched_nearby).sum() > 0.5:
+        # one camera alone may have met a feature by chance
+        sharp = met >= min(2, met.max())
+        there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
+        # no rival meets less than a quarter of what the body meets; values grow as the square
+        value, own = (one.finest.value(T[None])[0] for one in (there, data))
+        if value > own / 16:
+            start = Start(T, data.close)
+            if _evidence(there, start) > judged.log_evidence + ahead:
+                return True
+    if not _is_by_chance(data, judged):
+        return False
+    # wherever it is found, and nothing known of either
+    track = Track(residuals=data.track.residuals)
+    # what explains more than this pose is met by the first guesses already
+    options = replace(data.options, search="live")
+    nothing = replace(data, predictions=(), beside=None, begun=None)
+    alone = replace(nothing, track=track, searches=[], options=options)
+    own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
+    least = own - rules.search.outdone
+    starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
+    return any(_evidence(mirror, start) > own + ahead for start in starts)
+
+
+def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str:
+    """Why a pose might as well be one of another body, or another of its own; empty if not.
+
+    All that is met is a part that both have.  `others` are the frames of the bodies in question.
     """
-    met, body = met_features(best), members[k].body
-    for j, other in enumerate(members):
-        theirs = other.body
-        # a body's own markers may repeat themselves: then it may be turned another way
-        if j != k and (theirs is body or elsewhere[j]):
-            continue
-        limit = best.log_evidence + float(np.log(other.rules.acceptance.rival))
-        tolerance = tolerance_of(body, theirs, other.rules.look_alikes.alike)
-        for part in like_features(body, met, theirs, tolerance):
-            if len(part.features) < len(met):
-                continue
-            there = replace(best, T_world_object=best.T_world_object @ part.T_body_other)
-            seen = replace(found[j].frame, views=found[k].frame.views, begun=None)
-            rival = explain_by(other, seen, found[k].left, [there], fitted=True)
-            if rival.ranked and rival.evidence > limit:
-                return part.reason
+    met = met_features(best)
+    for other in others:
+        rules = other.rules
+        limit = best.log_evidence + float(np.log(rules.acceptance.rival))
+        tolerance = tolerance_of(data.body, other.body, rules.look_alikes.alike)
+        seen = replace(other, views=data.views, begun=None)
+        for part in like_features(data.body, met, other.body, tolerance):
+            if len(part.features) == len(met):
+                T = best.T_world_object @ part.T_body_other
+                if _evidence(seen, Start(T, other.close, left_out=best.left_out)) > limit:
+                    return part.reason
     return ""
+
+
+def _is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
+    """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
+    if data.track.believed:
+        return False
+    gained = data.prior(judged.T_world_object).log_density - data.anywhere.log_density
+    return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
+
+
+def _is_flat(body: Body) -> bool:
+    """Whether a turn brings the body onto its mirror image: no camera tells one side's markers."""
+    return thickness(body) < 1e-6
+
+
+def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
+    """Whether features may be met by chance: few, others missed or these far off, early on."""
+    rules, seen = data.rules, judged.matches
+    if judged.measurements - 6 > rules.look_alikes.by_chance:
+        return False
+    if data.track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
+        return False
+    before, noise = data.track.residuals.total, rules.judgement.noise
+    off = is_far_off(seen, before, rules.acceptance, noise)
+    return off or bool((seen.missed > 0.5).any())
+
+
+def _evidence(data: Frame, start: Start) -> float:
+    likelihood = likelihood_of(data)
+    return likelihood.judge(likelihood.fit(start), start).log_evidence
+
+
+def _mirrored(data: Frame, chosen: Mask) -> Frame:
+    """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
+    near = frozenset(np.flatnonzero(chosen).tolist())
+    return replace(data, body=mirror_image(data.body, near), begun=None)

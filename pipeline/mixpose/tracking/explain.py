@@ -1,124 +1,92 @@
-"""Poses that may explain what is left of a frame for one body, and the verdict on them."""
+"""Poses that may explain a frame for one body, the verdict on them, and what becomes of that."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import expit
 
 from mixpose.fit import Fit
 from mixpose.judgement import (
     APART,
     ScoredPose,
     Verdict,
-    contradict,
     convinces,
     decide,
     insert,
     is_possible,
     is_sure,
 )
-from mixpose.tracking.claims import Claim, Unclaimed, claims_of
-from mixpose.tracking.frame import Frame
+from mixpose.matching import Matches
+from mixpose.objective import View
+from mixpose.records import Estimate, Hypothesis, Mask, Offsets, SensorReport
+from mixpose.tracking.doubt import doubt_about, is_known
+from mixpose.tracking.frame import Frame, follow
+from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, Start, likelihood_of
 from mixpose.tracking.proposers import reason
-from mixpose.tracking.recognition import (
-    ALONE,
-    MIRRORED,
-    TRIANGLE,
-    is_alone,
-    is_known,
-    is_reflection,
-)
-from mixpose.tracking.tracked_body import TrackedBody
+from mixpose.tracking.track import Branch, SensorTally, Track
+
+if TYPE_CHECKING:
+    from mixpose.tracking.scene import Tracker
 
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """What one body makes of what is left of a frame.
+    """What one body makes of what is left of a frame for it."""
 
-    Attributes
-    ----------
-    tracked : TrackedBody
-    frame : Frame
-    left : Unclaimed
-        What `frame` has of all that was seen.
-    ranked : tuple of ScoredPose
-        Distinct poses, most evident first.
-    tried : int
-        How many of the proposers were asked.
-    fits : tuple of Fit
-        That were judged.
-    likelihood : Likelihood or None
-        None where nothing was seen.
-    """
-
-    tracked: TrackedBody
+    tracked: Tracker
     frame: Frame
-    left: Unclaimed
-    ranked: tuple[ScoredPose, ...] = ()
-    tried: int = 0
-    fits: tuple[Fit, ...] = ()
-    likelihood: Likelihood | None = None
+    sensors: int = 1  # that had a frame, also those that saw nothing
+    left: Mask = field(default_factory=lambda: np.ones(0, np.bool_))  # (D,), see `Claims.left`
+    ranked: tuple[ScoredPose, ...] = ()  # distinct poses, most evident first
+    tried: int = 0  # of the proposers
+    fits: tuple[Fit, ...] = ()  # that were judged
+    likelihood: Likelihood | None = None  # that they are of
 
     @property
     def is_possible(self) -> bool:
         """Whether the best pose is worth telling."""
-        rules = self.tracked.rules.acceptance
-        return bool(self.ranked) and is_possible(self.ranked[0], self.frame.free, rules)
+        frame = self.frame
+        return any(is_possible(p, frame.free, frame.rules.acceptance) for p in self.ranked[:1])
 
     @property
     def convinces(self) -> bool:
         """Whether the best pose, near its prediction, needs no other to compare with."""
-        rules = self.tracked.rules.acceptance
-        return bool(self.ranked) and convinces(self.ranked[0], self.frame.free, rules)
-
-    @property
-    def is_sure(self) -> bool:
-        """Whether the verdict is ok."""
-        return self.verdict.status == "ok"
-
-    @property
-    def evidence(self) -> float:
-        """Log odds of the best pose."""
-        return self.ranked[0].log_evidence
-
-    @cached_property
-    def claims(self) -> Mapping[str, Claim]:
-        """The detections that the best pose meets, by sensor."""
-        return claims_of(self.ranked[0], self.left)
+        frame = self.frame
+        return any(convinces(p, frame.free, frame.rules.acceptance) for p in self.ranked[:1])
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return _verdict(self)
+        data = self.frame
+        verdict = decide(self.ranked, data.free, data.rules.acceptance)
+        best, has_rivals = verdict.best, verdict.status != "ok"
+        if best is None:
+            return verdict
+        if has_rivals:
+            rivals = [one for one, _ in verdict.kept if one is not best]
+            if why := reason(data, best, rivals):
+                return replace(verdict, doubt=why)
+        # a sure pose that has rivals may have them for a reason that can be told
+        if not is_sure(best, data.free, data.rules.acceptance):
+            return verdict
+        return verdict.doubted(doubt_about(data, best, self.sensors, has_rivals=has_rivals))
 
 
-def explain(
-    tracked: TrackedBody,
-    frame: Frame,
-    left: Unclaimed,
-    before: Explanation | None = None,
-    *,
-    quickly: bool = False,
-) -> Explanation:
-    """Distinct poses that may explain a frame, most evident first: propose, fit, judge.
+def explain(begun: Explanation, *, quickly: bool = False) -> Explanation:
+    """Propose, fit and judge poses, from the first proposer on that was not tried yet.
 
-    Parameters
-    ----------
-    tracked : TrackedBody
-    frame : Frame
-    left : Unclaimed
-        The views of `frame`.
-    before : Explanation or None
-        Of the same frame, by the first proposers, after which the others go on.
-    quickly : bool
-        Whether to stop where the body is not convincing where it is expected.
+    `quickly` stops where the body is not convincing where it is expected.
     """
-    begun = before or Explanation(tracked, frame, left)
-    if not frame.views or begun.tried == len(tracked.proposers):
+    tracked, data = begun.tracked, begun.frame
+    if not data.views or begun.tried == len(tracked.proposers):
         return begun
-    likelihood = begun.likelihood or likelihood_of(frame)
+    likelihood = begun.likelihood or likelihood_of(data)
     ranked, fits = list(begun.ranked), list(begun.fits)
 
     def consider(start: Start, name: str) -> ScoredPose | None:
@@ -127,71 +95,111 @@ def explain(
             return None  # judged before, and by the same prior
         fits.append(fit)
         judged = replace(likelihood.judge(fit, start), proposer=name, blurs=fit.blurs)
-        insert(ranked, judged, tracked.body, frame.free, tracked.rules.acceptance)
+        insert(ranked, judged, tracked.body, data.free, data.rules.acceptance)
         return judged
 
     def explained(tried: int) -> Explanation:
-        return Explanation(tracked, frame, left, tuple(ranked), tried, tuple(fits), likelihood)
+        poses, judged = tuple(ranked), tuple(fits)
+        return replace(begun, ranked=poses, tried=tried, fits=judged, likelihood=likelihood)
 
     for k, propose in enumerate(tracked.proposers[begun.tried :], begun.tried):
-        for start in propose(frame, ranked):
+        for start in propose(data, ranked):
             judged = consider(start, propose.__name__)
             if judged is None:
                 continue
             for refine in tracked.refinements:
-                for better in refine(frame, likelihood, judged):
+                for better in refine(data, likelihood, judged):
                     consider(better, refine.__name__)
         if quickly and k == 0 and not (first := explained(1)).convinces:
             return first
     return explained(len(tracked.proposers))
 
 
-def explain_by(
-    tracked: TrackedBody,
-    frame: Frame,
-    left: Unclaimed,
-    poses: Sequence[ScoredPose],
-    *,
-    fitted: bool,
+def judged_by(
+    other: Explanation, poses: Sequence[ScoredPose], *, fitted: bool = False
 ) -> Explanation:
-    """Poses judged by other views, and fitted to them, most evident first."""
-    ranked: list[ScoredPose] = []
-    likelihood = likelihood_of(frame)
-    for one in poses if frame.views else ():
-        start = Start(one.T_world_object, frame.close if fitted else None, left_out=one.left_out)
+    """Poses judged by another frame, and `fitted` to it, most evident first."""
+    data, ranked = other.frame, list[ScoredPose]()
+    likelihood = likelihood_of(data)
+    for one in poses if data.views else ():
+        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
         fit = likelihood.fit(start)
-        blurs = fit.blurs or one.blurs
-        judged = replace(likelihood.judge(fit, start), proposer=one.proposer, blurs=blurs)
-        insert(ranked, judged, tracked.body, frame.free, tracked.rules.acceptance)
-    return Explanation(tracked, frame, left, tuple(ranked), len(tracked.proposers))
+        judged, blurs = likelihood.judge(fit, start), fit.blurs or one.blurs
+        judged = replace(judged, proposer=one.proposer, blurs=blurs)
+        insert(ranked, judged, data.body, data.free, data.rules.acceptance)
+    return replace(other, ranked=tuple(ranked), tried=len(other.tracked.proposers))
 
 
-def _verdict(found: Explanation) -> Verdict:
-    frame, rules = found.frame, found.tracked.rules.acceptance
-    verdict = decide(found.ranked, frame.free, rules)
-    best = verdict.best
+def estimate_of(
+    data: Frame, views: Sequence[View], verdict: Verdict, shown: ScoredPose | None
+) -> Estimate:
+    """The estimate of a frame, with reports of the pose that is shown, believed or not."""
+    body, best = data.body, verdict.best
+    reports = {view.name: SensorReport(False) for view in views}
+    reports |= shown.sensors if shown else {}
+    used = shown.used if shown and len(body.nodes.points) == len(body) else None
+    if used:
+        lengths = (used.sigmas[:, None] * np.sqrt(used.squared)).tolist()
+        for name, row, k, in_view in zip(used.names, lengths, used.shares > 0, used.weights > 0):
+            residuals = {body.labels[i]: row[i] if k[i] else None for i in np.flatnonzero(in_view)}
+            reports[name] = replace(reports[name], residuals=residuals)
+    rivals = verdict.kept if verdict.status == "ambiguous" else ()
+    return Estimate(
+        frame=data.frame,
+        time_s=data.time_s,
+        object=body.name,
+        status=verdict.status,
+        T_world_object=best.T_world_object if best else None,
+        covariance=best.covariance if best else None,
+        score=shown.score if shown else 0.0,
+        sensors=reports,
+        hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
+        proposer=best.proposer if best else "",
+        blurs=best.blurs if best else (),
+        guesses=data.searches[-1][0] if data.searches else None,
+        doubt=verdict.doubt,
+        measured=partial(_offsets, used) if used else dict,
+    )
+
+
+def followed(data: Frame, verdict: Verdict) -> Track:
+    """The track after a frame."""
+    track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
     if best is None:
-        return verdict
-    if verdict.status != "ok":
-        rivals = [one for one, _ in verdict.kept if one is not best]
-        if why := reason(frame, best, rivals):
-            return replace(verdict, doubt=why)
-    # a sure pose that has rivals may have them for a reason that can be told
-    if not is_sure(best, frame.free, rules):
-        return verdict
-    return verdict.doubted(_doubt(found, best, has_rivals=verdict.status != "ok"))
+        clutter = track.clutter.learnt(data.views, data.rules.static)
+        state = data.searches[-1][1] if data.searches else Track.search
+        return replace(track.missed(state, clutter), doubted=True)
+    found = []
+    for one, weight in verdict.kept:
+        # what may be mere clutter counts as little in the next frame
+        belief = weight * float(expit(one.log_evidence))
+        momentary = np.diagonal(one.covariance - one.persistent)
+        deviation = np.sqrt(momentary) if data.is_timed else None
+        spread = one.spread if data.options.fuse else None
+        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
+    used = best.used
+    met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
+    tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
+    least = data.rules.acceptance.agreeing
+    # sensors whose delays are not known contradict each other until they are
+    late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
+    return replace(
+        follow(data, found),
+        residuals=best.noise if is_ok else track.residuals,
+        tallies=tallies,
+        delays=delays_after(data, best) if is_ok or late else track.delays,
+        agreed=track.agreed or sum(one.is_met(least) for one in tallies.values()) > 1,
+        known=is_known(data, best),
+        believed=track.believed + is_ok,
+        doubted=not is_ok,
+    )
 
 
-def _doubt(found: Explanation, best: ScoredPose, *, has_rivals: bool) -> str:
-    """Why a pose that is sure by itself is in doubt all the same; empty where it is not."""
-    frame, rules = found.frame, found.tracked.rules
-    if is_reflection(frame, best):
-        return MIRRORED
-    before, noise = frame.track.residuals.total, rules.judgement.noise
-    if contradict(best, before, frame.track.agreed, rules.acceptance, noise):
-        return APART
-    if has_rivals:
-        return ""
-    if not is_known(frame, best):
-        return TRIANGLE
-    return ALONE if is_alone(frame, best, found.left.sensors) else ""
+def _offsets(used: Matches) -> dict[str, Offsets]:
+    """By how much each sensor met the features of a body whose features are points."""
+    offsets = {}
+    for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
+        i = np.flatnonzero(used.weights[k])
+        y, by_shift = used.offsets[k, i, :m], used.J[k, i, :m, :3]
+        offsets[name] = Offsets(i, used.shares[k, i] > 0, sigma * y, sigma * by_shift)
+    return offsets

@@ -24,8 +24,7 @@ class ProposalRules:
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(
         3.0,
-        "how much surer than a start a drawn or mirrored pose is, and how much narrower the blur "
-        "at which drawn ones are scored; one that was searched for, by its square",
+        "how much surer, and at a narrower blur, drawn poses are than starts; searched: squared",
     )
     blurs: tuple[float, ...] = constant(
         (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
@@ -40,26 +39,16 @@ class LookAlikeRules:
     """Which look-alikes of a body are rivals; see `mixpose.body.look_alikes`."""
 
     kinds: tuple[str, ...] = constant(
-        ("congruent", "tilted", "mirrored"),
-        "looked for: features that lie like others, the other tilt, the mirror image",
+        ("congruent", "tilted", "mirrored"), "features like others, other tilt, mirror image"
     )
-    alike: float = constant(
-        0.05,
-        "of the smaller body's radius, how far features may be off their partners: bodies are as "
-        "rigid as that",
-    )
+    alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
     fewer: float = constant(
-        1.5,
-        "features fewer that a look-alike may meet to be a rival still: each is worth four of the "
-        "log odds, or so",
+        1.5, "features fewer that a rival may meet: each is worth four of the log odds, or so"
     )
-    flat: float = constant(
-        0.15, "thickness of a body against its smaller width below which it may be tilted"
-    )
+    flat: float = constant(0.15, "thickness by smaller width below which a body may be tilted")
     by_chance: float = constant(
         14.0,
-        "coordinates met beyond the six of a pose, up to which the body's mirror image may have "
-        "been met anywhere: five features by two cameras, where three always lie alike",
+        "coordinates met beyond six up to which it may be by chance: 5 features, 2 cameras",
     )
 
 
@@ -85,30 +74,17 @@ class SceneRules:
     """How detections are shared out, and when bodies are in doubt for each other's sake."""
 
     gate: float = constant(
-        6.0,
-        "σ_ε around expected features within which detections are the body's: they are met "
-        "within 2.2, and a steady prediction errs by less than the rest",
-    )
-    rounds: int = constant(
-        3, "times that detections are shared out again: neighbours' neighbours are settled by then"
+        6.0, "σ_ε around expected features: they are met within 2.2, predictions err by the rest"
     )
     rival: float = constant(
-        0.5,
-        "share of the detections of one body, met by another too, from which it is either the "
-        "one or the other; below, their images only touch",
+        0.5, "share of its detections that another meets from which it is the one or the other"
     )
     touching: float = constant(
-        3.0,
-        "σ_ε between a spot and another body's feature that is seen nowhere else: images of "
-        "spots run together at twice their width",
+        3.0, "σ_ε from a spot to another body's feature: images run together at twice their width"
     )
     pulled: float = constant(
-        0.1,
-        "squared offset in σ_ε² from which such a spot is taken for both: two and a half "
-        "times what blobs have (0.2²)",
+        0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
     )
     thorough: int = constant(
-        10,
-        "frames of which one is searched thoroughly for a body that is away while others are "
-        "there: a third of a second of video; the rest have the budget of live streams",
+        10, "frames, of which one is searched thoroughly for a body that is away, others not: 1/3 s"
     )
