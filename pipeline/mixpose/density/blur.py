@@ -8,8 +8,6 @@ no filter is cut off but where a Gaussian has vanished.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 
@@ -18,76 +16,59 @@ from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
 
 
-class Factors(NamedTuple):
-    """A blurred pattern as products: ``left.T @ right`` at rows v and columns u.
+def blurred(
+    pattern: Pattern, sigma: float, u: Floats, v: Floats, total: float, *, gradient: bool
+) -> list[Singles]:
+    """Blur a pattern that is not empty at columns u (U,) and rows v (V,), which ranges do not use.
 
-    `left` is (K, V), `right` is (K, U); the slopes are their derivatives by v and u.
+    The density (V, U), and where wanted its derivatives by u and v.  `sigma` is the standard
+    deviation of the blur in sensor units, positive for detections, and `total` what the pattern is
+    normalised by, its `mass`.
     """
-
-    left: Singles
-    left_slope: Singles
-    right: Singles
-    right_slope: Singles
-
-    def layers(self, *, gradient: bool) -> list[Singles]:
-        """Density (V, U), and where wanted its derivatives by u and v."""
-        value = self.left.T @ self.right
-        if not gradient:
-            return [value]
-        return [value, self.left.T @ self.right_slope, self.left_slope.T @ self.right]
-
-
-def factors(pattern: Pattern, sigma: float, u: Floats, v: Floats | None, total: float) -> Factors:
-    """Blur a pattern that is not empty at columns u (U,) and rows v (V,), None for ranges.
-
-    `sigma` is the standard deviation of the blur in sensor units, positive for detections, and
-    `total` what the pattern is normalised by, its `mass`.
-    """
-    if isinstance(pattern, PointPattern):
-        weights = (pattern.weights / total).astype(np.float32)[:, None]
-        right, right_slope = bell(u, pattern.points[:, 0], sigma)
-        if v is None:
-            return Factors(weights, np.zeros_like(weights), right, right_slope)
-        left, left_slope = bell(v, pattern.points[:, 1], sigma)
-        return Factors(left * weights, left_slope * weights, right, right_slope)
     m = pattern.dimension
-    columns, right, right_slope = _along(pattern, 0, sigma, u)
-    scale = np.float32(pattern.step**m / total)
-    if v is None:
-        one = np.ones((1, 1), dtype=np.float32)
-        values: Singles = (pattern.values[:, columns] * scale).astype(np.float32)
-        return Factors(one, np.zeros_like(one), values @ right, values @ right_slope)
-    rows, left, left_slope = _along(pattern, 1, sigma, v)
-    values = (pattern.values[rows, columns] * scale).astype(np.float32)
-    return Factors(left, left_slope, values @ right, values @ right_slope)
+    if isinstance(pattern, PointPattern):
+        along = [_bell(axis, pattern.points[:, k], sigma) for k, axis in enumerate((u, v)[:m])]
+        weights = (pattern.weights / total).astype(np.float32)[:, None]
+        right, left = along[0], [weights * one for one in along[1]] if m == 2 else [weights]
+    else:
+        columns, right = _along(pattern, 0, sigma, u)
+        rows, left = slice(None), [np.ones((1, 1), dtype=np.float32)]
+        if m == 2:
+            rows, left = _along(pattern, 1, sigma, v)
+        scale = np.float32(pattern.step**m / total)
+        values = (pattern.values[rows, columns] * scale).astype(np.float32)
+        right = [values @ one for one in right]
+    factors = [(left[0], right[0]), (left[0], right[1]), (left[-1], right[0])]
+    return [one.T @ other for one, other in factors[: 1 + m if gradient else 1]]
 
 
 def _along(
     pattern: GridPattern, axis: int, sigma: float, places: Floats
-) -> tuple[slice, Singles, Singles]:
-    """The part of a grid that matters along an axis, and its Gaussians at places."""
+) -> tuple[slice, list[Singles]]:
+    """The part of a grid that matters along an axis, and its Gaussians and slopes at places."""
     step, count = pattern.step, pattern.values.shape[1 - axis]
     margin = max(DRAWING.cut * sigma, step)
     first = int(np.clip((places.min() - margin - pattern.origin[axis]) / step, 0, count - 1))
     last = (places.max() + margin - pattern.origin[axis]) / step + 2
     part = slice(first, int(np.clip(last, first + 1, count)))
     grid = pattern.origin[axis] + step * np.arange(part.start, part.stop)
-    if sigma > DRAWING.hat * step:
-        return part, *bell(places, grid, sigma)
+    if sigma > 0.3 * step:
+        return part, _bell(places, grid, sigma)
+    # sums over a grid coarser than that are no integrals: a narrower blur is linear interpolation
     away = (places - grid[:, None]) / step
     hat = np.maximum(1 - np.abs(away), 0.0) / step
     slope = np.where(np.abs(away) <= 1, -np.sign(away), 0.0) / step**2
-    return part, hat.astype(np.float32), slope.astype(np.float32)
+    return part, [hat.astype(np.float32), slope.astype(np.float32)]
 
 
-def bell(axis: Floats, centres: Floats, sigma: float) -> tuple[Singles, Singles]:
+def _bell(axis: Floats, centres: Floats, sigma: float) -> list[Singles]:
     """Gaussians (M, n) around centres (M,) along an axis (n,), and their derivative."""
     away = ((axis - centres[:, None]) / sigma).astype(np.float32)
     squared = away * away
     values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
     # products of tails beyond (1e-11 of the peak) are subnormal: matrix products crawl on them
     values[squared > 2 * DRAWING.cut**2] = 0.0
-    return values, values * away * np.float32(-1.0 / sigma)
+    return [values, values * away * np.float32(-1.0 / sigma)]
 
 
 def mass(pattern: Pattern) -> float:
@@ -112,16 +93,16 @@ def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
     factor = odd_factor(sigma / (DRAWING.steps_per_sigma * pattern.step))
     if factor == 1:
         return pattern, sigma
-    flat = pattern.dimension == 1
     rows, columns = pattern.values.shape
-    box = (factor, 1 if flat else factor)
-    size = (-(-columns // factor) + 2, rows if flat else -(-rows // factor) + 2)
-    after = (size[0] * factor - columns - factor, 0 if flat else size[1] * factor - rows - factor)
-    before = 0 if flat else factor
+    down = factor if pattern.dimension == 2 else 1
+    # a block before, and what fills up the last one and another after
+    size = (-(-columns // factor) + 2, -(-rows // down) + 2 * (down > 1))
+    before = (down if down > 1 else 0, factor)
+    after = (size[1] * down - rows - before[0], size[0] * factor - columns - factor)
     padded = cv2.copyMakeBorder(
-        pattern.values, before, after[1], factor, after[0], cv2.BORDER_CONSTANT, value=0
+        pattern.values, before[0], after[0], before[1], after[1], cv2.BORDER_CONSTANT, value=0
     )
-    smooth = cv2.blur(padded, box, borderType=cv2.BORDER_CONSTANT)
+    smooth = cv2.blur(padded, (factor, down), borderType=cv2.BORDER_CONSTANT)
     values = np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     step = factor * pattern.step
     origin = pattern.origin - factor * pattern.step + (factor - 1) / 2 * pattern.step
@@ -142,25 +123,21 @@ def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = F
     normalisation is that of the whole pattern, so that a window shows a part of the same density,
     which is zero everywhere where the pattern is empty.
     """
-    m = len(window.origin)
     if is_empty(pattern):
         shape = (*window.shape, 3) if gradient else window.shape
         return Density(np.zeros(shape, dtype=np.float32), window, sigma)
+    left = sigma
     if isinstance(pattern, GridPattern):
-        pattern, sigma_left = reduced(pattern, sigma)
-    else:
-        sigma_left = sigma
-    v = window.axis(1) if m == 2 else None
-    made = factors(pattern, sigma_left, window.axis(0), v, mass(pattern))
-    layers = made.layers(gradient=gradient)
-    values = merge(layers[: 1 + m]) if gradient else layers[0]
-    return Density(values, window, sigma)
+        pattern, left = reduced(pattern, sigma)
+    u, v = window.axis(0), window.axis(pattern.dimension - 1)
+    layers = blurred(pattern, left, u, v, mass(pattern), gradient=gradient)
+    return Density(merge(layers) if gradient else layers[0], window, sigma)
 
 
 def is_empty(pattern: Pattern) -> bool:
     """Whether a pattern has no feature at all."""
     if isinstance(pattern, PointPattern):
         return len(pattern.points) == 0 or not pattern.weights.sum() > 0
-    # a profile that lies below zero as a whole has no density anywhere, nor has one that cannot be
-    # normalised in single precision
-    return not pattern.values.max() > DRAWING.least_value
+    # a profile that lies below zero as a whole has no density anywhere, nor has one so low that
+    # what it is normalised by overflows in single precision
+    return not pattern.values.max() > 1e-30

@@ -1,12 +1,10 @@
 """A density on a grid, and how to look values up in it.
 
 A density is float32 values plus the affine map from sensor coordinates to array indices,
-``index = (y - origin) / step``: windows, coarse levels and range profiles (one row high) are all
-the same thing.  Channel 0 holds the density g, the following m channels its gradient by sensor
-coordinates.  Outside the array every channel is 0.
-
-Arrays have 1, 3 or 4 channels: for those `cv2.remap` of OpenCV 5 is exact to float rounding, for
-2 it still rounds coordinates to 1/32 of a step.  Densities of ranges are padded to 3.
+``index = (y - origin) / step``; a range profile is one row high.  Channel 0 holds the density g,
+the following m channels its gradient by sensor coordinates; outside the array every channel is 0.
+`cv2.remap` of OpenCV 5 is exact to float rounding for 1, 3 or 4 channels, for 2 it still rounds
+coordinates to 1/32 of a step: densities of ranges are padded to 3.
 """
 
 from __future__ import annotations
@@ -15,10 +13,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats
+from mixpose.records import Floats, Singles
 
 FAR = DRAWING.far
 
@@ -40,19 +37,15 @@ class Window:
 
     def axis(self, k: int) -> Floats:
         """Sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
-        count = self.shape[1] if k == 0 else self.shape[0]
-        return np.asarray(self.origin[k] + self.step * np.arange(count))
+        return np.asarray(self.origin[k] + self.step * np.arange(self.shape[1 - k]))
 
 
 @dataclass(frozen=True)
 class Density:
-    """A probability density over sensor coordinates, sampled on a window.
+    """A probability density over sensor coordinates, sampled on a window."""
 
-    Values are (H, W, 3) or (H, W): the density in 1/unit^m, then its gradient in 1/unit^(m+1) where
-    it was asked for; for ranges the last channel is empty.
-    """
-
-    values: NDArray[np.float32]
+    # (H, W) in 1/unit^m, or (H, W, 3) with its gradient; for ranges the last channel is empty
+    values: Singles
     window: Window
     sigma: float  # standard deviation, in sensor units, that one exact feature has in it
 
@@ -63,31 +56,27 @@ class Density:
 
     def integral(self) -> float:
         """Integral of the density over its window."""
-        first = self.values if self.values.ndim == 2 else self.values[..., 0]
-        return float(first.sum(dtype=np.float64) * self.window.step**self.dimension)
+        total = np.atleast_3d(self.values)[..., 0].sum(dtype=np.float64)
+        return float(total * self.window.step**self.dimension)
 
-    def indices(self, y: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Array indices (n,) along columns and rows of sensor coordinates (..., m), all finite."""
-        index = (y.reshape(-1, self.dimension) - self.window.origin) / self.window.step
-        np.nan_to_num(index, copy=False, nan=FAR)
-        np.clip(index, FAR, -FAR, out=index)
-        map_u = index[:, 0].astype(np.float32)
-        map_v = index[:, 1].astype(np.float32) if self.dimension == 2 else np.zeros_like(map_u)
-        return map_u, map_v
-
-    def sample(self, y: Floats) -> NDArray[np.float32]:
-        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside.
+    def sample(self, y: Floats) -> Singles:
+        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
 
         Without the last axis for a single channel.
         """
-        map_u, map_v = self.indices(y)
-        looked_up = remap(self.values, map_u, map_v)
+        m = self.dimension
+        index = (y.reshape(-1, m) - self.window.origin) / self.window.step
+        np.nan_to_num(index, copy=False, nan=FAR)
+        np.clip(index, FAR, -FAR, out=index)
+        u = index[:, 0].astype(np.float32)
+        v = index[:, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
+        looked_up = remap(self.values, u, v)
         if self.values.ndim == 2:
             return looked_up.reshape(y.shape[:-1])
-        return looked_up[:, : 1 + self.dimension].reshape(*y.shape[:-1], 1 + self.dimension)
+        return looked_up[:, : 1 + m].reshape(*y.shape[:-1], 1 + m)
 
 
-def merge(layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+def merge(layers: list[Singles]) -> Singles:
     """Stack layers (H, W) as channels (H, W, C), padded to a number that is looked up exactly."""
     while len(layers) > 1 and len(layers) not in DRAWING.exact_channels:
         layers = [*layers, np.zeros_like(layers[0])]
@@ -95,17 +84,15 @@ def merge(layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     return merged.reshape(*layers[0].shape, len(layers))
 
 
-def remap(
-    values: NDArray[np.float32], map_u: NDArray[np.float32], map_v: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Sample an array bilinearly at n indices: (n, C) or (n,); 0 outside."""
-    count, channels = len(map_u), values.shape[2:]
+def remap(values: Singles, u: Singles, v: Singles) -> Singles:
+    """Sample an array bilinearly at n indices along columns and rows: (n, C) or (n,); 0 outside."""
+    count, channels = len(u), values.shape[2:]
     width = min(count, DRAWING.side)
     if count == 0:
         return np.zeros((0, *channels), dtype=np.float32)
     if count > width:
         padding = -count % width
-        map_u, map_v = np.pad(map_u, (0, padding)), np.pad(map_v, (0, padding))
-    maps = map_u.reshape(-1, width), map_v.reshape(-1, width)
+        u, v = np.pad(u, (0, padding)), np.pad(v, (0, padding))
+    maps = u.reshape(-1, width), v.reshape(-1, width)
     looked_up = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(looked_up, dtype=np.float32).reshape(-1, *channels)[:count]

@@ -1,4 +1,4 @@
-"""What one sensor observed, as densities at any blur.
+"""What one sensor observed, as densities at any blur, and inner products of Gaussian mixtures.
 
 Two densities are made of a pattern g0 whose features have standard deviation σ after blurring:
 
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,33 +19,21 @@ from scipy.spatial import cKDTree
 from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
-from mixpose.density.overlap import self_overlap
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Pattern, PointPattern
+from mixpose.records import Floats, Indices, Pattern, PointPattern
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A feature pattern with what is known about its blur.
+    """A feature pattern with what is known about its blur, in sensor units.
 
-    Attributes
-    ----------
-    pattern : PointPattern or GridPattern
-        g0 in sensor coordinates.
-    sigma : float
-        σ_ε, the finest standard deviation of a feature, in sensor units.
-    intrinsic : float
-        Standard deviation that features have in the pattern already: 0 for detections, σ_ε for
-        a simulated measurement that is a density itself.
-
-    Raises
-    ------
-    ValueError
-        If sigma is not greater than 0.
+    Raises ValueError if sigma is not greater than 0.
     """
 
-    pattern: Pattern
-    sigma: float
+    pattern: Pattern  # g0 in sensor coordinates
+    sigma: float  # σ_ε, the finest standard deviation of a feature
+    # that features have in the pattern already: 0 for detections, σ_ε for a simulated measurement
+    # that is a density itself
     intrinsic: float = 0.0
 
     def __post_init__(self) -> None:
@@ -65,18 +53,20 @@ class Observation:
         return float(self.pattern.step**self.dimension)
 
     @property
+    def _amounts(self) -> Floats:
+        """Weights of detections, or values of cells."""
+        pattern = self.pattern
+        return pattern.weights if isinstance(pattern, PointPattern) else pattern.values
+
+    @property
     def cells(self) -> int:
         """Number of cells, or of detections."""
-        if isinstance(self.pattern, PointPattern):
-            return len(self.pattern.points)
-        return int(self.pattern.values.size)
+        return self._amounts.size
 
     @property
     def weight(self) -> float:
         """Sum of all weights or values."""
-        pattern = self.pattern
-        values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
-        return float(values.sum())
+        return float(self._amounts.sum())
 
     @cached_property
     def is_empty(self) -> bool:
@@ -105,7 +95,7 @@ class Observation:
         """Make g with features of standard deviation sigma, on a window over the box `within`."""
         window = self._window(sigma, within)
         rendered = render(self.pattern, self.blur(sigma), window, gradient=gradient)
-        return Density(rendered.values, window, sigma)
+        return replace(rendered, sigma=sigma)
 
     def blur(self, sigma: float, *, matched: bool = False) -> float:
         """Blur of the pattern that gives features a standard deviation, once or for C."""
@@ -152,15 +142,38 @@ class Observation:
 def matched_atlas(
     observations: Sequence[Observation], sigmas: Sequence[float], steps_per_sigma: float
 ) -> Atlas:
-    """C of several sensors, none of which is empty.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-    sigmas : sequence of float
-        Standard deviation of a feature, per sensor, in sensor units.
-    steps_per_sigma : float
-        Cells per standard deviation of C.
-    """
+    """C of several sensors, none of which is empty, with features of standard deviations sigmas."""
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
     return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)
+
+
+def peak(variance: float, dimension: int) -> float:
+    """Value of an isotropic Gaussian density at its centre."""
+    return float((2 * np.pi * variance) ** (-dimension / 2))
+
+
+def close_pairs(points: Floats, variance: float) -> Indices:
+    """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
+    if len(points) ** 2 <= DRAWING.few_pairs:
+        return _all_pairs(len(points))
+    pairs = cKDTree(points).query_pairs(DRAWING.overlap * np.sqrt(variance), output_type="ndarray")
+    return np.asarray(pairs, dtype=np.intp)
+
+
+@lru_cache
+def _all_pairs(count: int) -> Indices:
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    pairs.flags.writeable = False
+    return pairs
+
+
+def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
+    """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, variance) of a mixture at points (n, m), weights (n,).
+
+    The variance is 2σ² for features of standard deviation σ.
+    """
+    pairs = close_pairs(points, variance)
+    away = points[pairs[:, 0]] - points[pairs[:, 1]]
+    bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
+    cross = float(np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells))
+    return (float(weights @ weights) + 2 * cross) * peak(variance, points.shape[1])

@@ -219,9 +219,6 @@ def fit_together(
     found: list[tuple[MatchedObjective, Ascent] | None] = []
     for k, seen in enumerate(joint.seen(objectives, ends.states)):
         own = ends.of(slice(k, k + 1))
-        assert seen.at_hand is not None
-        last = own.last._replace(source=seen.at_hand[1])
-        own = own._replace(last=last, steps=np.zeros((1, 6)))
         is_near = here.value[k] >= rules.near * len(seen.views)
         found.append((seen, own) if is_near else None)
     return found

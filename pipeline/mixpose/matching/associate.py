@@ -35,21 +35,21 @@ def associate(
         Narrowest blur of interest, σ_ε.
     """
     match, views = objective.match(T_world_object[None]), objective.views
-    at, y, seen, weights = match.at, match.at.y[:, 0], match.at.seen[:, 0], match.at.weights[:, 0]
+    y, seen, weights = match.y[:, 0], match.seen[:, 0], match.weights[:, 0]
     sigmas = np.array([view.observation.sigma for view in views])
     detections = side_by_side(tuple([view.observation for view in views]), rules)
     product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
-    energy, norm = objective.energies[:, 0], match.over.norm[:, 0]
+    energy, norm = objective.energies[:, 0], match.norm[:, 0]
     explained = np.minimum(np.maximum(product, 0.0) ** 2 / (energy * norm), 1.0)
     shares, offsets, by, partner = _met(
         objective, match, T_world_object, product, detections, rules
     )
-    J, merged = at.J[:, 0] / sigmas[:, None, None, None], np.zeros(len(views), dtype=np.intp)
+    J, merged = match.J[:, 0] / sigmas[:, None, None, None], np.zeros(len(views), dtype=np.intp)
     paired = np.nonzero(partner >= 0)
     if len(paired[0]):
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
         merged = np.bincount(paired[0], minlength=len(views)) // 2
-    faced = at.faced[:, 0] & ~seen
+    faced = match.faced[:, 0] & ~seen
     around = surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
@@ -81,21 +81,20 @@ def _met(
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Indices, Indices]:
     """Shares, offsets in sensor units, detections, and partners of features in merged pairs."""
-    at, variances = match.at, objective.variances
-    y, weights = at.y[:, 0], at.weights[:, 0]
+    variances, y, weights = objective.variances, match.y[:, 0], match.weights[:, 0]
     shares, offsets = np.zeros(weights.shape), np.zeros(y.shape)
     by, partner = np.full((2, *weights.shape), -1)
-    is_open = at.seen[:, 0] & (product > 0)[:, None]
+    is_open = match.seen[:, 0] & (product > 0)[:, None]
     if detections.points.shape[1]:
         reach = rules.reach_squared * variances
         if objective.projection.body.spread:
-            reach = reach + rules.reach_squared * _spread(objective, at.J[:, 0], T_world_object)
+            reach = reach + rules.reach_squared * _spread(objective, match.J[:, 0], T_world_object)
         _to_nearest(y, weights, detections, reach, is_open, rules, (shares, offsets, by, partner))
     unlike = all(detections.is_grid)
     for k in np.flatnonzero(detections.is_grid) if any(detections.is_grid) else ():
         of, m = np.flatnonzero(is_open[k]), int(objective.projection.dimensions[k])
         if len(of):
-            amplitude, variance = product[k] / match.over.norm[k, 0], float(variances[k, 0])
+            amplitude, variance = product[k] / match.norm[k, 0], float(variances[k, 0])
             sampled = match.sampled[k, 0, of, : 1 + m]
             shares[k, of], offsets[k, of, :m] = _residuals(
                 y[k, of, :m], weights[k, of], variance, sampled, float(amplitude), rules, unlike

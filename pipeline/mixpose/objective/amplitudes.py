@@ -53,18 +53,17 @@ class AmplitudesObjective:
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
         for k, one in enumerate(self._mixtures(T_world_object)):
             v, scale = float(self.matched.variances[k, 0]), 0.5 / float(self.noise[k])
-            alpha, n = one.alpha, len(one.alpha)
-            bells = alpha[:, None] * one.B * alpha
-            pull = alpha[:, None] * one.pull + (bells[..., None] * one.away).sum(axis=1) / v
+            alpha, away, (n, _, m) = one.alpha[:, None], one.away, one.away.shape
+            bells = alpha * one.B * one.alpha
+            pull = alpha * one.pull + (bells[..., None] * away).sum(axis=1) / v
             J = one.J.reshape(-1, 6)
-            value += scale * float(alpha @ one.b)
+            value += scale * float(one.alpha @ one.b)
             gradient += 2 * scale * (pull.ravel() @ J)
             # ⟨∂h_i, ∂h_jᵀ⟩, and ⟨∂h_i, h_j⟩
-            outer = one.away[..., :, None] * one.away[..., None, :] / v
-            m = one.away.shape[2]
+            outer = away[..., :, None] * away[..., None, :] / v
             gram = (bells / v)[..., None, None] * (np.eye(m) - outer)
             gram = gram.swapaxes(1, 2).reshape(n * m, n * m)
-            cross = -((alpha[:, None] * one.B / v)[..., None] * one.away).swapaxes(1, 2)
+            cross = -((alpha * one.B / v)[..., None] * away).swapaxes(1, 2)
             mixed = cross.reshape(n * m, n).T @ J
             solved = np.linalg.solve(one.inner, mixed)
             curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
@@ -72,32 +71,30 @@ class AmplitudesObjective:
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
-        energies = self.matched.energies[:, 0]
         explained = [
             2 * float(one.alpha @ one.b) - float(one.alpha @ one.B @ one.alpha)
             for one in self._mixtures(T_world_object)
         ]
-        return np.asarray(energies - np.array(explained))
+        return np.asarray(self.matched.energies[:, 0] - np.array(explained))
 
     def _mixtures(self, T_world_object: Floats) -> list[_Mixture]:
-        at, sampled, over = self.matched.match(T_world_object[None])
-        found = []
+        match = self.matched.match(T_world_object[None])
+        mixtures = []
         for k, m in enumerate(self.matched.projection.dimensions.tolist()):
-            seen = np.flatnonzero(at.weights[k, 0] > 0)
-            w, y = at.weights[k, 0, seen], at.y[k, 0, seen, :m]
-            C = w[:, None] * sampled[k, 0, seen, : 1 + m]
+            seen = np.flatnonzero(match.weights[k, 0] > 0)
+            w, y = match.weights[k, 0, seen], match.y[k, 0, seen, :m]
+            C = w[:, None] * match.sampled[k, 0, seen, : 1 + m]
             away = y[:, None] - y[None]
             v, top = float(self.matched.variances[k, 0]), float(self.matched.tops[k, 0])
             B = top * np.outer(w, w) * np.exp(-0.5 * (away * away).sum(axis=2) / v)
-            common = max(float(C[:, 0].sum()), 0.0) / float(over.norm[k, 0])
+            common = max(float(C[:, 0].sum()), 0.0) / float(match.norm[k, 0])
             # bounded, so that features at one place are told apart by nothing
             least = 1e-9 * top * float(w @ w)
             # and where nothing is seen, amplitudes are as good as one
             squares = max((self.spread * common) ** 2, 1e-300)
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
-            inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1))
-            inner += least * np.eye(len(w))
+            inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
             alpha = np.linalg.solve(inner, C[:, 0])
-            J = at.J[k, 0, seen, :m]
-            found.append(_Mixture(alpha, C[:, 0], B, inner, C[:, 1:], away, J))
-        return found
+            J = match.J[k, 0, seen, :m]
+            mixtures.append(_Mixture(alpha, C[:, 0], B, inner, C[:, 1:], away, J))
+        return mixtures

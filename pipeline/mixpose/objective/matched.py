@@ -13,29 +13,27 @@ once more by σ: an image, drawn once and looked up with `cv2.remap`.  Nothing i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.density import DRAWING, Atlas, matched_atlas, peak
 from mixpose.objective.base import View
-from mixpose.objective.kernel import Match, overlaps, slopes
-from mixpose.objective.projection import BodyProjection, project_body
+from mixpose.objective.kernel import overlaps, slopes
+from mixpose.objective.projection import BodyProjection, Match, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats
 
 STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
-def look_up_error(steps_per_sigma: float) -> float:
-    """Of a height, what looking it up errs by along an axis: √3/216 n⁻³ of the third derivative."""
-    return 0.011 / steps_per_sigma**3
-
-
 def value_error(steps_per_sigma: float) -> float:
-    """Relative error of looked-up values: along each of two axes, and squared."""
-    return 4 * look_up_error(steps_per_sigma)
+    """Relative error of values, squares of what is looked up.
+
+    Of a height, looking it up errs by √3/216 n⁻³ of the third derivative along each of two axes.
+    """
+    return 4 * 0.011 / steps_per_sigma**3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +41,7 @@ class MatchedObjective:
     """Σ_l ω_l ⟨g_l, h_l⟩² / (⟨g_l, g_l⟩ ⟨h_l, h_l⟩) over the pose.
 
     Spreads Σ_i of the body's features do not widen the prediction, as a template wider than the
-    data is biased (see `docs/method.md`).
+    data is biased (see `docs/method.md`).  Of K bodies at once (`together`), at poses (K, 4, 4).
     """
 
     views: tuple[View, ...]
@@ -51,8 +49,8 @@ class MatchedObjective:
     atlas: Atlas  # C of all sensors
     variances: Floats  # (L, 1) v = 2σ², of the product of two features, in squared sensor units
     tops: Floats  # (L, 1) N(0; 0, v)
-    energies: Floats  # (L, 1) ⟨g, g⟩
-    weights: Floats  # (L, 1) ω_l
+    energies: Floats  # (L, 1) ⟨g, g⟩; (L, K) of several bodies, each with its part of what is seen
+    weights: Floats  # (L, 1) ω_l; (L, K)
     # where several bodies were looked up at once: the body's pose, and what it has there
     at_hand: tuple[Floats, Match] | None = None
 
@@ -67,16 +65,15 @@ class MatchedObjective:
         With `whole`, features out of view count as predicted and not met.  Else a pose gains by
         moving features that meet nothing out of the picture.
         """
-        parts = []
-        for some in self._blocks(poses):
-            match = self.match(some)
-            own = self.shares_of(match)
+        parts = [np.zeros((len(self.views), 0))]
+        for match in map(self.match, self._blocks(poses)):
+            product, norm = (match.sampled[..., 0] * match.weights).sum(axis=2), match.norm
+            own = self.weights / self.energies * product**2 / norm
             if whole:
-                hidden = np.where(match.at.seen, 0.0, self.projection.body.nodes.weights)
-                norm = match.over.norm
+                hidden = np.where(match.seen, 0.0, self.projection.body.nodes.weights)
                 own = own * (norm / (norm + self.tops * (hidden**2).sum(axis=2)))
             parts.append(own)
-        return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
+        return np.concatenate(parts, axis=1)
 
     def match(self, poses: Floats) -> Match:
         """What is predicted at poses (H, 4, 4), and what is there."""
@@ -84,27 +81,27 @@ class MatchedObjective:
             return self.at_hand[1]
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
-        return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
-
-    def shares_of(self, match: Match) -> Floats:
-        """ω_l S_l (L, H), of what is predicted and found at some poses."""
-        product = (match.sampled[..., 0] * match.at.weights).sum(axis=2)
-        return np.asarray(self.weights / self.energies * product**2 / match.over.norm)
+        return Match(*at[:5], sampled, *overlaps(at.y, at.weights, self.variances, self.tops))
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Second-order models at poses (H, 4, 4); of few, with the `Match` they come from."""
-        scales = self.weights / self.energies
-        parts = [
-            slopes(self.match(some), self.variances, self.tops, scales)
-            for some in self._blocks(poses)
-        ]
+        """Second-order models at poses (H, 4, 4)."""
+        rest = self.variances, self.tops, self.weights / self.energies
+        parts = [slopes(self.match(some), *rest) for some in self._blocks(poses)]
         if len(parts) == 1:
             return parts[0]
         return Quadratic(*map(np.concatenate, zip(*(part[:3] for part in parts))))
 
+    def seen(self, objectives: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
+        """The objectives that were put `together`, with what each sees at its pose (K, 4, 4)."""
+        match = self.match(poses)
+        counts = [len(body.nodes.points) for body in self.projection.bodies]
+        parts = [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]
+        pairs = zip(objectives, poses, parts, strict=True)
+        return [replace(objective, at_hand=(T, part)) for objective, T, part in pairs]
+
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
-        rows = max(DRAWING.held // (n * min(n, 12)), 1)
+        rows = max(DRAWING.held // (n * min(n, 12)), len(self.projection.bodies))
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
@@ -132,30 +129,20 @@ def matched_objective(
     steps_per_sigma: float | None = None,
     shared: SharedDensities | None = None,
 ) -> MatchedObjective:
-    """Build the matched objective at given blurs.
+    """Build the matched objective of views that are not empty.
 
-    Parameters
-    ----------
-    views : sequence of View
-        Sensors whose observation is not empty.
-    body : Body
-    sigmas : sequence of float
-        Standard deviation of a feature at this level, per view, in sensor units.
-    steps_per_sigma : float or None
-        Cells per standard deviation of C; None: fine for grey values at σ_ε.
-    shared : SharedDensities or None
-        Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
-        own detections, and others only where they are out of its reach.
+    With features of standard deviations `sigmas`, by view and in sensor units, and as many cells of
+    C per standard deviation; None: fine for grey values at σ_ε.  Or on densities that are `shared`
+    by bodies, at σ_ε, where views hold parts of what was drawn: the body's own detections, and
+    others only where they are out of its reach.
     """
-    if steps_per_sigma is None:
-        at_last = all(
-            view.observation.cell is not None and sigma <= view.observation.sigma
-            for view, sigma in zip(views, sigmas, strict=True)
-        )
-        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
-    projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
-    energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
+    pairs = list(zip(observations, sigmas, strict=True))
+    if steps_per_sigma is None:
+        at_last = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
+        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
+    projection = project_body(tuple([view.sensor for view in views]), body)
+    energies = np.array([o.energy(sigma) for o, sigma in pairs])
     variances = np.array([2 * sigma * sigma for sigma in sigmas])
     tops = np.array([peak(*one) for one in zip(variances.tolist(), projection.dimensions.tolist())])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
@@ -167,12 +154,23 @@ def matched_objective(
         atlas = shared.atlas
         parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
         energies = energies * np.square(parts)
-    return MatchedObjective(
-        views=tuple(views),
-        projection=projection,
-        atlas=atlas,
-        variances=variances[:, None],
-        tops=tops[:, None],
-        energies=energies[:, None],
-        weights=weights[:, None],
+    columns = [numbers[:, None] for numbers in (variances, tops, energies, weights)]
+    return MatchedObjective(tuple(views), projection, atlas, *columns)
+
+
+def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
+    """The objectives of several bodies, of bare points, on the same densities and blurs.
+
+    For a handful of features NumPy spends its time on calls, not on numbers: the poses that one
+    body is evaluated at in a batch may as well be those of several bodies, one of each.
+    """
+    first = objectives[0]
+    return replace(
+        first,
+        projection=project_body(
+            first.projection.sensors, *[one.projection.body for one in objectives]
+        ),
+        energies=np.concatenate([one.energies for one in objectives], axis=1),
+        weights=np.concatenate([one.weights for one in objectives], axis=1),
+        at_hand=None,
     )
