@@ -170,8 +170,9 @@ def test_features_that_are_not_seen_neither_count_nor_pull() -> None:
     over = overlaps(y, weights, VARIANCES, TOPS)
     met = Match(y, J, seen, seen, weights, at.sampled, *over)
     found = slopes(met, VARIANCES, TOPS, SCALES)
-    some = [part[:, :, :4] for part in at[:6]]
-    met = Match(*some, *overlaps(some[0], some[4], VARIANCES, TOPS))
+    some = at.of(slice(None), 4)
+    over = overlaps(some.y, some.weights, VARIANCES, TOPS)
+    met = Match(*some[:6], *over)
     expected = slopes(met, VARIANCES, TOPS, SCALES)
     for one, other in zip(found[:3], expected[:3], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=rounding(1))

@@ -96,7 +96,7 @@ def value_terms(seen: list[View], samples: Floats, T: Floats) -> list[SampledTer
     for view in seen:
         sigma = view.observation.sigma
         y, _ = view.sensor.project(transform(T, samples.reshape(-1, 3)))
-        box = region_of_interest(view.sensor, y, DRAWING.reach * sigma)
+        box = region_of_interest(view.sensor, y, DRAWING.paper_reach * sigma)
         terms.append(SampledTerm(view.sensor, view.observation.density(sigma, box)))
     return terms
 

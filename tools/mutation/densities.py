@@ -57,8 +57,8 @@ _ATLAS = (
     Mutant(
         "density-tiles-that-are-left",
         "density/atlas.py",
-        "<= 0.5 * DRAWING.tile",
-        "<= 2.0 * DRAWING.tile",
+        "> 0.5 * self.tile",
+        "> 2.0 * self.tile",
         "a fit that goes on by some pixels looks up what another feature has",
     ),
     Mutant(
@@ -129,14 +129,14 @@ _BLUR = (
     ),
     Mutant(
         "density-pairs-overlap-once",
-        "density/overlap.py",
+        "density/observation.py",
         "+ 2 * cross)",
         "+ cross)",
         "detections side by side have too little energy",
     ),
     Mutant(
         "density-overlap-ends-early",
-        "density/overlap.py",
+        "density/observation.py",
         "DRAWING.overlap * np.sqrt(variance)",
         "2.0 * np.sqrt(variance)",
         "bodies of many features have too little energy where features lie close",

@@ -119,7 +119,7 @@ _RECORD = (
     Mutant(
         "matching-jacobian-in-the-sensors-unit",
         "matching/associate.py",
-        "at.J[:, 0] / sigmas[:, None, None, None]",
+        "match.J[:, 0] / sigmas[:, None, None, None]",
         "at.J[:, 0] / 1.0",
         "covariances depend on the unit of a sensor",
     ),

@@ -36,7 +36,7 @@ def blurred(
         if m == 2:
             rows, left = _along(pattern, 1, sigma, v)
         scale = np.float32(pattern.step**m / total)
-        values = (pattern.values[rows, columns] * scale).astype(np.float32)
+        values: Singles = (pattern.values[rows, columns] * scale).astype(np.float32)
         right = [values @ one for one in right]
     factors = [(left[0], right[0]), (left[0], right[1]), (left[-1], right[0])]
     return [one.T @ other for one, other in factors[: 1 + m if gradient else 1]]

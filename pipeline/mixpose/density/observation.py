@@ -53,20 +53,18 @@ class Observation:
         return float(self.pattern.step**self.dimension)
 
     @property
-    def _amounts(self) -> Floats:
-        """Weights of detections, or values of cells."""
-        pattern = self.pattern
-        return pattern.weights if isinstance(pattern, PointPattern) else pattern.values
-
-    @property
     def cells(self) -> int:
         """Number of cells, or of detections."""
-        return self._amounts.size
+        pattern = self.pattern
+        return (pattern.weights if isinstance(pattern, PointPattern) else pattern.values).size
 
     @property
     def weight(self) -> float:
         """Sum of all weights or values."""
-        return float(self._amounts.sum())
+        pattern = self.pattern
+        return float(
+            (pattern.weights if isinstance(pattern, PointPattern) else pattern.values).sum()
+        )
 
     @cached_property
     def is_empty(self) -> bool:

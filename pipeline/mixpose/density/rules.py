@@ -23,8 +23,11 @@ class DrawingRules:
     )
     reach: float = constant(
         4.25,
-        "standard deviations around a detection that an atlas draws, and around predicted samples "
-        "that a window does: features farther apart draw each other by less than 1e-3 σ_ε",
+        "standard deviations around a detection that an atlas draws: features farther apart draw "
+        "each other by less than 1e-3 σ_ε",
+    )
+    paper_reach: float = constant(
+        4.0, "margin of a window around the predicted samples, in standard deviations"
     )
     cut: float = constant(5.0, "standard deviations at which sums end: the tail holds 6e-7")
     negligible: float = constant(

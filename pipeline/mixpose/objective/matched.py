@@ -154,8 +154,9 @@ def matched_objective(
         atlas = shared.atlas
         parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
         energies = energies * np.square(parts)
-    columns = [numbers[:, None] for numbers in (variances, tops, energies, weights)]
-    return MatchedObjective(tuple(views), projection, atlas, *columns)
+    energies, weights = energies[:, None], weights[:, None]
+    rest = variances[:, None], tops[:, None], energies, weights
+    return MatchedObjective(tuple(views), projection, atlas, *rest)
 
 
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:

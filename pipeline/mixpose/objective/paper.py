@@ -228,7 +228,7 @@ def sampled_terms(
             y, visible = view.sensor.project(transform(near, samples.reshape(-1, 3)))
             if not visible.any():
                 continue
-            box = region_of_interest(view.sensor, y[visible], DRAWING.reach * sigma)
+            box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
         density = view.observation.density(sigma, box, gradient=True)
         terms.append(SampledTerm(view.sensor, density))
     return terms

@@ -49,7 +49,8 @@ class Match(NamedTuple):
         near = bells.any(axis=(0, 1))
         away = self.away[:, poses][:, :, near]
         features = [part[:, poses, :n] for part in self[:6]]
-        return Match(*features, self.norm[:, poses], self.pairs[near], bells[..., near], away)
+        over = self.norm[:, poses], self.pairs[near], bells[..., near], away
+        return Match._make([*features, *over])
 
 
 class BodyProjection:
@@ -97,9 +98,9 @@ class BodyProjection:
         The Jacobian is that of a marker that moves without turning.
         """
         L, count = len(self.sensors), len(world)
-        is_disk = self.body.shape == "disk" and self._normals is not None
-        if is_disk:
-            turned = _across(self._normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
+        normals = self._normals if self.body.shape == "disk" else None
+        if normals is not None:
+            turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
             middle, axes = world, turned.reshape(2, count, 3)
         else:
             towards = np.array([sensor.towards(world) for sensor in self.sensors])
@@ -111,7 +112,7 @@ class BodyProjection:
         steps = np.sqrt(0.5) * radii * axes  # where the four points are
         signs = np.array([1, -1, 1, -1]).reshape(4, *[1] * middle.ndim)
         nodes = middle + signs * steps[[0, 0, 1, 1]]
-        if is_disk:
+        if normals is not None:
             nodes, axes = nodes.reshape(4 * count, 3), axes[:, None]
         else:
             nodes = nodes.swapaxes(0, 1).reshape(L, 4 * count, 3)

@@ -30,12 +30,12 @@ class Quadratic(NamedTuple):
 
     def of(self, rows: Any) -> Quadratic:
         """The models at some of the states."""
-        return Quadratic(*[None if part is None else part[rows] for part in self])
+        return Quadratic._make(None if part is None else part[rows] for part in self)
 
     def followed_by(self, other: Quadratic) -> Quadratic:
         """These models and others of the same term, one after the other."""
         pairs = zip(self, other, strict=True)
-        return Quadratic(*[None if a is None else np.concatenate([a, b]) for a, b in pairs])
+        return Quadratic._make(None if b is None else np.concatenate([a, b]) for a, b in pairs)
 
 
 class Term(Protocol):
@@ -55,9 +55,11 @@ class Sum:
     def linearise(self, states: Any) -> Quadratic:
         """Second-order models at H states; Hessians where all terms know theirs."""
         models = [term.linearise(states) for term in self.terms]
-        hessians = [model.hessian for model in models if model.hessian is not None]
-        sums = [np.sum(parts, axis=0) for parts in zip(*[model[:3] for model in models])]
-        return Quadratic(*sums, np.sum(hessians, axis=0) if len(hessians) == len(models) else None)
+        parts = [[part for part in column if part is not None] for column in zip(*models)]
+        is_known = [len(column) == len(models) for column in parts]
+        return Quadratic._make(
+            np.sum(column, axis=0) if known else None for column, known in zip(parts, is_known)
+        )
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class Ascent(NamedTuple):
 
     def of(self, rows: slice) -> Ascent:
         """The ascents of some of the states."""
-        return Ascent(*[part[rows] for part in self[:4]], self.last.of(rows))
+        return Ascent._make([*[part[rows] for part in self[:4]], self.last.of(rows)])
 
 
 def ascend(
@@ -226,7 +228,7 @@ def _step(C: Floats, g: Floats, damping: float) -> tuple[Floats, list[float]]:
     """The step (1, q) of one state, and its gain: a quarter of the time of `_many_steps`."""
     diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
-    floor = max(diagonal.tolist(), default=0.0) * 1e-12 * damping + _TINY
+    floor = _TINY + max(diagonal.tolist(), default=0.0) * 1e-12 * damping
     A = C.copy()
     A.reshape(-1)[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
     step = g
