@@ -120,7 +120,7 @@ _RECORD = (
         "matching-jacobian-in-the-sensors-unit",
         "matching/associate.py",
         "match.J[:, 0] / sigmas[:, None, None, None]",
-        "at.J[:, 0] / 1.0",
+        "match.J[:, 0] / 1.0",
         "covariances depend on the unit of a sensor",
     ),
     Mutant(

@@ -67,8 +67,8 @@ _KERNEL = (
     Mutant(
         "objective-neighbours-taken-for-apart",
         "objective/kernel.py",
-        "if not len(near):",
-        "if len(near) < len(pairs):",
+        "if not overlap.any():",
+        "if not overlap.all():",
         "a body with some features close together is fitted as if they were apart",
     ),
     Mutant(

@@ -10,6 +10,7 @@ from mixpose.density.grid import (
 )
 from mixpose.density.observation import (
     Observation as Observation,
+    all_pairs as all_pairs,
     close_pairs as close_pairs,
     matched_atlas as matched_atlas,
     peak as peak,

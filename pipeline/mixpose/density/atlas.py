@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.density.blur import blurred, mass, reduced
 from mixpose.density.grid import remap
-from mixpose.density.pages import Pages, Plane, middles_of, side_of
+from mixpose.density.pages import RIM, Pages, Plane, middles_of
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
@@ -71,6 +71,7 @@ class Atlas:
         self._own: tuple[Floats, Floats, Singles] | None = None
         if self._grids:  # the larger the plane, the larger its pages
             self.tile = self.pages.plane.page
+        self._side, self._reach = self.tile + RIM, 0.5 * self.tile + scale.reach
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
@@ -86,7 +87,7 @@ class Atlas:
         beside += 0.25
         around = self._sides * beside[:, None]
         around += maps[:, None]
-        u, v = around.reshape(2, -1).astype(np.float32)
+        u, v = around.astype(np.float32)
         sampled = self._quarters @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._scale.units)
 
@@ -95,7 +96,7 @@ class Atlas:
         own = self._own
         is_left = own is None or own[0].shape != index.shape
         if own is None or is_left or np.abs(index - own[0]).max(initial=0.0) > 0.5 * self.tile:
-            middles, side = np.rint(index), side_of(self.tile)
+            middles, side = np.rint(index), self._side
             flat = middles.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
             tiles = self._drawn(sensors, flat, *self._near(sensors, flat))
@@ -125,7 +126,7 @@ class Atlas:
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
-        reach = 0.5 * self.tile + self._scale.reach
+        reach = self._reach
         if len(sensors) * len(self._q) <= DRAWING.few_pairs:
             away = np.abs(self._q - middles[:, None])
             inside = away < reach
@@ -141,17 +142,16 @@ class Atlas:
     @cached_property
     def _tree(self) -> cKDTree:
         """Detections, for a search around tiles."""
-        reach = 0.5 * self.tile + self._scale.reach
-        return cKDTree(np.column_stack([self._q, 2 * reach * self._sensor]))
+        return cKDTree(np.column_stack([self._q, 2 * self._reach * self._sensor]))
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
         """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections near them."""
-        side = side_of(self.tile)
+        side = self._side
         tiles = np.empty((len(middles), side, 3 * side), dtype=np.float32)
         at_once = max(DRAWING.held // side**2, 1)
         for first in range(0, len(tiles), at_once):
             part = slice(first, first + at_once)
-            pairs = slice(*np.searchsorted(of, [part.start, part.stop]))
+            pairs = slice(*of.searchsorted([part.start, part.stop]))
             self._draw(tiles[part], sensors[part], middles[part], of[pairs] - first, which[pairs])
         return tiles
 
@@ -163,8 +163,8 @@ class Atlas:
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
         """
-        count, side, scale = len(middles), side_of(self.tile), self._scale
-        place = np.arange(len(of)) - np.searchsorted(of, of)
+        count, side, scale = len(middles), self._side, self._scale
+        place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
         begin = (self._q[which] - middles[of]) * (1 / scale.sigma)
         cells = (np.arange(side, dtype=np.float32) - 0.5 * (side - 1)) * (1 / scale.sigma)
@@ -189,10 +189,9 @@ class Atlas:
         of, which = self._near(sensors, middles)
         is_filled = np.zeros(len(sensors), dtype=np.bool_)
         is_filled[of] = True
-        reach = 0.5 * self.tile + self._scale.reach
         for k in self._grids:
             lower, upper = self._corners(k)
-            inside = (middles > lower - reach) & (middles < upper + reach)
+            inside = (middles > lower - self._reach) & (middles < upper + self._reach)
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         sensors, middles = sensors[filled], middles[filled]
@@ -205,7 +204,7 @@ class Atlas:
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
         """A tile (side, 3 side) of grey values or a profile."""
         pattern, sigma, total = self._grids[sensor]
-        side = side_of(self.tile)
+        side = self._side
         cells = middle + (np.arange(side) - 0.5 * (side - 1))[:, None]
         u, v = (cells / self.per_unit[sensor, 0, 0, 0]).T
         tile = np.zeros((side, side, 3), dtype=np.float32)
@@ -236,5 +235,5 @@ class _Scale(NamedTuple):
         units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
         is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
         per_unit = np.array(across)[:, None, None]
-        reach = DRAWING.reach * n + side_of(0) - 1
+        reach = DRAWING.reach * n + RIM - 1
         return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)

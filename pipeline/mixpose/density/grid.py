@@ -10,6 +10,7 @@ coordinates to 1/32 of a step: densities of ranges are padded to 3.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,12 +69,10 @@ class Density:
         index = (y.reshape(-1, m) - self.window.origin) / self.window.step
         np.nan_to_num(index, copy=False, nan=FAR)
         np.clip(index, FAR, -FAR, out=index)
-        u = index[:, 0].astype(np.float32)
-        v = index[:, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
-        looked_up = remap(self.values, u, v)
-        if self.values.ndim == 2:
-            return looked_up.reshape(y.shape[:-1])
-        return looked_up[:, : 1 + m].reshape(*y.shape[:-1], 1 + m)
+        u = index[None, :, 0].astype(np.float32)
+        v = index[None, :, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
+        looked_up = remap(self.values, u, v).reshape(*y.shape[:-1], *self.values.shape[2:])
+        return np.asarray(looked_up if self.values.ndim == 2 else looked_up[..., : 1 + m])
 
 
 def merge(layers: list[Singles]) -> Singles:
@@ -84,15 +83,13 @@ def merge(layers: list[Singles]) -> Singles:
     return merged.reshape(*layers[0].shape, len(layers))
 
 
-def remap(values: Singles, u: Singles, v: Singles) -> Singles:
-    """Sample an array bilinearly at n indices along columns and rows: (n, C) or (n,); 0 outside."""
-    count, channels = len(u), values.shape[2:]
+def remap(values: Singles, u: Singles, v: Singles) -> Any:
+    """Sample an array bilinearly at indices (...) along columns and rows: (..., C); 0 outside."""
+    if u.ndim == 2 and 0 < max(u.shape) <= DRAWING.side:
+        return cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    count, shape = u.size, (*u.shape, *values.shape[2:])
+    if not count:
+        return np.zeros(shape, dtype=np.float32)
     width = min(count, DRAWING.side)
-    if count == 0:
-        return np.zeros((0, *channels), dtype=np.float32)
-    if count > width:
-        padding = -count % width
-        u, v = np.pad(u, (0, padding)), np.pad(v, (0, padding))
-    maps = u.reshape(-1, width), v.reshape(-1, width)
-    looked_up = cv2.remap(values, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(looked_up, dtype=np.float32).reshape(-1, *channels)[:count]
+    maps = [np.pad(one.ravel(), (0, -count % width)).reshape(-1, width) for one in (u, v)]
+    return remap(values, *maps).reshape(-1, *values.shape[2:])[:count].reshape(shape)

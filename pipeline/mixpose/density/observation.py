@@ -153,13 +153,14 @@ def peak(variance: float, dimension: int) -> float:
 def close_pairs(points: Floats, variance: float) -> Indices:
     """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
     if len(points) ** 2 <= DRAWING.few_pairs:
-        return _all_pairs(len(points))
+        return all_pairs(len(points))
     pairs = cKDTree(points).query_pairs(DRAWING.overlap * np.sqrt(variance), output_type="ndarray")
     return np.asarray(pairs, dtype=np.intp)
 
 
 @lru_cache
-def _all_pairs(count: int) -> Indices:
+def all_pairs(count: int) -> Indices:
+    """Pairs i < j (P, 2) of as many points."""
     pairs = np.stack(np.triu_indices(count, 1), axis=1)
     pairs.flags.writeable = False
     return pairs

@@ -13,15 +13,12 @@ from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices, Singles
 
 
-def side_of(tile: int) -> int:
-    """Cells along a tile with those beside it that a spline reaches: one before, two after."""
-    return tile + 3
+RIM = 3  # cells along a tile beside those looked up, which a spline reaches: one before, two after
 
 
 def middles_of(numbers: Indices, columns: int, side: int) -> Floats:
     """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
-    row, column = np.divmod(numbers, columns)
-    return np.asarray(np.stack([column, row], axis=1) * side + 0.5 * (side - 1))
+    return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
 
 
 class Plane(NamedTuple):
@@ -72,7 +69,7 @@ class Pages:
         # row; 0 where there is nothing, negative where nothing was looked up yet
         self.table = np.full(sensors * plane.squares, -1, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
-        side = side_of(plane.page)
+        side = plane.page + RIM
         columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1

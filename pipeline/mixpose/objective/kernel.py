@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mixpose.density import DRAWING, close_pairs
+from mixpose.density import DRAWING, all_pairs, close_pairs
 from mixpose.objective.projection import Match
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Indices
@@ -33,33 +33,31 @@ def overlaps(
 
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
-    norm = tops * np.einsum("lhn,lhn->lh", weights, weights)
-    pairs = _pairs(y, variances)
-    i, j = pairs[:, 0], pairs[:, 1]
+    norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
+    pairs = all_pairs(n) if n * n <= DRAWING.few_pairs else _close_pairs(y, variances)
+    i, j = pairs.T
     away = y[:, :, i] - y[:, :, j]
-    exponents = np.einsum("lhpm,lhpm->lhp", away, away) * (-0.5 / variances)[..., None]
+    squared = away * away
+    exponents = (squared[..., 0] + squared[..., 1]) * (-0.5 / variances)[..., None]
     overlap = exponents > -DRAWING.negligible
-    near = np.flatnonzero(overlap.any(axis=(0, 1)))
-    if not len(near):
+    if not overlap.any():
         return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
+    near = np.flatnonzero(overlap.any(axis=(0, 1)))
     products = (weights[:, :, i] * weights[:, :, j])[..., near]
-    bells = products * np.exp(exponents[..., near]) * tops[..., None]
-    bells[~overlap[..., near]] = 0.0
+    bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
     norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
     return norm, pairs[near], bells, away[:, :, near]
 
 
-def _pairs(y: Floats, variances: Floats) -> Indices:
-    """Pairs of features that may overlap at any of the poses; all of few."""
+def _close_pairs(y: Floats, variances: Floats) -> Indices:
+    """Pairs of features that may overlap at any of the poses."""
     n = y.shape[2]
-    if n * n <= DRAWING.few_pairs:
-        return close_pairs(y[0, 0], 1.0)
-    each = [
-        close_pairs(y[k, h], float(v)) @ [n, 1]
-        for k, v in enumerate(variances[:, 0])
-        for h in range(y.shape[1])
+    pairs = [
+        close_pairs(places, variance) @ [n, 1]
+        for some, variance in zip(y, variances[:, 0].tolist(), strict=True)
+        for places in some
     ]
-    return np.stack(np.divmod(np.unique(np.concatenate(each)), n), axis=1)
+    return np.stack(np.divmod(np.unique(np.concatenate(pairs)), n), axis=1)
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:

@@ -59,10 +59,12 @@ class _SampledObjective:
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
+        if T_world_object.ndim == 2:  # no time for more
+            return self._values(self._densities(T_world_object[None])).reshape(())
         poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
         starts = range(0, len(poses), at_once)
         values = [self._values(self._densities(poses[k : k + at_once])) for k in starts]
-        return np.concatenate([np.zeros(0), *values]).reshape(T_world_object.shape[:-2])
+        return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
 
     def _values(self, densities: list[Singles]) -> Floats:
         """Values (k,) of densities (k, S) per sensor, which may be overwritten."""
@@ -91,9 +93,9 @@ class _SampledObjective:
     def _densities(self, poses: Floats) -> list[Singles]:
         """g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
         if self._maps is not None:
-            maps, shape = self._maps.at(poses), (len(poses), len(self.points))
+            maps = self._maps.at(poses).swapaxes(0, 1)
             pairs = zip(self._alone, maps[::2], maps[1::2], strict=True)
-            return [remap(g.values, u.ravel(), v.ravel()).reshape(shape) for g, u, v in pairs]
+            return [remap(g.values, u, v) for g, u, v in pairs]
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
             points = transform(poses, self.points) + self.offsets
             places = [term.sensor.project(points)[0] for term in self.terms]
@@ -149,7 +151,7 @@ class IndependentObjective(_SampledObjective):
 
 def _means(g: Singles) -> Floats:
     """Means (k,) over the samples (k, S) of k poses, summed in double precision."""
-    return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)[:, 0] / g.shape[1])
+    return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F).ravel() / g.shape[1])
 
 
 class _AffineMaps:
@@ -180,7 +182,7 @@ class _AffineMaps:
             limits.append((corners - origin) / step)
         P = np.concatenate(rows)  # (2 L, 4) array indices of points in the world
         lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
-        self._limits = [one[:, None, None].astype(np.float32) for one in (lower, upper)]
+        self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
         # coefficients (16, 2 L c) of indices by the 16 numbers of a pose, the last of which is 1
         to_centre = np.eye(4)
         to_centre[:3, 3] = centre
@@ -190,25 +192,30 @@ class _AffineMaps:
             in_world = np.zeros((4, 4, len(P), 3))
             in_world[3, 3] = P[:, :3]
             by_pose = np.concatenate([by_pose, in_world], axis=3)
-        self._by_pose = by_pose.reshape(16, -1)
+        by_pose = by_pose.reshape(16, -1)
+        self._width = by_pose.shape[1]
         # numbers within ±1 if the centre lies so that all samples are seen
         half = (upper - lower) / 2 - reach * np.linalg.norm(P[:, :3], axis=1)
         centres[15] -= (lower + upper) / 2
-        self._centred = centres / np.where(half > 0, half, np.nan)
+        self._by_pose = np.hstack([by_pose, centres / np.where(half > 0, half, np.nan)])
 
     def at(self, poses: Floats) -> Singles:
-        """Indices (2 L, k, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
+        """Indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
 
         `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
         """
-        flat, c = poses.reshape(-1, 16), len(self._samples)
+        flat = poses.reshape(-1, 16)
+        rows = flat.dot(self._by_pose)
+        if cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+            return self._product(rows)
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            single = (flat @ self._by_pose).astype(np.float32)
-            maps = single.reshape(len(flat), -1, c).swapaxes(0, 1) @ self._samples
-            if not cv2.checkRange(flat @ self._centred, True, -1.0, 1.0)[0]:
-                lower, upper = self._limits
-                maps[~((maps >= lower) & (maps <= upper))] = FAR
-        return np.asarray(maps)
+            maps, (lower, upper) = self._product(rows), self._limits
+            maps[~((maps >= lower) & (maps <= upper))] = FAR
+        return maps
+
+    def _product(self, rows: Floats) -> Singles:
+        single, (c, count) = rows[:, : self._width].astype(np.float32), self._samples.shape
+        return np.asarray(single.reshape(-1, c).dot(self._samples).reshape(len(rows), -1, count))
 
 
 def sampled_terms(
