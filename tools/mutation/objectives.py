@@ -145,8 +145,8 @@ _SAMPLED = (
     Mutant(
         "objective-sensors-added",
         "objective/paper.py",
-        "product *= g",
-        "product += g",
+        "product *= part",
+        "product += part",
         "formula (4) is another one",
     ),
     Mutant(

@@ -1,19 +1,16 @@
 """Densities of all sensors as images, drawn where they are looked up.
 
-A density is nearly empty: detections are few, and a grid fine enough for gradients has millions of
-points.  So small tiles of it are drawn, and all tiles of all sensors lie in one array (an atlas),
-which `cv2.remap` looks up at once, values and gradients together.  Few places, as those of a pose
-that a fit begins from, have tiles of their own, in which they stay while it moves a little.  For
-many the plane of every sensor is divided into pages: tiles that are drawn when they are looked up
-for the first time, and are found by a table.
+A density is nearly empty, so small tiles of it are drawn.  All tiles of all sensors lie in one
+array (an atlas), which `cv2.remap` looks up at once, values and gradients together.  Few places, as
+those of a pose that a fit begins from, have tiles of their own, in which they stay while it moves a
+little.  For many the plane of every sensor is divided into pages, tiles that are found by a table.
 
 Cells hold coefficients of quadratic B-splines, so that what is looked up bends smoothly from cell
 to cell.  At a place d cells beside the nearest one, such a spline is the mean of four bilinear
 look-ups, d² + 1/4 of a cell to either side along each axis.
 
-Arrays have a leading axis L over sensors.  A sensor of one coordinate has 0 as its second, and its
-tiles have equal rows.  Cells are counted from sensor coordinates 0, so that a density is the same
-whatever is seen beside it.
+A sensor of one coordinate has 0 as its second, and its tiles have equal rows.  Cells are counted
+from sensor coordinates 0, so that a density is the same whatever is seen beside it.
 """
 
 from __future__ import annotations
@@ -68,7 +65,7 @@ class Atlas:
         self._sensor = np.arange(len(counts)).repeat(counts)
         self.tile = max(math.ceil(steps_per_sigma), DRAWING.tile)
         # places (L, H, n, 2) in cells, shifts from there to the array of their tiles, and that
-        self._own: tuple[Floats, Floats, Singles] | None = None
+        self._own: tuple[Floats, Floats, Singles] = np.zeros(0), np.zeros(0), self.values
         if self._grids:  # the larger the plane, the larger its pages
             self.tile = self.pages.plane.page
         self._side, self._reach = self.tile + RIM, 0.5 * self.tile + scale.reach
@@ -93,9 +90,9 @@ class Atlas:
 
     def _to_own_tiles(self, index: Floats) -> None:
         """Turn places in cells into those in tiles around them, in place."""
-        own = self._own
-        is_left = own is None or own[0].shape != index.shape
-        if own is None or is_left or np.abs(index - own[0]).max(initial=0.0) > 0.5 * self.tile:
+        around, shifts, values = self._own
+        is_left = around.shape != index.shape
+        if is_left or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
             middles, side = np.rint(index), self._side
             flat = middles.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
@@ -106,11 +103,11 @@ class Atlas:
                 room = np.zeros((-(-len(tiles) // columns), columns, side, 3 * side), np.float32)
                 room.reshape(-1, side, 3 * side)[: len(tiles)] = tiles
                 tiles = room.swapaxes(1, 2)
-            shifts = middles_of(np.arange(len(flat)), columns, side) - flat
+            shifts = (middles_of(np.arange(len(flat)), columns, side) - flat).reshape(index.shape)
             values = tiles.reshape(-1, columns * side, 3)
-            own = self._own = middles, shifts.reshape(index.shape), values
-        index += own[1]
-        self.values = own[2]
+            self._own = middles, shifts, values
+        index += shifts
+        self.values = values
 
     @cached_property
     def pages(self) -> Pages:
@@ -145,24 +142,20 @@ class Atlas:
         return cKDTree(np.column_stack([self._q, 2 * self._reach * self._sensor]))
 
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """Tiles (P, side, 3 side) around places (P, 2) in cells, with the detections near them."""
-        side = self._side
-        tiles = np.empty((len(middles), side, 3 * side), dtype=np.float32)
-        at_once = max(DRAWING.held // side**2, 1)
-        for first in range(0, len(tiles), at_once):
-            part = slice(first, first + at_once)
-            pairs = slice(*of.searchsorted([part.start, part.stop]))
-            self._draw(tiles[part], sensors[part], middles[part], of[pairs] - first, which[pairs])
-        return tiles
-
-    def _draw(
-        self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
-    ) -> None:
-        """Draw tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
+        """Tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
 
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
         """
+        at_once = DRAWING.held // self._side**2
+        if len(middles) > at_once:  # what is made for them stays in the cache
+            cuts = [slice(k, k + at_once) for k in range(0, len(middles), at_once)]
+            pairs = [slice(*of.searchsorted([cut.start, cut.stop])) for cut in cuts]
+            parts = [
+                self._drawn(sensors[cut], middles[cut], of[some] - cut.start, which[some])
+                for cut, some in zip(cuts, pairs, strict=True)
+            ]
+            return np.concatenate(parts)
         count, side, scale = len(middles), self._side, self._scale
         place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
@@ -182,7 +175,7 @@ class Atlas:
         along_u[slots, 0, :, 0] = along_u[slots, 1, :, 2] = bells[:, 0]
         along_u[slots, 0, :, 1] = slopes[:, 0]
         rows = along_v.reshape(count, 2 * most, side).swapaxes(1, 2)
-        np.matmul(rows, along_u.reshape(count, 2 * most, 3 * side), out=tiles)
+        return np.asarray(rows @ along_u.reshape(count, 2 * most, 3 * side))
 
     def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
         """Those of pages around places (P, 2) in cells on which there is something, and they."""

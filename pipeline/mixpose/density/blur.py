@@ -19,17 +19,17 @@ from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
 def blurred(
     pattern: Pattern, sigma: float, u: Floats, v: Floats, total: float, *, gradient: bool
 ) -> list[Singles]:
-    """Blur a pattern that is not empty at columns u (U,) and rows v (V,), which ranges do not use.
+    """The density (V, U) of a pattern, and where wanted its derivatives by u and v.
 
-    The density (V, U), and where wanted its derivatives by u and v.  `sigma` is the standard
-    deviation of the blur in sensor units, positive for detections, and `total` what the pattern is
-    normalised by, its `mass`.
+    At columns u (U,) and rows v (V,), which ranges do not use.  Of a pattern that is not empty,
+    blurred by `sigma` in sensor units, positive for detections, and normalised by its mass `total`.
     """
     m = pattern.dimension
     if isinstance(pattern, PointPattern):
-        along = [_bell(axis, pattern.points[:, k], sigma) for k, axis in enumerate((u, v)[:m])]
-        weights = (pattern.weights / total).astype(np.float32)[:, None]
-        right, left = along[0], [weights * one for one in along[1]] if m == 2 else [weights]
+        right = _bell(u, pattern.points[:, 0], sigma)
+        left = [(pattern.weights / total).astype(np.float32)[:, None]]
+        if m == 2:
+            left = [left[0] * one for one in _bell(v, pattern.points[:, 1], sigma)]
     else:
         columns, right = _along(pattern, 0, sigma, u)
         rows, left = slice(None), [np.ones((1, 1), dtype=np.float32)]
@@ -74,8 +74,7 @@ def _bell(axis: Floats, centres: Floats, sigma: float) -> list[Singles]:
 def mass(pattern: Pattern) -> float:
     """What a pattern is normalised by: the sum of weights, or the integral of absolute values.
 
-    Noise about zero stays as it is, and may outweigh the features; the plain integral might then
-    be anything.
+    Noise about zero may outweigh the features; the plain integral might then be anything.
     """
     if isinstance(pattern, PointPattern):
         return float(pattern.weights.sum())
@@ -117,11 +116,10 @@ def odd_factor(ratio: float) -> int:
 
 
 def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern g0 and normalise it to a probability density, with its gradient if wanted.
+    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it, with its gradient if wanted.
 
-    `sigma` is the standard deviation of the blur in sensor units, positive for detections.  The
-    normalisation is that of the whole pattern, so that a window shows a part of the same density,
-    which is zero everywhere where the pattern is empty.
+    The normalisation is that of the whole pattern: a window shows a part of the same density, which
+    is zero everywhere where the pattern is empty.
     """
     if is_empty(pattern):
         shape = (*window.shape, 3) if gradient else window.shape

@@ -1,10 +1,7 @@
 """A density on a grid, and how to look values up in it.
 
 A density is float32 values plus the affine map from sensor coordinates to array indices,
-``index = (y - origin) / step``; a range profile is one row high.  Channel 0 holds the density g,
-the following m channels its gradient by sensor coordinates; outside the array every channel is 0.
-`cv2.remap` of OpenCV 5 is exact to float rounding for 1, 3 or 4 channels, for 2 it still rounds
-coordinates to 1/32 of a step: densities of ranges are padded to 3.
+``index = (y - origin) / step``; a range profile is one row high.  Outside the array it is 0.
 """
 
 from __future__ import annotations
@@ -55,11 +52,6 @@ class Density:
         """m, the number of sensor coordinates."""
         return len(self.window.origin)
 
-    def integral(self) -> float:
-        """Integral of the density over its window."""
-        total = np.atleast_3d(self.values)[..., 0].sum(dtype=np.float64)
-        return float(total * self.window.step**self.dimension)
-
     def sample(self, y: Floats) -> Singles:
         """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
 
@@ -85,11 +77,9 @@ def merge(layers: list[Singles]) -> Singles:
 
 def remap(values: Singles, u: Singles, v: Singles) -> Any:
     """Sample an array bilinearly at indices (...) along columns and rows: (..., C); 0 outside."""
-    if u.ndim == 2 and 0 < max(u.shape) <= DRAWING.side:
+    if u.ndim == 2 and u.size and max(u.shape) <= DRAWING.side:
         return cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    count, shape = u.size, (*u.shape, *values.shape[2:])
-    if not count:
-        return np.zeros(shape, dtype=np.float32)
-    width = min(count, DRAWING.side)
-    maps = [np.pad(one.ravel(), (0, -count % width)).reshape(-1, width) for one in (u, v)]
-    return remap(values, *maps).reshape(-1, *values.shape[2:])[:count].reshape(shape)
+    count, channels, width = u.size, values.shape[2:], min(max(u.size, 1), DRAWING.side)
+    padding = -count % width if count else 1
+    maps = [np.pad(one.ravel(), (0, padding)).reshape(-1, width) for one in (u, v)]
+    return remap(values, *maps).reshape(-1, *channels)[:count].reshape(*u.shape, *channels)

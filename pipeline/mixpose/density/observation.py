@@ -20,7 +20,7 @@ from mixpose.density.atlas import Atlas
 from mixpose.density.blur import is_empty, odd_factor, render
 from mixpose.density.grid import Density, Window
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Indices, Pattern, PointPattern
+from mixpose.records import Floats, Indices, Pattern, PointPattern, Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,16 +55,17 @@ class Observation:
     @property
     def cells(self) -> int:
         """Number of cells, or of detections."""
-        pattern = self.pattern
-        return (pattern.weights if isinstance(pattern, PointPattern) else pattern.values).size
+        return self._amounts.size
 
     @property
     def weight(self) -> float:
         """Sum of all weights or values."""
+        return float(self._amounts.sum())
+
+    @property
+    def _amounts(self) -> Floats | Singles:
         pattern = self.pattern
-        return float(
-            (pattern.weights if isinstance(pattern, PointPattern) else pattern.values).sum()
-        )
+        return pattern.weights if isinstance(pattern, PointPattern) else pattern.values
 
     @cached_property
     def is_empty(self) -> bool:

@@ -12,7 +12,6 @@ from mixpose.density.grid import FAR
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices, Singles
 
-
 RIM = 3  # cells along a tile beside those looked up, which a spline reaches: one before, two after
 
 

@@ -7,9 +7,8 @@ b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 
 where P takes the mean off and λ = N / (s a)² for noise N of cells, relative spread s and common
-amplitude a.  Under much noise α are equal and Q is the matched kernel; under little they are free.
-As α are at their maximum, the gradient is that at fixed α; the curvature is Gauss-Newton's of the
-residual g − Σ_i α_i h_i with α solved for (variable projection).
+amplitude a.  As α are at their maximum, the gradient is that at fixed α; the curvature is
+Gauss-Newton's of the residual g − Σ_i α_i h_i with α solved for (variable projection).
 """
 
 from __future__ import annotations
@@ -71,10 +70,8 @@ class AmplitudesObjective:
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
-        explained = [
-            2 * float(one.alpha @ one.b) - float(one.alpha @ one.B @ one.alpha)
-            for one in self._mixtures(T_world_object)
-        ]
+        mixtures = self._mixtures(T_world_object)
+        explained = [one.alpha @ (2 * one.b - one.B @ one.alpha) for one in mixtures]
         return np.asarray(self.matched.energies[:, 0] - np.array(explained))
 
     def _mixtures(self, T_world_object: Floats) -> list[_Mixture]:
@@ -95,6 +92,6 @@ class AmplitudesObjective:
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
             alpha = np.linalg.solve(inner, C[:, 0])
-            J = match.J[k, 0, seen, :m]
-            mixtures.append(_Mixture(alpha, C[:, 0], B, inner, C[:, 1:], away, J))
+            rest = C[:, 1:], away, match.J[k, 0, seen, :m]
+            mixtures.append(_Mixture(alpha, C[:, 0], B, inner, *rest))
         return mixtures

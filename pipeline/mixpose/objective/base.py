@@ -65,10 +65,6 @@ class NormalPrior:
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
-    """Box (lower, upper) around visible points (n, m), at least one, within the sensor.
-
-    The margin, in sensor units, is added on every side.
-    """
-    lower = np.maximum(y.min(axis=0) - margin, sensor.lower)
-    upper = np.minimum(y.max(axis=0) + margin, sensor.upper)
-    return lower, upper
+    """Box (lower, upper) with a margin around visible points (n, m), within the sensor."""
+    lower, upper = y.min(axis=0) - margin, y.max(axis=0) + margin
+    return np.maximum(lower, sensor.lower), np.minimum(upper, sensor.upper)

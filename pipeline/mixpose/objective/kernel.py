@@ -9,9 +9,8 @@ Steps are taken by curvatures that are never negative.  Where predicted features
 that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has
 ∇C = C (y_i − p_i) / v, so that the step is that of least squares to the detections around the
 features, with weights C_i: it gets there at once from any distance, and a feature that meets none
-does not hold the others back.  (Newton's step, with C I / v − ∇C ∇Cᵀ / C in place of C I / v,
-shrinks with the distance.)  Where features overlap their pulls are not their own, and the curvature
-is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
+does not hold the others back.  Where features overlap their pulls are not their own, and the
+curvature is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
 
 from __future__ import annotations
@@ -51,13 +50,9 @@ def overlaps(
 
 def _close_pairs(y: Floats, variances: Floats) -> Indices:
     """Pairs of features that may overlap at any of the poses."""
-    n = y.shape[2]
-    pairs = [
-        close_pairs(places, variance) @ [n, 1]
-        for some, variance in zip(y, variances[:, 0].tolist(), strict=True)
-        for places in some
-    ]
-    return np.stack(np.divmod(np.unique(np.concatenate(pairs)), n), axis=1)
+    L, H, n, _ = y.shape
+    each = [close_pairs(y[k, h], float(variances[k, 0])) for k in range(L) for h in range(H)]
+    return np.unique(np.concatenate(each), axis=0)
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
@@ -66,10 +61,9 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
     L, H, n = match.weights.shape
-    J = match.J.reshape(L, H, 2 * n, 6)
     C = match.sampled[..., 0] * match.weights
     pull = (match.sampled[..., 1:] * match.weights[..., None]).reshape(L, H, 1, 2 * n)
-    rest = (pull @ J)[:, :, 0]
+    rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
     product = C.sum(axis=2)
     amplitude = product / match.norm
     strength = 2 * scales * amplitude

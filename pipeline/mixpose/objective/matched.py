@@ -2,12 +2,9 @@
 
 For sensor l let g be the observed density and h_β the predicted one, a mixture of the projected
 features with the observation's own blur σ.  The share of g that h_β explains once its amplitude
-is solved for (variable projection) is
-
-    S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩),
-
-and the objective is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred
-once more by σ: an image, drawn once and looked up with `cv2.remap`.  Nothing is sampled at random.
+is solved for (variable projection) is S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩), and the objective
+is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred once more by σ: an
+image, drawn once and looked up with `cv2.remap`.
 """
 
 from __future__ import annotations
@@ -115,10 +112,9 @@ class SharedDensities:
     @classmethod
     def drawn(cls, views: Sequence[View]) -> SharedDensities:
         """Draw views of detections, none of which is empty."""
-        observations = [view.observation for view in views]
-        sigmas = [one.sigma for one in observations]
-        totals = tuple(one.weight for one in observations)
-        return cls(matched_atlas(observations, sigmas, STEPS_PER_SIGMA), totals)
+        seen = [view.observation for view in views]
+        atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
+        return cls(atlas, tuple(one.weight for one in seen))
 
 
 def matched_objective(
@@ -165,13 +161,8 @@ def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
     For a handful of features NumPy spends its time on calls, not on numbers: the poses that one
     body is evaluated at in a batch may as well be those of several bodies, one of each.
     """
-    first = objectives[0]
-    return replace(
-        first,
-        projection=project_body(
-            first.projection.sensors, *[one.projection.body for one in objectives]
-        ),
-        energies=np.concatenate([one.energies for one in objectives], axis=1),
-        weights=np.concatenate([one.weights for one in objectives], axis=1),
-        at_hand=None,
-    )
+    bodies = [one.projection.body for one in objectives]
+    projection = project_body(objectives[0].projection.sensors, *bodies)
+    energies = np.concatenate([one.energies for one in objectives], axis=1)
+    weights = np.concatenate([one.weights for one in objectives], axis=1)
+    return replace(objectives[0], projection=projection, energies=energies, weights=weights)

@@ -1,9 +1,5 @@
 """The paper's objectives, sampled: formula (4) and the product it warns of; objectives by name.
 
-* `PaperObjective`: (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)).  The product over sensors stands
-  inside, because all sensors see the same Z; with one sensor it is formula (2).
-* `IndependentObjective`: Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)), for comparison only.
-
 Densities are looked up with `cv2.remap`, batched over poses.  A feature that a sensor cannot see
 has density 0 there.  Curvatures are those of mean-shift: every sample pulls with the weight of
 its density, as if its feature were a Gaussian of the level's σ.
@@ -11,6 +7,7 @@ its density, as if its feature were a Gaussian of the level's σ.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -60,19 +57,22 @@ class _SampledObjective:
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
         if T_world_object.ndim == 2:  # no time for more
-            return self._values(self._densities(T_world_object[None])).reshape(())
+            return self._values(T_world_object[None]).reshape(())
         poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
         starts = range(0, len(poses), at_once)
-        values = [self._values(self._densities(poses[k : k + at_once])) for k in starts]
+        values = [self._values(poses[k : k + at_once]) for k in starts]
         return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
 
-    def _values(self, densities: list[Singles]) -> Floats:
-        """Values (k,) of densities (k, S) per sensor, which may be overwritten."""
-        raise AssertionError("an objective says how sensors combine")
+    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
+        """What is multiplied over sensors, (k, S) or (k, 1) each, of densities (k, S)."""
+        return densities
 
-    def _factors(self, densities: Floats) -> list[Floats]:
-        """What each sensor's density of a sample is multiplied by, (S,) each, of those (L, S)."""
-        raise AssertionError("an objective says how sensors combine")
+    def _values(self, poses: Floats) -> Floats:
+        """Values (k,) at poses (k, 4, 4)."""
+        product, *others = self._parts(self._densities(poses))
+        for part in others:
+            product *= part
+        return _means(product)
 
     @cached_property
     def _alone(self) -> list[Density]:
@@ -114,42 +114,33 @@ class _SampledObjective:
             y, by_world, _ = term.sensor.linearise(points)
             looked_up.append(term.density.sample(y).astype(np.float64))
             jacobians.append(pose_jacobian(by_world, arms))
-        factors = self._factors(np.array([g[:, 0] for g in looked_up]))
+        parts = self._parts([g[None, :, 0] for g in looked_up])
         gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for term, g, J, others in zip(self.terms, looked_up, jacobians, factors, strict=True):
+        for k, (term, g, J) in enumerate(zip(self.terms, looked_up, jacobians, strict=True)):
+            rest = (part[0] for j, part in enumerate(parts) if j != k)
+            others = math.prod(rest, start=np.ones(count))
             gradient += np.einsum("s,sm,smk->k", others, g[:, 1:], J) / count
             pull = others * g[:, 0] / (count * term.density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
-        value = float((factors[0] * looked_up[0][:, 0]).mean())
-        return value, gradient, curvature
+        return float((others * g[:, 0]).mean()), gradient, curvature
 
 
 class PaperObjective(_SampledObjective):
-    """Formula (4): sensors multiplied inside the integral over the object."""
+    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)).
 
-    def _values(self, densities: list[Singles]) -> Floats:
-        product, *others = densities
-        for g in others:
-            product *= g
-        return _means(product)
-
-    def _factors(self, densities: Floats) -> list[Floats]:
-        return [np.prod(np.delete(densities, k, axis=0), axis=0) for k in range(len(densities))]
+    The product over sensors stands inside, because all sensors see the same Z; with one sensor it
+    is formula (2).
+    """
 
 
 class IndependentObjective(_SampledObjective):
-    """The product of separate objectives: sensors as if they saw different objects."""
+    """Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)): sensors as if they saw different objects."""
 
-    def _values(self, densities: list[Singles]) -> Floats:
-        return np.asarray(np.prod([_means(g) for g in densities], axis=0))
-
-    def _factors(self, densities: Floats) -> list[Floats]:
-        means = densities.mean(axis=1)
-        ones = np.ones(densities.shape[1])
-        return [np.prod(np.delete(means, k)) * ones for k in range(len(means))]
+    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
+        return [_means(g)[:, None] for g in densities]
 
 
-def _means(g: Singles) -> Floats:
+def _means(g: Floats | Singles) -> Floats:
     """Means (k,) over the samples (k, S) of k poses, summed in double precision."""
     return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F).ravel() / g.shape[1])
 
@@ -158,64 +149,55 @@ class _AffineMaps:
     """Where samples (S, 3) of a body lie in the arrays of densities, for `cv2.remap`.
 
     One evaluation of a sampled objective is to cost hardly more than its look-ups.  So where no
-    sensor has perspective, as with the paper's cameras, samples are kept in single precision, and
-    one matrix product for all of them ends in array indices.  Single precision suffices because
-    samples are relative to their centre: maps err by less than 1/1000 of an index in arrays of up
-    to 4000 a side.
+    sensor has perspective, samples are kept in single precision, and one matrix product for all of
+    them ends in array indices: they err by less than 1/1000 in arrays of up to 4000 a side, as
+    samples are relative to their centre.
     """
 
     def __init__(self, terms: Sequence[SampledTerm], points: Floats, offsets: Floats) -> None:
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        to_centre = np.eye(4)
+        to_centre[:3, 3] = centre = (points.min(axis=0) + points.max(axis=0)) / 2
         parts = [points - centre, np.ones((len(points), 1))]
-        reach = float(np.linalg.norm(parts[0], axis=1).max())
-        if offsets.any():
-            parts.append(offsets)
-            reach += float(np.linalg.norm(offsets, axis=1).max())
-        self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
         rows, limits = [], []
         for term in terms:
             assert isinstance(term.sensor, AffineSensor)
             origin, step = term.density.window.origin, term.density.window.step
             rows.append(term.sensor.affine / step)
             rows[-1][:, 3] -= origin / step
-            corners = np.stack([term.sensor.lower, term.sensor.upper])
-            limits.append((corners - origin) / step)
+            limits.append((np.stack([term.sensor.lower, term.sensor.upper]) - origin) / step)
         P = np.concatenate(rows)  # (2 L, 4) array indices of points in the world
-        lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
-        self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
         # coefficients (16, 2 L c) of indices by the 16 numbers of a pose, the last of which is 1
-        to_centre = np.eye(4)
-        to_centre[:3, 3] = centre
         by_pose = np.einsum("ia,bj->abij", P, to_centre)
-        centres = by_pose[..., 3].reshape(16, -1).copy()
+        middle = by_pose[..., 3].reshape(16, -1).copy()
         if offsets.any():
+            parts.append(offsets)
             in_world = np.zeros((4, 4, len(P), 3))
             in_world[3, 3] = P[:, :3]
             by_pose = np.concatenate([by_pose, in_world], axis=3)
-        by_pose = by_pose.reshape(16, -1)
-        self._width = by_pose.shape[1]
+        self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
+        lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
+        self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
         # numbers within ±1 if the centre lies so that all samples are seen
+        reach = sum(float(np.linalg.norm(one, axis=1).max()) for one in (parts[0], offsets))
         half = (upper - lower) / 2 - reach * np.linalg.norm(P[:, :3], axis=1)
-        centres[15] -= (lower + upper) / 2
-        self._by_pose = np.hstack([by_pose, centres / np.where(half > 0, half, np.nan)])
+        middle[15] -= (lower + upper) / 2
+        self._width = by_pose[0, 0].size
+        is_seen = middle / np.where(half > 0, half, np.nan)
+        self._by_pose = np.hstack([by_pose.reshape(16, -1), is_seen])
 
     def at(self, poses: Floats) -> Singles:
         """Indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
 
         `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
         """
-        flat = poses.reshape(-1, 16)
-        rows = flat.dot(self._by_pose)
-        if cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
-            return self._product(rows)
+        rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            maps, (lower, upper) = self._product(rows), self._limits
-            maps[~((maps >= lower) & (maps <= upper))] = FAR
-        return maps
-
-    def _product(self, rows: Floats) -> Singles:
-        single, (c, count) = rows[:, : self._width].astype(np.float32), self._samples.shape
-        return np.asarray(single.reshape(-1, c).dot(self._samples).reshape(len(rows), -1, count))
+            single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
+            maps = single.dot(self._samples).reshape(len(rows), -1, count)
+            if not cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+                lower, upper = self._limits
+                maps[~((maps >= lower) & (maps <= upper))] = FAR
+        return np.asarray(maps)
 
 
 def sampled_terms(

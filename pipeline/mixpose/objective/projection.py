@@ -6,12 +6,9 @@ Sensors of one coordinate have 0 as their second.
 The image of a sphere or of an oblique disk is an ellipse, and with a lens nearly one, whose centre
 is not where the marker's own centre is seen.  What a sensor sees of a sphere is the disk within the
 circle at which lines of sight touch it.  So both are disks, of which the centroid of the image is
-
-    ∫ y(x) |det ∂y| dx / ∫ |det ∂y| dx,
-
-over the disk: the centroid of the grey values, and to the same order the centre of the ellipse
-through the rim.  Four points at 1/√2 of the radius integrate polynomials of third degree over a
-disk; what is left is of the fourth order of the marker's size over its distance.
+∫ y(x) |det ∂y| dx / ∫ |det ∂y| dx over the disk.  Four points at 1/√2 of the radius integrate
+polynomials of third degree; what is left is of the fourth order of the marker's size over its
+distance.
 """
 
 from __future__ import annotations
