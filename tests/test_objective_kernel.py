@@ -9,7 +9,7 @@ from rounding import rounding
 
 from mixpose.density import peak
 from mixpose.objective import Match
-from mixpose.objective.kernel import overlaps, slopes
+from mixpose.objective.matched import overlaps, slopes
 from mixpose.optimise import Quadratic
 
 Floats = NDArray[np.float64]

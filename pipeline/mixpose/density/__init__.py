@@ -1,12 +1,12 @@
 """Densities g_l of where features are: blur, normalisation, windows, tiles, levels of blur."""
 
 from mixpose.density.atlas import Atlas as Atlas
-from mixpose.density.blur import render as render
 from mixpose.density.grid import (
     FAR as FAR,
     Density as Density,
     Window as Window,
     remap as remap,
+    render as render,
 )
 from mixpose.density.observation import (
     Observation as Observation,

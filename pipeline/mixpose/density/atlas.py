@@ -23,8 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.density.blur import blurred, mass, reduced
-from mixpose.density.grid import remap
+from mixpose.density.grid import blurred, mass, reduced, remap
 from mixpose.density.pages import RIM, Pages, Plane, middles_of
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles

@@ -1,7 +1,11 @@
-"""A density on a grid, and how to look values up in it.
+"""Densities on grids: blur and normalisation, g = g0 * ε, and how to look values up.
 
 A density is float32 values plus the affine map from sensor coordinates to array indices,
 ``index = (y - origin) / step``; a range profile is one row high.  Outside the array it is 0.
+
+A Gaussian blur is separable.  At the crossings of columns u and rows v it is a product of three
+matrices: Gaussians along v, the pattern (diagonal for detections), Gaussians along u.  Nothing is
+interpolated, and no filter is cut off but where a Gaussian has vanished.
 """
 
 from __future__ import annotations
@@ -13,7 +17,7 @@ import cv2
 import numpy as np
 
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Singles
+from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
 
 FAR = DRAWING.far
 
@@ -83,3 +87,128 @@ def remap(values: Singles, u: Singles, v: Singles) -> Any:
     padding = -count % width if count else 1
     maps = [np.pad(one.ravel(), (0, padding)).reshape(-1, width) for one in (u, v)]
     return remap(values, *maps).reshape(-1, *channels)[:count].reshape(*u.shape, *channels)
+
+
+def blurred(
+    pattern: Pattern, sigma: float, u: Floats, v: Floats, total: float, *, gradient: bool
+) -> list[Singles]:
+    """The density (V, U) of a pattern, and where wanted its derivatives by u and v.
+
+    At columns u (U,) and rows v (V,), which ranges do not use.  Of a pattern that is not empty,
+    blurred by `sigma` in sensor units, positive for detections, and normalised by its mass `total`.
+    """
+    m = pattern.dimension
+    if isinstance(pattern, PointPattern):
+        right = _bell(u, pattern.points[:, 0], sigma)
+        left = [(pattern.weights / total).astype(np.float32)[:, None]]
+        if m == 2:
+            left = [left[0] * one for one in _bell(v, pattern.points[:, 1], sigma)]
+    else:
+        columns, right = _along(pattern, 0, sigma, u)
+        rows, left = slice(None), [np.ones((1, 1), dtype=np.float32)]
+        if m == 2:
+            rows, left = _along(pattern, 1, sigma, v)
+        scale = np.float32(pattern.step**m / total)
+        values: Singles = (pattern.values[rows, columns] * scale).astype(np.float32)
+        right = [values @ one for one in right]
+    factors = [(left[0], right[0]), (left[0], right[1]), (left[-1], right[0])]
+    return [one.T @ other for one, other in factors[: 1 + m if gradient else 1]]
+
+
+def _along(
+    pattern: GridPattern, axis: int, sigma: float, places: Floats
+) -> tuple[slice, list[Singles]]:
+    """The part of a grid that matters along an axis, and its Gaussians and slopes at places."""
+    step, count = pattern.step, pattern.values.shape[1 - axis]
+    margin = max(DRAWING.cut * sigma, step)
+    first = int(np.clip((places.min() - margin - pattern.origin[axis]) / step, 0, count - 1))
+    last = (places.max() + margin - pattern.origin[axis]) / step + 2
+    part = slice(first, int(np.clip(last, first + 1, count)))
+    grid = pattern.origin[axis] + step * np.arange(part.start, part.stop)
+    if sigma > 0.3 * step:
+        return part, _bell(places, grid, sigma)
+    # sums over a grid coarser than that are no integrals: a narrower blur is linear interpolation
+    away = (places - grid[:, None]) / step
+    hat = np.maximum(1 - np.abs(away), 0.0) / step
+    slope = np.where(np.abs(away) <= 1, -np.sign(away), 0.0) / step**2
+    return part, [hat.astype(np.float32), slope.astype(np.float32)]
+
+
+def _bell(axis: Floats, centres: Floats, sigma: float) -> list[Singles]:
+    """Gaussians (M, n) around centres (M,) along an axis (n,), and their derivative."""
+    away = ((axis - centres[:, None]) / sigma).astype(np.float32)
+    squared = away * away
+    values = np.exp(-0.5 * squared) * np.float32(1.0 / (np.sqrt(2 * np.pi) * sigma))
+    # products of tails beyond (1e-11 of the peak) are subnormal: matrix products crawl on them
+    values[squared > 2 * DRAWING.cut**2] = 0.0
+    return [values, values * away * np.float32(-1.0 / sigma)]
+
+
+def mass(pattern: Pattern) -> float:
+    """What a pattern is normalised by: the sum of weights, or the integral of absolute values.
+
+    Noise about zero may outweigh the features; the plain integral might then be anything.
+    """
+    if isinstance(pattern, PointPattern):
+        return float(pattern.weights.sum())
+    absolute = float(np.abs(pattern.values).sum(dtype=np.float64))
+    return absolute * pattern.step**pattern.dimension
+
+
+def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
+    """A grid on fewer points where a wide blur leaves nothing between them, and the blur left.
+
+    Points are averaged by a triangle (a box run over the pixels, then blocks): blocks alone would
+    move a feature to the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off
+    the blur.
+    """
+    factor = odd_factor(sigma / (DRAWING.steps_per_sigma * pattern.step))
+    if factor == 1:
+        return pattern, sigma
+    rows, columns = pattern.values.shape
+    down = factor if pattern.dimension == 2 else 1
+    # a block before, and what fills up the last one and another after
+    size = (-(-columns // factor) + 2, -(-rows // down) + 2 * (down > 1))
+    before = (down if down > 1 else 0, factor)
+    after = (size[1] * down - rows - before[0], size[0] * factor - columns - factor)
+    padded = cv2.copyMakeBorder(
+        pattern.values, before[0], after[0], before[1], after[1], cv2.BORDER_CONSTANT, value=0
+    )
+    smooth = cv2.blur(padded, (factor, down), borderType=cv2.BORDER_CONSTANT)
+    values = np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    step = factor * pattern.step
+    origin = pattern.origin - factor * pattern.step + (factor - 1) / 2 * pattern.step
+    left = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))
+    return GridPattern(values.reshape(size[1], size[0]), origin, step), float(left)
+
+
+def odd_factor(ratio: float) -> int:
+    """Largest odd whole number up to a ratio, at least 1: odd boxes have a central pixel."""
+    whole = max(int(ratio + 1e-9), 1)
+    return whole if whole % 2 else whole - 1
+
+
+def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
+    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it, with its gradient if wanted.
+
+    The normalisation is that of the whole pattern: a window shows a part of the same density, which
+    is zero everywhere where the pattern is empty.
+    """
+    if is_empty(pattern):
+        shape = (*window.shape, 3) if gradient else window.shape
+        return Density(np.zeros(shape, dtype=np.float32), window, sigma)
+    left = sigma
+    if isinstance(pattern, GridPattern):
+        pattern, left = reduced(pattern, sigma)
+    u, v = window.axis(0), window.axis(pattern.dimension - 1)
+    layers = blurred(pattern, left, u, v, mass(pattern), gradient=gradient)
+    return Density(merge(layers) if gradient else layers[0], window, sigma)
+
+
+def is_empty(pattern: Pattern) -> bool:
+    """Whether a pattern has no feature at all."""
+    if isinstance(pattern, PointPattern):
+        return len(pattern.points) == 0 or not pattern.weights.sum() > 0
+    # a profile that lies below zero as a whole has no density anywhere, nor has one so low that
+    # what it is normalised by overflows in single precision
+    return not pattern.values.max() > 1e-30

@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas
-from mixpose.density.blur import is_empty, odd_factor, render
-from mixpose.density.grid import Density, Window
+from mixpose.density.grid import Density, Window, is_empty, odd_factor, render
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices, Pattern, PointPattern, Singles
 

@@ -32,11 +32,6 @@ class Quadratic(NamedTuple):
         """The models at some of the states."""
         return Quadratic._make(None if part is None else part[rows] for part in self)
 
-    def followed_by(self, other: Quadratic) -> Quadratic:
-        """These models and others of the same term, one after the other."""
-        pairs = zip(self, other, strict=True)
-        return Quadratic._make(None if b is None else np.concatenate([a, b]) for a, b in pairs)
-
 
 class Term(Protocol):
     """A function of a state, to be maximised: any evidence, any knowledge."""
@@ -54,12 +49,9 @@ class Sum:
 
     def linearise(self, states: Any) -> Quadratic:
         """Second-order models at H states; Hessians where all terms know theirs."""
-        models = [term.linearise(states) for term in self.terms]
-        parts = [[part for part in column if part is not None] for column in zip(*models)]
-        is_known = [len(column) == len(models) for column in parts]
-        return Quadratic._make(
-            np.sum(column, axis=0) if known else None for column, known in zip(parts, is_known)
-        )
+        columns = zip(*[term.linearise(states) for term in self.terms], strict=True)
+        is_open = [(column, any(part is None for part in column)) for column in columns]
+        return Quadratic._make(None if some else np.sum(parts, axis=0) for parts, some in is_open)
 
 
 @dataclass(frozen=True)
@@ -184,7 +176,9 @@ class _Climb:
             return left
         if max(chosen) >= count:
             self.states = np.concatenate([self.states, tried])[chosen]
-            self._here = self._here.followed_by(there).of(chosen)
+            pairs = zip(self._here, there, strict=True)
+            both = [None if b is None else np.concatenate([a, b]) for a, b in pairs]
+            self._here = Quadratic._make(both).of(chosen)
         self.steps, self.gains = _steps(self._here, self._free, self._damping, options)
         return left
 
