@@ -8,7 +8,7 @@ _ATLAS = (
     Mutant(
         "density-second-detection-of-a-tile-lost",
         "density/atlas.py",
-        "place = np.arange(len(of)) - np.searchsorted(of, of)",
+        "place = np.arange(len(of)) - of.searchsorted(of)",
         "place = np.zeros_like(of)",
         "of two detections on one tile only one is there",
     ),

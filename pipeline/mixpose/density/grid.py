@@ -145,10 +145,7 @@ def _bell(axis: Floats, centres: Floats, sigma: float) -> list[Singles]:
 
 
 def mass(pattern: Pattern) -> float:
-    """What a pattern is normalised by: the sum of weights, or the integral of absolute values.
-
-    Noise about zero may outweigh the features; the plain integral might then be anything.
-    """
+    """The sum of weights, or of absolute values: noise about zero may outweigh the features."""
     if isinstance(pattern, PointPattern):
         return float(pattern.weights.sum())
     absolute = float(np.abs(pattern.values).sum(dtype=np.float64))
@@ -158,9 +155,8 @@ def mass(pattern: Pattern) -> float:
 def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
     """A grid on fewer points where a wide blur leaves nothing between them, and the blur left.
 
-    Points are averaged by a triangle (a box run over the pixels, then blocks): blocks alone would
-    move a feature to the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off
-    the blur.
+    Points are averaged by a triangle (a box, then blocks), as blocks alone would move a feature to
+    the centre of its block.  Its variance, twice (n² − 1)/12 px², is taken off the blur.
     """
     factor = odd_factor(sigma / (DRAWING.steps_per_sigma * pattern.step))
     if factor == 1:
@@ -189,11 +185,7 @@ def odd_factor(ratio: float) -> int:
 
 
 def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it, with its gradient if wanted.
-
-    The normalisation is that of the whole pattern: a window shows a part of the same density, which
-    is zero everywhere where the pattern is empty.
-    """
+    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it as a whole, on a window."""
     if is_empty(pattern):
         shape = (*window.shape, 3) if gradient else window.shape
         return Density(np.zeros(shape, dtype=np.float32), window, sigma)

@@ -1,10 +1,8 @@
 """What one sensor observed, as densities at any blur, and inner products of Gaussian mixtures.
 
-Two densities are made of a pattern g0 whose features have standard deviation σ after blurring:
-
-* g = g0 * ε, the paper's observation density;
-* C, g blurred once more by σ, whose samples are inner products ⟨g, N(p, σ²)⟩ of the observation
-  with a predicted feature of the same width.
+Of a pattern g0 whose features have standard deviation σ after blurring these are g = g0 * ε, the
+paper's observation density, and C, g blurred once more by σ, whose samples are inner products
+⟨g, N(p, σ²)⟩ with a predicted feature of the same width.
 """
 
 from __future__ import annotations
@@ -24,16 +22,11 @@ from mixpose.records import Floats, Indices, Pattern, PointPattern, Singles
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A feature pattern with what is known about its blur, in sensor units.
-
-    Raises ValueError if sigma is not greater than 0.
-    """
+    """A feature pattern with what is known about its blur, in sensor units."""
 
     pattern: Pattern  # g0 in sensor coordinates
     sigma: float  # σ_ε, the finest standard deviation of a feature
-    # that features have in the pattern already: 0 for detections, σ_ε for a simulated measurement
-    # that is a density itself
-    intrinsic: float = 0.0
+    intrinsic: float = 0.0  # the same in the pattern already: σ_ε of simulated densities
 
     def __post_init__(self) -> None:
         if not 0 < self.sigma < np.inf:
@@ -167,10 +160,7 @@ def all_pairs(count: int) -> Indices:
 
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
-    """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, variance) of a mixture at points (n, m), weights (n,).
-
-    The variance is 2σ² for features of standard deviation σ.
-    """
+    """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
     pairs = close_pairs(points, variance)
     away = points[pairs[:, 0]] - points[pairs[:, 1]]
     bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)

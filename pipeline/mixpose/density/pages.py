@@ -34,10 +34,7 @@ class Plane(NamedTuple):
 
     @classmethod
     def of(cls, q: Floats, corners: Sequence[Floats], page: int, reach: float) -> Plane:
-        """A plane that holds detections (D, 2), and corners (2, 2) of grids, of all sensors.
-
-        In cells.  There is a rim of pages with nothing.
-        """
+        """For detections (D, 2), corners (2, 2) of grids, in cells; with a rim of empty pages."""
         grids = np.concatenate([np.zeros((0, 2)), *corners])
         places = q if len(q) else grids
         lower, upper = places.min(axis=0), places.max(axis=0)
@@ -45,8 +42,7 @@ class Plane(NamedTuple):
             middle, half = np.median(q, axis=0), page * math.sqrt(DRAWING.held) / 2.5
             lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
         if corners:
-            lower = np.minimum(lower, grids.min(axis=0))
-            upper = np.maximum(upper, grids.max(axis=0))
+            lower, upper = np.minimum(lower, grids.min(0)), np.maximum(upper, grids.max(0))
             page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.held), 1.0))
         # half a cell is left, lest rounding puts a place on a page of the rim
         origin = page * np.floor((lower - (reach + page + 0.5)) / page)
@@ -86,8 +82,7 @@ class Pages:
     ) -> None:
         """Turn places (L, H, n, 2) in cells into those in `values`, in place.
 
-        Of sensors (P,) and the middles (P, 2) of pages `draw` tells those on which there is
-        something, and what is on them, (F, side, 3 side).
+        Of pages, by sensors (P,) and middles (P, 2), `draw` gives those with something, and that.
         """
         plane = self.plane
         index -= plane.origin
@@ -115,8 +110,7 @@ class Pages:
         numbers = np.arange(self._drawn, self._drawn + len(pages))
         self._drawn += len(pages)
         if self._drawn > rows * columns:
-            # so large that allocators keep it from frame to frame; memory that is not written to
-            # is free
+            # so large that allocators keep it; memory that is not written to is free
             most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
             room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
             room[:rows] = self._room

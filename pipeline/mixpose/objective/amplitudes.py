@@ -85,9 +85,8 @@ class AmplitudesObjective:
             v, top = float(self.matched.variances[k, 0]), float(self.matched.tops[k, 0])
             B = top * np.outer(w, w) * np.exp(-0.5 * (away * away).sum(axis=2) / v)
             common = max(float(C[:, 0].sum()), 0.0) / float(match.norm[k, 0])
-            # bounded, so that features at one place are told apart by nothing
+            # bounded, as features at one place, and what is not seen, tell nothing of amplitudes
             least = 1e-9 * top * float(w @ w)
-            # and where nothing is seen, amplitudes are as good as one
             squares = max((self.spread * common) ** 2, 1e-300)
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))

@@ -126,8 +126,8 @@ def _gram(A: Floats, B: Floats) -> Floats:
 class MatchedObjective:
     """Σ_l ω_l ⟨g_l, h_l⟩² / (⟨g_l, g_l⟩ ⟨h_l, h_l⟩) over the pose.
 
-    Spreads Σ_i of the body's features do not widen the prediction, as a template wider than the
-    data is biased (see `docs/method.md`).  Of K bodies at once (`together`), at poses (K, 4, 4).
+    Of K bodies at once (`together`), at poses (K, 4, 4).  Spreads Σ_i of features do not widen the
+    prediction, as a template wider than the data is biased (see `docs/method.md`).
     """
 
     views: tuple[View, ...]

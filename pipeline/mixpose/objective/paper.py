@@ -39,11 +39,7 @@ class SampledTerm:
 
 
 class _SampledObjective:
-    """What both objectives share: samples z_ir (N, R, 3) of every feature, and their densities.
-
-    `world_offsets` (R, 3) are displacements in the world that belong to the samples, as by gravity:
-    they do not turn with the pose.
-    """
+    """Of samples z_ir (N, R, 3), displaced in the world by offsets (R, 3), as by gravity."""
 
     def __init__(
         self, terms: Sequence[SampledTerm], samples: Floats, world_offsets: Floats | None = None
@@ -59,8 +55,7 @@ class _SampledObjective:
         if T_world_object.ndim == 2:  # no time for more
             return self._values(T_world_object[None]).reshape(())
         poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
-        starts = range(0, len(poses), at_once)
-        values = [self._values(poses[k : k + at_once]) for k in starts]
+        values = [self._values(poses[k : k + at_once]) for k in range(0, len(poses), at_once)]
         return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
 
     def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
@@ -77,11 +72,9 @@ class _SampledObjective:
     @cached_property
     def _alone(self) -> list[Density]:
         """The densities without gradients, which values do not need."""
-        first = [np.atleast_3d(term.density.values)[..., 0] for term in self.terms]
-        return [
-            replace(term.density, values=np.ascontiguousarray(values))
-            for term, values in zip(self.terms, first, strict=True)
-        ]
+        drawn = [term.density for term in self.terms]
+        first = [np.ascontiguousarray(np.atleast_3d(one.values)[..., 0]) for one in drawn]
+        return [replace(one, values=values) for one, values in zip(drawn, first, strict=True)]
 
     @cached_property
     def _maps(self) -> _AffineMaps | None:
@@ -126,11 +119,7 @@ class _SampledObjective:
 
 
 class PaperObjective(_SampledObjective):
-    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)).
-
-    The product over sensors stands inside, because all sensors see the same Z; with one sensor it
-    is formula (2).
-    """
+    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)): all sensors see the same Z."""
 
 
 class IndependentObjective(_SampledObjective):
@@ -201,10 +190,7 @@ class _AffineMaps:
 
 
 def sampled_terms(
-    views: Sequence[View],
-    samples: Floats,
-    sigmas: Sequence[float],
-    near: Floats | None = None,
+    views: Sequence[View], samples: Floats, sigmas: Sequence[float], near: Floats | None = None
 ) -> list[SampledTerm]:
     """Densities g_l around the samples (N, R, 3) at a pose (4, 4), or wherever a sensor sees.
 
@@ -218,8 +204,7 @@ def sampled_terms(
             if not visible.any():
                 continue
             box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
-        density = view.observation.density(sigma, box, gradient=True)
-        terms.append(SampledTerm(view.sensor, density))
+        terms.append(SampledTerm(view.sensor, view.observation.density(sigma, box, gradient=True)))
     return terms
 
 

@@ -53,8 +53,8 @@ class Match(NamedTuple):
 class BodyProjection:
     """Sensors that look at a body; made once for the same ones by `project_body`.
 
-    Or at K bodies of bare points, at poses (K, 4, 4), one of each.  What a body has fewer features
-    than others is filled up with its first one, without weight.
+    Or at K bodies that `can_be_together`, at a pose of each (K, 4, 4): what one has fewer features
+    than others is filled up with its first, without weight.
     """
 
     def __init__(self, sensors: tuple[Sensor, ...], bodies: tuple[Body, ...]) -> None:
@@ -90,10 +90,7 @@ class BodyProjection:
         return Match(y.reshape(L, H, n, 2), J, seen, faced, self._weights * seen)
 
     def _of_disks(self, poses: Floats, world: Floats, radii: Floats) -> tuple[Floats, Floats, Mask]:
-        """As `SensorBatch.linearise`, of spheres or disks at world (H * n, 3), poses (H, 4, 4).
-
-        The Jacobian is that of a marker that moves without turning.
-        """
+        """As `SensorBatch.linearise`, of spheres or disks (H * n, 3) that move without turning."""
         L, count = len(self.sensors), len(world)
         normals = self._normals if self.body.shape == "disk" else None
         if normals is not None:
@@ -108,11 +105,9 @@ class BodyProjection:
             axes = _across(towards / np.sqrt(squared))
         steps = np.sqrt(0.5) * radii * axes  # where the four points are
         signs = np.array([1, -1, 1, -1]).reshape(4, *[1] * middle.ndim)
-        nodes = middle + signs * steps[[0, 0, 1, 1]]
+        nodes = (middle + signs * steps[[0, 0, 1, 1]]).swapaxes(0, -3).reshape(-1, 4 * count, 3)
         if normals is not None:
-            nodes, axes = nodes.reshape(4 * count, 3), axes[:, None]
-        else:
-            nodes = nodes.swapaxes(0, 1).reshape(L, 4 * count, 3)
+            nodes, axes = nodes[0], axes[:, None]
         y, J, seen = self._batch.linearise(nodes)
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
         a, b = (np.einsum("lknij,lnj->lkni", J, axis) for axis in axes + np.zeros((1, L, 1, 1)))
@@ -141,10 +136,7 @@ def can_be_together(body: Body) -> bool:
 
 
 def in_image(spreads: Floats, J: Floats) -> Floats:
-    """How far features are off in a sensor's coordinates, mean variance along an axis (..., n).
-
-    For covariances (..., n, 3, 3) in the world, and J (..., n, m, 6) in a sensor's m coordinates.
-    """
+    """Mean variance (..., n) along an axis of a sensor, by J (..., n, m, 6), of (..., n, 3, 3)."""
     by_world = J[..., :3]
     total = np.einsum("...nmi,...nij,...nmj->...n", by_world, spreads, by_world)
     return np.asarray(total / J.shape[-2])
@@ -167,10 +159,7 @@ def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
 
 
 def _across(directions: Floats) -> Floats:
-    """Two unit vectors (2, ..., 3) across unit vectors (..., 3) and each other.
-
-    Duff and others, Building an Orthonormal Basis, Revisited, JCGT 6 (2017).
-    """
+    """Two unit vectors (2, ..., 3) across unit vectors (..., 3): Duff and others, JCGT 6 (2017)."""
     x, y, z = np.moveaxis(directions, -1, 0)
     sign = np.copysign(1.0, z)
     a = -1 / (sign + z)

@@ -61,9 +61,8 @@ class NewtonOptions:
     iterations: int = 30  # most evaluations of a state's model
     tolerance: float = 1e-12  # end: the step is expected to gain less than this share of the value
     damping: float = 1e-4  # first Levenberg-Marquardt damping, as a share of the diagonal
-    # Relative error of values, as from interpolation.  Gains below it cannot be seen in the value;
-    # there a step is good when less gain is left after it: the zero of the gradient is sought,
-    # which interpolation does not move.
+    # relative error of values, as from interpolation, which does not move the zero of the gradient:
+    # below it a step is good when less gain is left after it
     value_error: float = 0.0
     # end: less than this share of the value is left to be gained after the step, as gains shrink by
     # about the same factor from step to step
