@@ -13,26 +13,14 @@ Gauss-Newton's of the residual g − Σ_i α_i h_i with α solved for (variable 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.objective.matched import MatchedObjective
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats
-
-
-class _Mixture(NamedTuple):
-    """The n features that a sensor of m coordinates sees, and their amplitudes."""
-
-    alpha: Floats  # (n,)
-    b: Floats  # (n,)
-    B: Floats  # (n, n)
-    inner: Floats  # (n, n) B + λP
-    pull: Floats  # (n, m) ∇b
-    away: Floats  # (n, n, m) p_i − p_j
-    J: Floats  # (n, m, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,33 +38,32 @@ class AmplitudesObjective:
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and curvature at one pose (4, 4)."""
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
-        for k, one in enumerate(self._mixtures(T_world_object)):
+        for k, (a, B, inner, C, away, J) in enumerate(self._mixtures(T_world_object)):
             v, scale = float(self.matched.variances[k, 0]), 0.5 / float(self.noise[k])
-            alpha, away, (n, _, m) = one.alpha[:, None], one.away, one.away.shape
-            bells = alpha * one.B * one.alpha
-            pull = alpha * one.pull + (bells[..., None] * away).sum(axis=1) / v
-            J = one.J.reshape(-1, 6)
-            value += scale * float(one.alpha @ one.b)
+            alpha, (n, _, m) = a[:, None], away.shape
+            bells = alpha * B * a
+            pull = alpha * C[:, 1:] + (bells[..., None] * away).sum(axis=1) / v
+            value += scale * float(a @ C[:, 0])
             gradient += 2 * scale * (pull.ravel() @ J)
             # ⟨∂h_i, ∂h_jᵀ⟩, and ⟨∂h_i, h_j⟩
             outer = away[..., :, None] * away[..., None, :] / v
             gram = (bells / v)[..., None, None] * (np.eye(m) - outer)
             gram = gram.swapaxes(1, 2).reshape(n * m, n * m)
-            cross = -((alpha * one.B / v)[..., None] * away).swapaxes(1, 2)
+            cross = -((alpha * B / v)[..., None] * away).swapaxes(1, 2)
             mixed = cross.reshape(n * m, n).T @ J
-            solved = np.linalg.solve(one.inner, mixed)
+            solved = np.linalg.solve(inner, mixed)
             curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
         return value, gradient, curvature
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
-        mixtures = self._mixtures(T_world_object)
-        explained = [one.alpha @ (2 * one.b - one.B @ one.alpha) for one in mixtures]
+        parts = self._mixtures(T_world_object)
+        explained = [a @ (2 * C[:, 0] - B @ a) for a, B, _, C, _, _ in parts]
         return np.asarray(self.matched.energies[:, 0] - np.array(explained))
 
-    def _mixtures(self, T_world_object: Floats) -> list[_Mixture]:
+    def _mixtures(self, T_world_object: Floats) -> Iterator[tuple[Floats, ...]]:
+        """By sensor α (n,), B, B + λP (n, n), b, ∇b (n, 1 + m), p_i − p_j (n, n, m), J (n m, 6)."""
         match = self.matched.match(T_world_object[None])
-        mixtures = []
         for k, m in enumerate(self.matched.projection.dimensions.tolist()):
             seen = np.flatnonzero(match.weights[k, 0] > 0)
             w, y = match.weights[k, 0, seen], match.y[k, 0, seen, :m]
@@ -91,6 +78,4 @@ class AmplitudesObjective:
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
             alpha = np.linalg.solve(inner, C[:, 0])
-            rest = C[:, 1:], away, match.J[k, 0, seen, :m]
-            mixtures.append(_Mixture(alpha, C[:, 0], B, inner, *rest))
-        return mixtures
+            yield alpha, B, inner, C, away, match.J[k, 0, seen, :m].reshape(-1, 6)
