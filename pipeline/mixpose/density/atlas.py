@@ -21,12 +21,14 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from mixpose.density.grid import blurred, mass, reduced, remap
 from mixpose.density.pages import RIM, Pages, Plane, middles_of
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
+
+# tiles that are drawn at once: they have room for as many detections each
+_TOGETHER = math.isqrt(DRAWING.few_pairs)
 
 
 class Atlas:
@@ -41,6 +43,7 @@ class Atlas:
     tile: int  # cells along the part of a tile that is looked up
 
     _sides = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
+    _apart = 4e9  # cells between rows of one sensor and the next, where they are sorted
     _quarters = np.full(4, 0.25, dtype=np.float32)
 
     def __init__(
@@ -95,15 +98,15 @@ class Atlas:
             middles, side = np.rint(index), self._side
             flat = middles.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(flat) // len(index))
-            tiles = self._drawn(sensors, flat, *self._near(sensors, flat))
-            # in columns so short that single precision rounds places in them to 6e-5 cells
-            columns = max(-(-len(tiles) * side // 2048), 1)
-            if columns > 1:
-                room = np.zeros((-(-len(tiles) // columns), columns, side, 3 * side), np.float32)
-                room.reshape(-1, side, 3 * side)[: len(tiles)] = tiles
-                tiles = room.swapaxes(1, 2)
-            shifts = (middles_of(np.arange(len(flat)), columns, side) - flat).reshape(index.shape)
-            values = tiles.reshape(-1, columns * side, 3)
+            groups = self._groups(len(flat), *self._near(sensors, flat))
+            # columns of so few tiles that places in the array are rounded to 6e-5 cells
+            shape = min(len(flat), _TOGETHER), side, len(groups), 3 * side
+            room, numbers = np.empty(shape, dtype=np.float32), np.empty(len(flat), dtype=np.intp)
+            for k, (some, *pairs) in enumerate(groups):
+                self._draw(room[: len(some), :, k], sensors[some], flat[some], *pairs)
+                numbers[some] = np.arange(len(some)) * len(groups) + k
+            shifts = (middles_of(numbers, len(groups), side) - flat).reshape(index.shape)
+            values = room.reshape(-1, len(groups) * side, 3)
             self._own = middles, shifts, values
         index += shifts
         self.values = values
@@ -122,39 +125,54 @@ class Atlas:
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
-        reach = self._reach
         if len(sensors) * len(self._q) <= DRAWING.few_pairs:
             away = np.abs(self._q - middles[:, None])
-            inside = away < reach
+            inside = away < self._reach
             near = inside[..., 0] & inside[..., 1] & (self._sensor == sensors[:, None])
             of, which = np.nonzero(near)
             return of, which
-        # a third coordinate keeps sensors apart
-        tiles = cKDTree(np.column_stack([middles, 2 * reach * sensors]))
-        pairs = tiles.sparse_distance_matrix(self._tree, reach, p=np.inf, output_type="ndarray")
-        order = np.lexsort((pairs["j"], pairs["i"]))
-        return pairs["i"][order], pairs["j"][order]
+        (order, keys), margin = self._sorted, self._reach + 1.0
+        rows = middles[:, 1] + self._apart * sensors
+        first, counts = keys.searchsorted(rows - margin), keys.searchsorted(rows + margin)
+        counts -= first
+        of = np.arange(len(rows)).repeat(counts)
+        which = order[np.arange(len(of)) + (first - np.cumsum(counts) + counts).repeat(counts)]
+        near = np.flatnonzero((np.abs(self._q[which] - middles[of]) < self._reach).all(axis=1))
+        return of[near], which[near]
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        """Detections, for a search around tiles."""
-        return cKDTree(np.column_stack([self._q, 2 * self._reach * self._sensor]))
+    def _sorted(self) -> tuple[Indices, Floats]:
+        """Detections (D,) by sensor and row, and numbers that are sorted alike."""
+        farthest = self._apart / 4
+        keys = np.clip(self._q[:, 1], -farthest, farthest) + self._apart * self._sensor
+        order = np.argsort(keys)
+        return order, keys[order]
 
-    def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
-        """Tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
+    def _groups(
+        self, count: int, of: Indices, which: Indices
+    ) -> list[tuple[Indices, Indices, Indices]]:
+        """Tiles that about as many detections reach, with the pairs of both, as of `_near`."""
+        if count <= _TOGETHER:
+            return [(np.arange(count), of, which)]
+        order = np.argsort(np.bincount(of, minlength=count), kind="stable")
+        rank = np.argsort(order)[of]
+        by_rank = np.argsort(rank, kind="stable")
+        rank, which = rank[by_rank], which[by_rank]
+        firsts = range(0, count, _TOGETHER)
+        ends = rank.searchsorted([*firsts, count]).tolist()
+        return [
+            (order[k : k + _TOGETHER], rank[a:b] - k, which[a:b])
+            for k, a, b in zip(firsts, ends, ends[1:])
+        ]
+
+    def _draw(
+        self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
+    ) -> None:
+        """Draw tiles (P, side, 3 side) around places (P, 2) in cells, with detections near them.
 
         They hold exact Gaussians: sums, over the detections that reach a tile, of products of one
         along v and one along u, in three channels side by side.
         """
-        at_once = DRAWING.held // self._side**2
-        if len(middles) > at_once:  # what is made for them stays in the cache
-            cuts = [slice(k, k + at_once) for k in range(0, len(middles), at_once)]
-            pairs = [slice(*of.searchsorted([cut.start, cut.stop])) for cut in cuts]
-            parts = [
-                self._drawn(sensors[cut], middles[cut], of[some] - cut.start, which[some])
-                for cut, some in zip(cuts, pairs, strict=True)
-            ]
-            return np.concatenate(parts)
         count, side, scale = len(middles), self._side, self._scale
         place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
@@ -174,7 +192,7 @@ class Atlas:
         along_u[slots, 0, :, 0] = along_u[slots, 1, :, 2] = bells[:, 0]
         along_u[slots, 0, :, 1] = slopes[:, 0]
         rows = along_v.reshape(count, 2 * most, side).swapaxes(1, 2)
-        return np.asarray(rows @ along_u.reshape(count, 2 * most, 3 * side))
+        np.matmul(rows, along_u.reshape(count, 2 * most, 3 * side), out=tiles)
 
     def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
         """Those of pages around places (P, 2) in cells on which there is something, and they."""
@@ -187,7 +205,11 @@ class Atlas:
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         sensors, middles = sensors[filled], middles[filled]
-        tiles = self._drawn(sensors, middles, np.searchsorted(filled, of), which)
+        tiles = np.empty((len(filled), self._side, 3 * self._side), dtype=np.float32)
+        for some, *pairs in self._groups(len(filled), np.searchsorted(filled, of), which):
+            drawn = np.empty((len(some), *tiles.shape[1:]), dtype=np.float32)
+            self._draw(drawn, sensors[some], middles[some], *pairs)
+            tiles[some] = drawn
         for i, k in enumerate(sensors.tolist()):
             if k in self._grids:
                 tiles[i] = self._of_grid(k, middles[i])

@@ -49,7 +49,7 @@ class DrawingRules:
         (1, 3, 4), "that cv2.remap of OpenCV 5 looks up exactly; others to 1/32 of a cell"
     )
     few_pairs: int = constant(
-        2500, "of points, or of tiles and detections: all at once are faster than neighbours"
+        64**2, "of points, or of tiles and detections: all at once are faster than neighbours"
     )
     held: int = constant(
         2**18,
