@@ -137,7 +137,7 @@ _BLUR = (
     Mutant(
         "density-overlap-ends-early",
         "density/observation.py",
-        "DRAWING.overlap * np.sqrt(variance)",
+        "np.sqrt(2 * DRAWING.negligible * variance)",
         "2.0 * np.sqrt(variance)",
         "bodies of many features have too little energy where features lie close",
     ),

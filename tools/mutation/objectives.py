@@ -138,8 +138,8 @@ _SAMPLED = (
     Mutant(
         "objective-gravity-left-out",
         "objective/paper.py",
-        "in_world[3, 3] = P[:, :3]",
-        "in_world[3, 3] = 0 * P[:, :3]",
+        "by_pose[3, 3, :, 4:] = P[:, :3]",
+        "by_pose[3, 3, :, 4:] = 0 * P[:, :3]",
         "a body that sags is expected where it would be without weight",
     ),
     Mutant(

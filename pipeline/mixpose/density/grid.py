@@ -201,6 +201,5 @@ def is_empty(pattern: Pattern) -> bool:
     """Whether a pattern has no feature at all."""
     if isinstance(pattern, PointPattern):
         return len(pattern.points) == 0 or not pattern.weights.sum() > 0
-    # a profile that lies below zero as a whole has no density anywhere, nor has one so low that
-    # what it is normalised by overflows in single precision
+    # a profile below zero has no density, nor has one that single precision cannot normalise
     return not pattern.values.max() > 1e-30

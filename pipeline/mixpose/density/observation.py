@@ -115,8 +115,7 @@ class Observation:
 
     def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
         """A window over the box, fine enough for the blur and within the budget of cells."""
-        margin = DRAWING.cut * feature_sigma
-        near, far = self.extent
+        (near, far), margin = self.extent, DRAWING.cut * feature_sigma
         lower = np.maximum(within[0], near - margin)
         upper = np.maximum(np.minimum(within[1], far + margin), lower)
         affordable = float(np.prod(upper - lower) / DRAWING.window_cells) ** (1 / self.dimension)
@@ -147,8 +146,8 @@ def close_pairs(points: Floats, variance: float) -> Indices:
     """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
     if len(points) ** 2 <= DRAWING.few_pairs:
         return all_pairs(len(points))
-    pairs = cKDTree(points).query_pairs(DRAWING.overlap * np.sqrt(variance), output_type="ndarray")
-    return np.asarray(pairs, dtype=np.intp)
+    reach = np.sqrt(2 * DRAWING.negligible * variance)
+    return np.asarray(cKDTree(points).query_pairs(reach, output_type="ndarray"), dtype=np.intp)
 
 
 @lru_cache

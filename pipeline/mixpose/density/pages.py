@@ -60,8 +60,8 @@ class Pages:
 
     def __init__(self, plane: Plane, sensors: int) -> None:
         self.plane = plane
-        # number of the page of each square of a plane (L * squares,), plane after plane and row by
-        # row; 0 where there is nothing, negative where nothing was looked up yet
+        # (L * squares,) number of each page, plane after plane and row by row; 0 where there is
+        # nothing, negative where nothing was looked up yet
         self.table = np.full(sensors * plane.squares, -1, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
         side = plane.page + RIM

@@ -58,11 +58,6 @@ class DrawingRules:
     )
 
     @property
-    def overlap(self) -> float:
-        """Standard deviations beyond which two features do not overlap."""
-        return math.sqrt(2 * self.negligible)
-
-    @property
     def widest(self) -> float:
         """Extent of features over the narrowest blur that the pages of a plane hold."""
         return math.sqrt(2 * self.held) * self.tile / self.steps_per_sigma

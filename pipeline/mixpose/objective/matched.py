@@ -217,9 +217,8 @@ def matched_objective(
     """Build the matched objective of views that are not empty.
 
     With features of standard deviations `sigmas`, by view and in sensor units, and as many cells of
-    C per standard deviation; None: fine for grey values at σ_ε.  Or on densities that are `shared`
-    by bodies, at σ_ε, where views hold parts of what was drawn: the body's own detections, and
-    others only where they are out of its reach.
+    C per standard deviation; None: fine for grey values at σ_ε.  On densities that are `shared`, at
+    σ_ε, views hold the body's own detections, and others only where they are out of its reach.
     """
     observations = [view.observation for view in views]
     pairs = list(zip(observations, sigmas, strict=True))

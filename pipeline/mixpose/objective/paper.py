@@ -160,9 +160,8 @@ class _AffineMaps:
         middle = by_pose[..., 3].reshape(16, -1).copy()
         if offsets.any():
             parts.append(offsets)
-            in_world = np.zeros((4, 4, len(P), 3))
-            in_world[3, 3] = P[:, :3]
-            by_pose = np.concatenate([by_pose, in_world], axis=3)
+            by_pose = np.pad(by_pose, [(0, 0), (0, 0), (0, 0), (0, 3)])
+            by_pose[3, 3, :, 4:] = P[:, :3]
         self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
         lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
         self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
