@@ -346,7 +346,7 @@ def test_detections_far_outside_neither_take_memory_nor_hide_the_others() -> Non
         np.testing.assert_allclose(value, expected, rtol=4 * spline_error(STEPS_PER_SIGMA, THIRD))
         many, _ = looked_up(atlas, np.tile(near, (MOST_OWN, 1)))
         np.testing.assert_allclose(many[: len(near)], value, rtol=1e-5)
-        assert len(atlas.pages.table) < 1.1 * DRAWING.pages
+        assert len(atlas.pages.table) < 1.1 * DRAWING.held
         assert atlas.values.nbytes < 2e6
     several = points_only(rng.uniform(-1e7, 1e7, (20, 2)), STEPS_PER_SIGMA)
     looked_up(several, np.tile(near, (MOST_OWN, 1)))

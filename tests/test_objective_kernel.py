@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from rounding import rounding
 
 from mixpose.density import peak
-from mixpose.objective.kernel import Match, overlaps, slopes
-from mixpose.objective.projection import Projected
+from mixpose.objective import Match
+from mixpose.objective.matched import overlaps, slopes
 from mixpose.optimise import Quadratic
 
 Floats = NDArray[np.float64]
@@ -51,8 +51,8 @@ class Scene:
         bells = np.exp(-0.5 * (away**2).sum(axis=4) / v) * TOPS[..., None, None]
         slope = (bells[..., None] * away).sum(axis=3) / v
         sampled = np.concatenate([bells.sum(axis=3)[..., None], slope], axis=3)
-        at = Projected(y, J, seen, seen, weights)
-        return Match(at, sampled, overlaps(y, weights, VARIANCES, TOPS))
+        over = overlaps(y, weights, VARIANCES, TOPS)
+        return Match(y, J, seen, seen, weights, sampled, *over)
 
     def slopes(self, twists: Floats) -> Quadratic:
         return slopes(self.at(twists), VARIANCES, TOPS, SCALES)
@@ -125,8 +125,8 @@ def test_poses_of_which_some_have_overlapping_features_are_what_they_are_one_by_
     several = np.zeros((2, 6))
     onto = scene.places[0, 1] - scene.places[0, 0]
     several[1] = np.linalg.pinv(scene.J[0, 0] - scene.J[0, 1]) @ onto
-    assert len(scene.at(several[:1])[2].pairs) == 0
-    assert len(scene.at(several[1:])[2].pairs) > 0
+    assert len(scene.at(several[:1]).pairs) == 0
+    assert len(scene.at(several[1:]).pairs) > 0
     together = scene.slopes(several)
     for k in range(2):
         alone = scene.slopes(several[k : k + 1])
@@ -152,28 +152,27 @@ def test_at_a_pose_that_fits_exactly_the_curvature_is_the_hessian(spacing: float
 
 def test_the_norm_counts_every_pair_of_features_that_overlap() -> None:
     scene = Scene(3.0)
-    at, _, over = scene.at(twists(2))
+    at = scene.at(twists(2))
     away = at.y[:, :, :, None] - at.y[:, :, None]
     bells = np.exp(-0.5 * (away**2).sum(axis=4) / VARIANCES[..., None, None])
     expected = np.einsum("lhi,lhj,lhij->lh", at.weights, at.weights, bells) * TOPS
     # pairs with less than e⁻¹⁶ of a peak are left out
-    np.testing.assert_allclose(over.norm, expected, rtol=1e-6)
+    np.testing.assert_allclose(at.norm, expected, rtol=1e-6)
 
 
 def test_features_that_are_not_seen_neither_count_nor_pull() -> None:
     # hidden features sit together far outside, with weight 0
     scene = Scene(60.0)
-    at, sampled, _ = scene.at(np.zeros((1, 6)))
+    at = scene.at(np.zeros((1, 6)))
     y, J, weights = at.y.copy(), at.J.copy(), at.weights.copy()
     seen = at.seen.copy()
     y[:, :, 4:], J[:, :, 4:], weights[:, :, 4:], seen[:, :, 4:] = -1e6, 0.0, 0.0, False
-    fewer = Projected(y, J, seen, seen, weights)
-    met = Match(fewer, sampled, overlaps(y, weights, VARIANCES, TOPS))
+    over = overlaps(y, weights, VARIANCES, TOPS)
+    met = Match(y, J, seen, seen, weights, at.sampled, *over)
     found = slopes(met, VARIANCES, TOPS, SCALES)
-    some = Projected(
-        at.y[:, :, :4], at.J[:, :, :4], at.seen[:, :, :4], at.faced[:, :, :4], at.weights[:, :, :4]
-    )
-    met = Match(some, sampled[:, :, :4], overlaps(some.y, some.weights, VARIANCES, TOPS))
+    some = at.of(slice(None), 4)
+    over = overlaps(some.y, some.weights, VARIANCES, TOPS)
+    met = Match(*some[:6], *over)
     expected = slopes(met, VARIANCES, TOPS, SCALES)
     for one, other in zip(found[:3], expected[:3], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=rounding(1))
@@ -181,11 +180,11 @@ def test_features_that_are_not_seen_neither_count_nor_pull() -> None:
 
 def test_a_sensor_that_sees_no_feature_adds_nothing() -> None:
     scene = Scene(60.0)
-    at, sampled, _ = scene.at(np.zeros((1, 6)))
+    at = scene.at(np.zeros((1, 6)))
     weights = at.weights.copy()
     weights[1] = 0.0
     over = overlaps(at.y, weights, VARIANCES, TOPS)
-    met = Match(at._replace(weights=weights), sampled, over)
+    met = Match(*at[:4], weights, at.sampled, *over)
     blind = slopes(met, VARIANCES, TOPS, SCALES)
     alone = slopes(scene.at(np.zeros((1, 6))), VARIANCES, TOPS, SCALES * [[1], [0]])
     for one, other in zip(blind[:3], alone[:3], strict=True):

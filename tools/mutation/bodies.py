@@ -123,8 +123,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-damps-less-after-failure",
         "optimise/ascent.py",
-        "max(10 * own[k], options.held_back)",
-        "max(0.1 * own[k], options.held_back)",
+        "max(10 * self._damping[k], options.held_back)",
+        "max(0.1 * self._damping[k], options.held_back)",
         "a step that led astray is tried again for ever",
     ),
     Mutant(
@@ -137,8 +137,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-any-hessian",
         "optimise/ascent.py",
-        "definite = [_is_definite(one) for one in hessian - lowest]",
-        "definite = [True for _ in hessian - lowest]",
+        "len(one) > 0 and dpotrf(one)[1] == 0 for one",
+        "True for one",
         "where the Hessian is not definite the step leads to a saddle or a minimum",
     ),
     Mutant(
@@ -158,8 +158,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-flat-directions-are-singular",
         "optimise/ascent.py",
-        "* 1e-12 * damping + float(_ROUNDING.tiny)",
-        "* 0.0",
+        "_TINY + max(diagonal.tolist(), default=0.0) * 1e-12 * damping",
+        "0.0",
         "a direction without curvature ends the run with an error",
     ),
     Mutant(

@@ -8,7 +8,7 @@ _ATLAS = (
     Mutant(
         "density-second-detection-of-a-tile-lost",
         "density/atlas.py",
-        "place = np.arange(len(of)) - np.searchsorted(of, of)",
+        "place = np.arange(len(of)) - of.searchsorted(of)",
         "place = np.zeros_like(of)",
         "of two detections on one tile only one is there",
     ),
@@ -57,8 +57,8 @@ _ATLAS = (
     Mutant(
         "density-tiles-that-are-left",
         "density/atlas.py",
-        "<= 0.5 * DRAWING.tile",
-        "<= 2.0 * DRAWING.tile",
+        "> 0.5 * self.tile",
+        "> 2.0 * self.tile",
         "a fit that goes on by some pixels looks up what another feature has",
     ),
     Mutant(
@@ -80,28 +80,28 @@ _ATLAS = (
 _BLUR = (
     Mutant(
         "density-noise-cancels-itself",
-        "density/blur.py",
+        "density/grid.py",
         "absolute = float(np.abs(pattern.values).sum(dtype=np.float64))",
         "absolute = float(pattern.values.sum(dtype=np.float64))",
         "a profile whose noise sums to about zero is normalised by about zero",
     ),
     Mutant(
         "density-blocks-blur-once-more",
-        "density/blur.py",
+        "density/grid.py",
         "left = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))",
         "left = sigma",
         "wide blurs of grey values are wider than said",
     ),
     Mutant(
         "density-blocks-half-a-pixel-aside",
-        "density/blur.py",
+        "density/grid.py",
         "(factor - 1) / 2 * pattern.step",
         "factor / 2 * pattern.step",
         "coarse blurs of grey values are half a pixel aside",
     ),
     Mutant(
         "density-slope-of-a-blur-turned-round",
-        "density/blur.py",
+        "density/grid.py",
         "values * away * np.float32(-1.0 / sigma)",
         "values * away * np.float32(1.0 / sigma)",
         "gradients of grey values have the wrong sign",
@@ -129,15 +129,15 @@ _BLUR = (
     ),
     Mutant(
         "density-pairs-overlap-once",
-        "density/overlap.py",
+        "density/observation.py",
         "+ 2 * cross)",
         "+ cross)",
         "detections side by side have too little energy",
     ),
     Mutant(
         "density-overlap-ends-early",
-        "density/overlap.py",
-        "DRAWING.overlap * np.sqrt(variance)",
+        "density/observation.py",
+        "np.sqrt(2 * DRAWING.negligible * variance)",
         "2.0 * np.sqrt(variance)",
         "bodies of many features have too little energy where features lie close",
     ),

@@ -1,52 +1,32 @@
-"""What one sensor observed, as densities at any blur.
+"""What one sensor observed, as densities at any blur, and inner products of Gaussian mixtures.
 
-Two densities are made of a pattern g0 whose features have standard deviation σ after blurring:
-
-* g = g0 * ε, the paper's observation density;
-* C, g blurred once more by σ, whose samples are inner products ⟨g, N(p, σ²)⟩ of the observation
-  with a predicted feature of the same width.
+Of a pattern g0 whose features have standard deviation σ after blurring these are g = g0 * ε, the
+paper's observation density, and C, g blurred once more by σ, whose samples are inner products
+⟨g, N(p, σ²)⟩ with a predicted feature of the same width.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas
-from mixpose.density.blur import is_empty, odd_factor, render
-from mixpose.density.grid import Density, Window
-from mixpose.density.overlap import self_overlap
+from mixpose.density.grid import Density, Window, is_empty, odd_factor, render
 from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Mask, Pattern, PointPattern
+from mixpose.records import Floats, Indices, Mask, Pattern, PointPattern, Singles
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A feature pattern with what is known about its blur.
+    """A feature pattern with what is known about its blur, in sensor units."""
 
-    Attributes
-    ----------
-    pattern : PointPattern or GridPattern
-        g0 in sensor coordinates.
-    sigma : float
-        σ_ε, the finest standard deviation of a feature, in sensor units.
-    intrinsic : float
-        Standard deviation that features have in the pattern already: 0 for detections, σ_ε for
-        a simulated measurement that is a density itself.
-
-    Raises
-    ------
-    ValueError
-        If sigma is not greater than 0.
-    """
-
-    pattern: Pattern
-    sigma: float
-    intrinsic: float = 0.0
+    pattern: Pattern  # g0 in sensor coordinates
+    sigma: float  # σ_ε, the finest standard deviation of a feature
+    intrinsic: float = 0.0  # the same in the pattern already: σ_ε of simulated densities
 
     def __post_init__(self) -> None:
         if not 0 < self.sigma < np.inf:
@@ -78,16 +58,17 @@ class Observation:
     @property
     def cells(self) -> int:
         """Number of cells, or of detections."""
-        if isinstance(self.pattern, PointPattern):
-            return len(self.pattern.points)
-        return int(self.pattern.values.size)
+        return self._amounts.size
 
     @property
     def weight(self) -> float:
         """Sum of all weights or values."""
+        return float(self._amounts.sum())
+
+    @property
+    def _amounts(self) -> Floats | Singles:
         pattern = self.pattern
-        values = pattern.weights if isinstance(pattern, PointPattern) else pattern.values
-        return float(values.sum())
+        return pattern.weights if isinstance(pattern, PointPattern) else pattern.values
 
     @cached_property
     def is_empty(self) -> bool:
@@ -116,7 +97,7 @@ class Observation:
         """Make g with features of standard deviation sigma, on a window over the box `within`."""
         window = self._window(sigma, within)
         rendered = render(self.pattern, self.blur(sigma), window, gradient=gradient)
-        return Density(rendered.values, window, sigma)
+        return replace(rendered, sigma=sigma)
 
     def blur(self, sigma: float, *, matched: bool = False) -> float:
         """Blur of the pattern that gives features a standard deviation, once or for C."""
@@ -145,8 +126,7 @@ class Observation:
 
     def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
         """A window over the box, fine enough for the blur and within the budget of cells."""
-        margin = DRAWING.cut * feature_sigma
-        near, far = self.extent
+        (near, far), margin = self.extent, DRAWING.cut * feature_sigma
         lower = np.maximum(within[0], near - margin)
         upper = np.maximum(np.minimum(within[1], far + margin), lower)
         affordable = float(np.prod(upper - lower) / DRAWING.window_cells) ** (1 / self.dimension)
@@ -163,15 +143,36 @@ class Observation:
 def matched_atlas(
     observations: Sequence[Observation], sigmas: Sequence[float], steps_per_sigma: float
 ) -> Atlas:
-    """C of several sensors, none of which is empty.
-
-    Parameters
-    ----------
-    observations : sequence of Observation
-    sigmas : sequence of float
-        Standard deviation of a feature, per sensor, in sensor units.
-    steps_per_sigma : float
-        Cells per standard deviation of C.
-    """
+    """C of several sensors, none of which is empty, with features of standard deviations sigmas."""
     blurs = [o.blur(sigma, matched=True) for o, sigma in zip(observations, sigmas, strict=True)]
     return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)
+
+
+def peak(variance: float, dimension: int) -> float:
+    """Value of an isotropic Gaussian density at its centre."""
+    return float((2 * np.pi * variance) ** (-dimension / 2))
+
+
+def close_pairs(points: Floats, variance: float) -> Indices:
+    """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
+    if len(points) ** 2 <= DRAWING.few_pairs:
+        return all_pairs(len(points))
+    reach = np.sqrt(2 * DRAWING.negligible * variance)
+    return np.asarray(cKDTree(points).query_pairs(reach, output_type="ndarray"), dtype=np.intp)
+
+
+@lru_cache
+def all_pairs(count: int) -> Indices:
+    """Pairs i < j (P, 2) of as many points."""
+    pairs = np.stack(np.triu_indices(count, 1), axis=1)
+    pairs.flags.writeable = False
+    return pairs
+
+
+def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
+    """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
+    pairs = close_pairs(points, variance)
+    away = points[pairs[:, 0]] - points[pairs[:, 1]]
+    bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
+    cross = float(np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells))
+    return (float(weights @ weights) + 2 * cross) * peak(variance, points.shape[1])

@@ -12,16 +12,20 @@ from mixpose.density.grid import FAR
 from mixpose.density.rules import DRAWING
 from mixpose.records import Floats, Indices, Singles
 
-RIM = 3
-"""Cells along a tile beside those whose places may be looked up: a spline reaches beyond."""
+RIM = 3  # cells along a tile beside those looked up, which a spline reaches: one before, two after
+
+
+def middles_of(numbers: Indices, columns: int, side: int) -> Floats:
+    """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
+    return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
 
 
 class Plane(NamedTuple):
-    """The plane of every sensor: origin in cells, pages along u and v, and cells along a page."""
+    """The plane of every sensor."""
 
-    origin: Floats
-    shape: tuple[int, int]
-    page: int
+    origin: Floats  # (2,) in cells
+    shape: tuple[int, int]  # pages along u and v
+    page: int  # cells along a page
 
     @property
     def squares(self) -> int:
@@ -30,20 +34,16 @@ class Plane(NamedTuple):
 
     @classmethod
     def of(cls, q: Floats, corners: Sequence[Floats], page: int, reach: float) -> Plane:
-        """A plane that holds detections (D, 2), and corners (2, 2) of grids, of all sensors.
-
-        In cells.  There is a rim of pages with nothing.
-        """
+        """For detections (D, 2), corners (2, 2) of grids, in cells; with a rim of empty pages."""
         grids = np.concatenate([np.zeros((0, 2)), *corners])
         places = q if len(q) else grids
         lower, upper = places.min(axis=0), places.max(axis=0)
-        if len(q) and _count(lower, upper, page) > DRAWING.pages:
-            middle, half = np.median(q, axis=0), page * math.sqrt(DRAWING.pages) / 2.5
+        if len(q) and _count(lower, upper, page) > DRAWING.held:
+            middle, half = np.median(q, axis=0), page * math.sqrt(DRAWING.held) / 2.5
             lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
         if corners:
-            lower = np.minimum(lower, grids.min(axis=0))
-            upper = np.maximum(upper, grids.max(axis=0))
-            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.pages), 1.0))
+            lower, upper = np.minimum(lower, grids.min(0)), np.maximum(upper, grids.max(0))
+            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.held), 1.0))
         # half a cell is left, lest rounding puts a place on a page of the rim
         origin = page * np.floor((lower - (reach + page + 0.5)) / page)
         columns, rows = ((upper - lower + 2 * reach) / page).tolist()
@@ -52,25 +52,16 @@ class Plane(NamedTuple):
 
 def _count(lower: Floats, upper: Floats, page: int) -> float:
     """Pages of a box in cells, about."""
-    columns, rows = ((upper - lower) / page + 5).tolist()
-    return float(columns * rows)
+    return float(((upper - lower) / page + 5).prod())
 
 
 class Pages:
-    """Pages of L sensors that were drawn so far, in one array.
-
-    Attributes
-    ----------
-    plane : Plane
-    table : (L * squares,) int32
-        Number of the page of each square of a plane, plane after plane and row by row; 0 where
-        there is nothing, negative where nothing was looked up yet.
-    values : (rows, columns, 3) float32
-        Pages with one cell more on every side, which look-ups reach.
-    """
+    """Pages of L sensors that were drawn so far, in one array."""
 
     def __init__(self, plane: Plane, sensors: int) -> None:
         self.plane = plane
+        # (L * squares,) number of each page, plane after plane and row by row; 0 where there is
+        # nothing, negative where nothing was looked up yet
         self.table = np.full(sensors * plane.squares, -1, dtype=np.int32)
         self._first = plane.squares * np.arange(sensors)[:, None, None]
         side = plane.page + RIM
@@ -82,7 +73,7 @@ class Pages:
 
     @property
     def values(self) -> Singles:
-        """The array that pages lie in."""
+        """The array (rows, columns, 3) that pages lie in."""
         rows, side, columns, _ = self._room.shape
         return self._room.reshape(rows * side, columns * side, 3)
 
@@ -91,8 +82,7 @@ class Pages:
     ) -> None:
         """Turn places (L, H, n, 2) in cells into those in `values`, in place.
 
-        Of sensors (P,) and the middles (P, 2) of pages `draw` tells those on which there is
-        something, and what is on them, (F, side, 3 side).
+        Of pages, by sensors (P,) and middles (P, 2), `draw` gives those with something, and that.
         """
         plane = self.plane
         index -= plane.origin
@@ -102,8 +92,9 @@ class Pages:
         squares = columns_rows @ np.array([1, plane.shape[0]]) + self._first
         number = self.table[squares]
         if number.min(initial=0) < 0:
-            pending = np.unique(squares[number < 0])
-            for some in np.array_split(pending, -(-len(pending) // DRAWING.pages_at_once)):
+            pending, at_once = np.unique(squares[number < 0]), DRAWING.held // plane.page**2
+            for first in range(0, len(pending), at_once):
+                some = pending[first : first + at_once]
                 sensors, place = np.divmod(some, plane.squares)
                 rows, columns = np.divmod(place, plane.shape[0])
                 middles = plane.page * (np.stack([columns, rows], axis=1) + 0.5)
@@ -114,24 +105,18 @@ class Pages:
         index += self._shifts[number]
 
     def _kept(self, pages: Singles, middles: Floats) -> Indices:
-        """Numbers of pages (F, side, 3 side) that are put into the array.
-
-        Middles (F, 2) are in cells from the origin of the plane.
-        """
+        """Numbers of pages (F, side, 3 side) around places (F, 2) that are put into the array."""
         rows, side, columns, _ = self._room.shape
         numbers = np.arange(self._drawn, self._drawn + len(pages))
         self._drawn += len(pages)
         if self._drawn > rows * columns:
-            # so large that allocators keep it from frame to frame; memory that is not written to
-            # is free
+            # so large that allocators keep it; memory that is not written to is free
             most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
             room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
             room[:rows] = self._room
             shifts = np.empty((most * columns, 2))
             shifts[: len(self._shifts)] = self._shifts
             self._room, self._shifts = room, shifts
-        row, column = np.divmod(numbers, columns)
-        self._room[row, :, column] = pages
-        corners = np.stack([column, row], axis=1) * side
-        self._shifts[numbers] = corners + 0.5 * (side - 1) - middles
+        self._room[numbers // columns, :, numbers % columns] = pages
+        self._shifts[numbers] = middles_of(numbers, columns, side) - middles
         return numbers

@@ -173,9 +173,6 @@ def fit_together(
     begun: list[tuple[MatchedObjective, Ascent] | None] = []
     for k, objective in enumerate(joint.seen(objectives, ends.states)):
         own = ends.of(slice(k, k + 1))
-        assert objective.at_hand is not None
-        last = own.last._replace(source=objective.at_hand[1])
-        own = own._replace(last=last, steps=np.zeros((1, 6)))
         is_near = here.value[k] >= rules.near * len(objective.views)
         begun.append((objective, own) if is_near else None)
     return begun

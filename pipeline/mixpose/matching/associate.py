@@ -54,11 +54,11 @@ def associate(
 ) -> Matches:
     """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
     match, views = objective.match(T_world_object[None]), objective.views
-    at, dimensions, body = match.at, objective.projection.dimensions, objective.projection.body
-    y, seen, weights, J = at.y[:, 0], at.seen[:, 0], at.weights[:, 0], at.J[:, 0]
+    dimensions, body = objective.projection.dimensions, objective.projection.body
+    y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
     sigmas, detections = np.array([view.observation.sigma for view in views]), _detections(views)
     product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
-    explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.over.norm[:, 0])
+    explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = np.broadcast_to(objective.variances, seen.shape)
     if body.spread:  # variances along an axis by which features may be off
         spreads = body.node_spreads(T_world_object)
@@ -70,7 +70,7 @@ def associate(
     _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
-        of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.over.norm[k, 0])
+        of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m] = _residuals(
             *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
@@ -89,7 +89,7 @@ def associate(
         J=J,
         detections=by,
         explained=np.minimum(explained, 1.0),
-        unseen=(body.nodes.weights * (at.faced[:, 0] & ~seen)).sum(axis=1),
+        unseen=(body.nodes.weights * (match.faced[:, 0] & ~seen)).sum(axis=1),
         merged=np.bincount(paired[0], minlength=len(views)) // 2,
         count=count,
         crowd=crowd,

@@ -1,44 +1,26 @@
 """Objectives of the pose: the matched one, the paper's, and the product of independent ones."""
 
-from __future__ import annotations
-
-from mixpose.objective.amplitudes import AmplitudesObjective
-from mixpose.objective.base import Objective, View
-from mixpose.objective.build import OBJECTIVES, ObjectiveName, build_objective
-from mixpose.objective.kernel import Match
-from mixpose.objective.matched import MatchedObjective, SharedDensities, matched_objective
-from mixpose.objective.normal_prior import NormalPrior
-from mixpose.objective.paper import IndependentObjective, PaperObjective, sampled_terms
-from mixpose.objective.projection import (
-    BodyProjection,
-    Projected,
-    in_image,
-    pose_jacobian,
-    project_body,
+from mixpose.objective.amplitudes import AmplitudesObjective as AmplitudesObjective
+from mixpose.objective.base import NormalPrior as NormalPrior, Objective as Objective, View as View
+from mixpose.objective.matched import (
+    MatchedObjective as MatchedObjective,
+    SharedDensities as SharedDensities,
+    matched_objective as matched_objective,
+    together as together,
 )
-from mixpose.objective.together import BodiesObjective, can_be_together, together
-
-__all__ = [
-    "OBJECTIVES",
-    "AmplitudesObjective",
-    "BodiesObjective",
-    "BodyProjection",
-    "IndependentObjective",
-    "Match",
-    "MatchedObjective",
-    "NormalPrior",
-    "Objective",
-    "ObjectiveName",
-    "PaperObjective",
-    "Projected",
-    "SharedDensities",
-    "View",
-    "build_objective",
-    "can_be_together",
-    "in_image",
-    "matched_objective",
-    "pose_jacobian",
-    "project_body",
-    "sampled_terms",
-    "together",
-]
+from mixpose.objective.paper import (
+    OBJECTIVES as OBJECTIVES,
+    IndependentObjective as IndependentObjective,
+    ObjectiveName as ObjectiveName,
+    PaperObjective as PaperObjective,
+    build_objective as build_objective,
+    sampled_terms as sampled_terms,
+)
+from mixpose.objective.projection import (
+    BodyProjection as BodyProjection,
+    Match as Match,
+    can_be_together as can_be_together,
+    in_image as in_image,
+    pose_jacobian as pose_jacobian,
+    project_body as project_body,
+)

@@ -7,33 +7,20 @@ b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 
 where P takes the mean off and λ = N / (s a)² for noise N of cells, relative spread s and common
-amplitude a.  Under much noise α are equal and Q is the matched kernel; under little they are free.
-As α are at their maximum, the gradient is that at fixed α; the curvature is Gauss-Newton's of the
-residual g − Σ_i α_i h_i with α solved for (variable projection).
+amplitude a.  As α are at their maximum, the gradient is that at fixed α; the curvature is
+Gauss-Newton's of the residual g − Σ_i α_i h_i with α solved for (variable projection).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.objective.matched import MatchedObjective
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats
-
-
-class _Mixture(NamedTuple):
-    """The n features that a sensor of m coordinates sees, and their amplitudes."""
-
-    alpha: Floats  # (n,)
-    b: Floats  # (n,)
-    B: Floats  # (n, n)
-    inner: Floats  # (n, n) B + λP
-    pull: Floats  # (n, m) ∇b
-    away: Floats  # (n, n, m) p_i − p_j
-    J: Floats  # (n, m, 6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,53 +38,44 @@ class AmplitudesObjective:
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and curvature at one pose (4, 4)."""
         value, gradient, curvature = 0.0, np.zeros(6), np.zeros((6, 6))
-        for k, one in enumerate(self._mixtures(T_world_object)):
+        for k, (a, B, inner, C, away, J) in enumerate(self._mixtures(T_world_object)):
             v, scale = float(self.matched.variances[k, 0]), 0.5 / float(self.noise[k])
-            alpha, n = one.alpha, len(one.alpha)
-            bells = alpha[:, None] * one.B * alpha
-            pull = alpha[:, None] * one.pull + (bells[..., None] * one.away).sum(axis=1) / v
-            J = one.J.reshape(-1, 6)
-            value += scale * float(alpha @ one.b)
+            alpha, (n, _, m) = a[:, None], away.shape
+            bells = alpha * B * a
+            pull = alpha * C[:, 1:] + (bells[..., None] * away).sum(axis=1) / v
+            value += scale * float(a @ C[:, 0])
             gradient += 2 * scale * (pull.ravel() @ J)
             # ⟨∂h_i, ∂h_jᵀ⟩, and ⟨∂h_i, h_j⟩
-            outer = one.away[..., :, None] * one.away[..., None, :] / v
-            m = one.away.shape[2]
+            outer = away[..., :, None] * away[..., None, :] / v
             gram = (bells / v)[..., None, None] * (np.eye(m) - outer)
             gram = gram.swapaxes(1, 2).reshape(n * m, n * m)
-            cross = -((alpha[:, None] * one.B / v)[..., None] * one.away).swapaxes(1, 2)
+            cross = -((alpha * B / v)[..., None] * away).swapaxes(1, 2)
             mixed = cross.reshape(n * m, n).T @ J
-            solved = np.linalg.solve(one.inner, mixed)
+            solved = np.linalg.solve(inner, mixed)
             curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
         return value, gradient, curvature
 
     def unexplained(self, T_world_object: Floats) -> Floats:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
-        energies = self.matched.energies[:, 0]
-        explained = [
-            2 * float(one.alpha @ one.b) - float(one.alpha @ one.B @ one.alpha)
-            for one in self._mixtures(T_world_object)
-        ]
-        return np.asarray(energies - np.array(explained))
+        parts = self._mixtures(T_world_object)
+        explained = [a @ (2 * C[:, 0] - B @ a) for a, B, _, C, _, _ in parts]
+        return np.asarray(self.matched.energies[:, 0] - np.array(explained))
 
-    def _mixtures(self, T_world_object: Floats) -> list[_Mixture]:
-        at, sampled, over = self.matched.match(T_world_object[None])
-        found = []
+    def _mixtures(self, T_world_object: Floats) -> Iterator[tuple[Floats, ...]]:
+        """By sensor α (n,), B, B + λP (n, n), b, ∇b (n, 1 + m), p_i − p_j (n, n, m), J (n m, 6)."""
+        match = self.matched.match(T_world_object[None])
         for k, m in enumerate(self.matched.projection.dimensions.tolist()):
-            seen = np.flatnonzero(at.weights[k, 0] > 0)
-            w, y = at.weights[k, 0, seen], at.y[k, 0, seen, :m]
-            C = w[:, None] * sampled[k, 0, seen, : 1 + m]
+            seen = np.flatnonzero(match.weights[k, 0] > 0)
+            w, y = match.weights[k, 0, seen], match.y[k, 0, seen, :m]
+            C = w[:, None] * match.sampled[k, 0, seen, : 1 + m]
             away = y[:, None] - y[None]
             v, top = float(self.matched.variances[k, 0]), float(self.matched.tops[k, 0])
             B = top * np.outer(w, w) * np.exp(-0.5 * (away * away).sum(axis=2) / v)
-            common = max(float(C[:, 0].sum()), 0.0) / float(over.norm[k, 0])
-            # bounded, so that features at one place are told apart by nothing
+            common = max(float(C[:, 0].sum()), 0.0) / float(match.norm[k, 0])
+            # bounded, as features at one place, and what is not seen, tell nothing of amplitudes
             least = 1e-9 * top * float(w @ w)
-            # and where nothing is seen, amplitudes are as good as one
             squares = max((self.spread * common) ** 2, 1e-300)
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
-            inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1))
-            inner += least * np.eye(len(w))
+            inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
             alpha = np.linalg.solve(inner, C[:, 0])
-            J = at.J[k, 0, seen, :m]
-            found.append(_Mixture(alpha, C[:, 0], B, inner, C[:, 1:], away, J))
-        return found
+            yield alpha, B, inner, C, away, match.J[k, 0, seen, :m].reshape(-1, 6)

@@ -1,7 +1,6 @@
-"""What an objective is, and what it knows of each sensor.
+"""What an objective is, what it knows of each sensor, and what is known of a pose before.
 
-An objective maps poses to numbers to be maximised: a term with values of its own.  Order and axes
-of the six numbers that a pose is moved by are those of `mixpose.rigid`.
+Order and axes of the six numbers that a pose is moved by are those of `mixpose.rigid`.
 """
 
 from __future__ import annotations
@@ -12,8 +11,9 @@ from typing import Protocol
 import numpy as np
 
 from mixpose.density import Observation
-from mixpose.optimise import Quadratic
-from mixpose.records import Floats
+from mixpose.optimise import Quadratic, Term
+from mixpose.records import Floats, Mask
+from mixpose.rigid import perturb, twist_between
 from mixpose.sensors import Sensor
 
 
@@ -32,23 +32,39 @@ class View:
     doubts: tuple[Sensor, ...] = ()
 
 
-class Objective(Protocol):
-    """A function of the pose, to be maximised."""
+class Objective(Term, Protocol):
+    """A function of the pose, to be maximised: a term with values of its own."""
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
         ...
 
-    def linearise(self, T_world_object: Floats) -> Quadratic:
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """Logarithm of a normal distribution of the pose, without its constant."""
+
+    T_world_object: Floats  # (4, 4) its mean
+    uncertainty: Floats  # (6,) standard deviations, lengths and radians; positive where free
+    free: Mask  # (6,) directions in which the pose may change
+
+    def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
-        ...
+        information = np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)
+        away = twist_between(self.T_world_object, poses)
+        pull = -information * away
+        C = np.broadcast_to(np.diag(information), (len(poses), 6, 6))
+        return Quadratic(0.5 * (away * pull).sum(axis=1), pull, C, C)
+
+    def points(self) -> Floats:
+        """The mean, and √k standard deviations to either side along each of k directions."""
+        count = int(self.free.sum())
+        steps = np.sqrt(count) * np.diag(np.where(self.free, self.uncertainty, 0.0))[self.free]
+        twists = np.concatenate([np.zeros((1, 6)), np.stack([steps, -steps], 1).reshape(-1, 6)])
+        return perturb(self.T_world_object, twists)
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
-    """Box (lower, upper) around visible points (n, m), at least one, within the sensor.
-
-    The margin, in sensor units, is added on every side.
-    """
-    lower = np.maximum(y.min(axis=0) - margin, sensor.lower)
-    upper = np.minimum(y.max(axis=0) + margin, sensor.upper)
-    return lower, upper
+    """Box (lower, upper) with a margin around visible points (n, m), within the sensor."""
+    lower, upper = y.min(axis=0) - margin, y.max(axis=0) + margin
+    return np.maximum(lower, sensor.lower), np.minimum(upper, sensor.upper)

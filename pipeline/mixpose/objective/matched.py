@@ -2,48 +2,132 @@
 
 For sensor l let g be the observed density and h_β the predicted one, a mixture of the projected
 features with the observation's own blur σ.  The share of g that h_β explains once its amplitude
-is solved for (variable projection) is
+is solved for (variable projection) is S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩), and the objective
+is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred once more by σ: an
+image, drawn once and looked up with `cv2.remap`.
 
-    S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩),
+With c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
+amplitude a = c / n that fits h to g best,
 
-and the objective is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred
-once more by σ: an image, drawn once and looked up with `cv2.remap`.  Nothing is sampled at random.
+    S = c a,     ∇S = 2 a (∇c − a ∇n / 2).
+
+Steps are taken by curvatures that are never negative.  Where predicted features lie apart it is
+that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has
+∇C = C (y_i − p_i) / v, so that the step is that of least squares to the detections around the
+features, with weights C_i: it gets there at once from any distance, and a feature that meets none
+does not hold the others back.  Where features overlap their pulls are not their own, and the
+curvature is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import DRAWING, Atlas, matched_atlas, peak
+from mixpose.density import DRAWING, Atlas, all_pairs, close_pairs, matched_atlas, peak
 from mixpose.objective.base import View
-from mixpose.objective.kernel import Match, overlaps, slopes
-from mixpose.objective.projection import BodyProjection, project_body
+from mixpose.objective.projection import BodyProjection, Match, project_body
 from mixpose.optimise import Quadratic
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 
+_NONE = np.finfo(np.float64).tiny  # ⟨h, h⟩ of a sensor that sees no feature
 STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
-def look_up_error(steps_per_sigma: float) -> float:
-    """Of a height, what looking it up errs by along an axis: √3/216 n⁻³ of the third derivative."""
-    return 0.011 / steps_per_sigma**3
-
-
 def value_error(steps_per_sigma: float) -> float:
-    """Relative error of looked-up values: along each of two axes, and squared."""
-    return 4 * look_up_error(steps_per_sigma)
+    """Relative error of values, squares of what is looked up.
+
+    Of a height, looking it up errs by √3/216 n⁻³ of the third derivative along each of two axes.
+    """
+    return 4 * 0.011 / steps_per_sigma**3
+
+
+def overlaps(
+    y: Floats, weights: Floats, variances: Floats, tops: Floats
+) -> tuple[Floats, Indices, Floats, Floats]:
+    """⟨h, h⟩ of features y (L, H, n, 2) of weights (L, H, n), and their overlaps, as `Match` has.
+
+    `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
+    """
+    norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
+    pairs = all_pairs(n) if n * n <= DRAWING.few_pairs else _close_pairs(y, variances)
+    i, j = pairs.T
+    away = y[:, :, i] - y[:, :, j]
+    squared = away * away
+    exponents = (squared[..., 0] + squared[..., 1]) * (-0.5 / variances)[..., None]
+    overlap = exponents > -DRAWING.negligible
+    if not overlap.any():
+        return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
+    near = np.flatnonzero(overlap.any(axis=(0, 1)))
+    products = (weights[:, :, i] * weights[:, :, j])[..., near]
+    bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
+    norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
+    return norm, pairs[near], bells, away[:, :, near]
+
+
+def _close_pairs(y: Floats, variances: Floats) -> Indices:
+    """Pairs of features that may overlap at any of the poses."""
+    L, H = y.shape[:2]
+    each = [close_pairs(y[k, h], float(variances[k, 0])) for k in range(L) for h in range(H)]
+    return np.unique(np.concatenate(each), axis=0)
+
+
+def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
+    """Second-order models of Σ_l s_l c_l² / n_l at H poses.
+
+    `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
+    """
+    L, H, n = match.weights.shape
+    C = match.sampled[..., 0] * match.weights
+    pull = (match.sampled[..., 1:] * match.weights[..., None]).reshape(L, H, 1, 2 * n)
+    rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
+    product = C.sum(axis=2)
+    amplitude = product / match.norm
+    strength = 2 * scales * amplitude
+    value = (scales * product * amplitude).sum(axis=0)
+    gradient = (strength[..., None] * rest).sum(axis=0)
+    drawn = (strength / variances)[..., None] * C
+    curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
+    if len(match.pairs):
+        near = np.flatnonzero(match.bells.any(axis=(0, 2)))
+        some = match.of(near)
+        half, gram = _pair_terms(some, variances, tops)
+        level = (strength * amplitude)[:, near, None]
+        gradient[near] -= (level * half).sum(axis=0)
+        outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
+        curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
+    return Quadratic(value, gradient, curvature)
+
+
+def _pair_terms(match: Match, variances: Floats, tops: Floats) -> tuple[Floats, Floats]:
+    """⟨h, ∂h⟩ (L, H, 6) and ⟨∂h, ∂hᵀ⟩ (L, H, 6, 6)."""
+    v, (i, j) = variances[..., None], match.pairs.T
+    own = match.J * match.weights[..., None, None]
+    gram = _gram(own, own) * (tops / variances)[..., None, None]
+    J_i, J_j = match.J[:, :, i], match.J[:, :, j]
+    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", match.away, each) for each in (J_i, J_j))
+    scaled = match.bells / v
+    half = -(scaled[:, :, None] @ (along_i - along_j))[:, :, 0]
+    cross = _gram(scaled[..., None, None] * J_i, J_j)
+    cross -= ((scaled / v)[..., None] * along_i).swapaxes(2, 3) @ along_j
+    return half, gram + cross + cross.swapaxes(2, 3)
+
+
+def _gram(A: Floats, B: Floats) -> Floats:
+    """Σ_p A_pᵀ B_p (L, H, 6, 6) of A and B (L, H, P, 2, 6)."""
+    L, H, P = A.shape[:3]
+    return A.reshape(L, H, 2 * P, 6).swapaxes(2, 3) @ B.reshape(L, H, 2 * P, 6)
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedObjective:
     """Σ_l ω_l ⟨g_l, h_l⟩² / (⟨g_l, g_l⟩ ⟨h_l, h_l⟩) over the pose.
 
-    Spreads Σ_i of the body's features do not widen the prediction, as a template wider than the
-    data is biased (see `docs/method.md`).
+    Of K bodies at once (`together`), at poses (K, 4, 4).  Spreads Σ_i of features do not widen the
+    prediction, as a template wider than the data is biased (see `docs/method.md`).
     """
 
     views: tuple[View, ...]
@@ -51,8 +135,8 @@ class MatchedObjective:
     atlas: Atlas  # C of all sensors
     variances: Floats  # (L, 1) v = 2σ², of the product of two features, in squared sensor units
     tops: Floats  # (L, 1) N(0; 0, v)
-    energies: Floats  # (L, 1) ⟨g, g⟩
-    weights: Floats  # (L, 1) ω_l
+    energies: Floats  # (L, 1) ⟨g, g⟩; (L, K) of several bodies, each with its part of what is seen
+    weights: Floats  # (L, 1) ω_l; (L, K)
     # where several bodies were looked up at once: the body's pose, and what it has there
     at_hand: tuple[Floats, Match] | None = None
 
@@ -67,16 +151,15 @@ class MatchedObjective:
         With `whole`, features out of view count as predicted and not met.  Else a pose gains by
         moving features that meet nothing out of the picture.
         """
-        parts = []
-        for some in self._blocks(poses):
-            match = self.match(some)
-            own = self.shares_of(match)
+        parts = [np.zeros((len(self.views), 0))]
+        for match in map(self.match, self._blocks(poses)):
+            product, norm = (match.sampled[..., 0] * match.weights).sum(axis=2), match.norm
+            own = self.weights / self.energies * product**2 / norm
             if whole:
-                hidden = np.where(match.at.seen, 0.0, self.projection.body.nodes.weights)
-                norm = match.over.norm
+                hidden = np.where(match.seen, 0.0, self.projection.body.nodes.weights)
                 own = own * (norm / (norm + self.tops * (hidden**2).sum(axis=2)))
             parts.append(own)
-        return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.views), 0))
+        return np.concatenate(parts, axis=1)
 
     def match(self, poses: Floats) -> Match:
         """What is predicted at poses (H, 4, 4), and what is there."""
@@ -84,27 +167,27 @@ class MatchedObjective:
             return self.at_hand[1]
         at = self.projection.project(poses)
         sampled = self.atlas.look_up(at.y)
-        return Match(at, sampled, overlaps(at.y, at.weights, self.variances, self.tops))
-
-    def shares_of(self, match: Match) -> Floats:
-        """ω_l S_l (L, H), of what is predicted and found at some poses."""
-        product = (match.sampled[..., 0] * match.at.weights).sum(axis=2)
-        return np.asarray(self.weights / self.energies * product**2 / match.over.norm)
+        return Match(*at[:5], sampled, *overlaps(at.y, at.weights, self.variances, self.tops))
 
     def linearise(self, poses: Floats) -> Quadratic:
-        """Second-order models at poses (H, 4, 4); of few, with the `Match` they come from."""
-        scales = self.weights / self.energies
-        parts = [
-            slopes(self.match(some), self.variances, self.tops, scales)
-            for some in self._blocks(poses)
-        ]
+        """Second-order models at poses (H, 4, 4)."""
+        rest = self.variances, self.tops, self.weights / self.energies
+        parts = [slopes(self.match(some), *rest) for some in self._blocks(poses)]
         if len(parts) == 1:
             return parts[0]
         return Quadratic(*map(np.concatenate, zip(*(part[:3] for part in parts))))
 
+    def seen(self, objectives: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
+        """The objectives that were put `together`, with what each sees at its pose (K, 4, 4)."""
+        match = self.match(poses)
+        counts = [len(body.nodes.points) for body in self.projection.bodies]
+        parts = [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]
+        pairs = zip(objectives, poses, parts, strict=True)
+        return [replace(objective, at_hand=(T, part)) for objective, T, part in pairs]
+
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
-        rows = max(DRAWING.held // (n * min(n, 12)), 1)
+        rows = max(DRAWING.held // (n * min(n, 12)), len(self.projection.bodies))
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
@@ -118,10 +201,9 @@ class SharedDensities:
     @classmethod
     def drawn(cls, views: Sequence[View]) -> SharedDensities:
         """Draw views of detections, none of which is empty."""
-        observations = [view.observation for view in views]
-        sigmas = [one.sigma for one in observations]
-        totals = tuple(one.weight for one in observations)
-        return cls(matched_atlas(observations, sigmas, STEPS_PER_SIGMA), totals)
+        seen = [view.observation for view in views]
+        atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
+        return cls(atlas, tuple(one.weight for one in seen))
 
 
 def matched_objective(
@@ -132,30 +214,19 @@ def matched_objective(
     steps_per_sigma: float | None = None,
     shared: SharedDensities | None = None,
 ) -> MatchedObjective:
-    """Build the matched objective at given blurs.
+    """Build the matched objective of views that are not empty.
 
-    Parameters
-    ----------
-    views : sequence of View
-        Sensors whose observation is not empty.
-    body : Body
-    sigmas : sequence of float
-        Standard deviation of a feature at this level, per view, in sensor units.
-    steps_per_sigma : float or None
-        Cells per standard deviation of C; None: fine for grey values at σ_ε.
-    shared : SharedDensities or None
-        Of the same sensors at σ_ε, where each view holds a part of what was drawn: the body's
-        own detections, and others only where they are out of its reach.
+    With features of standard deviations `sigmas`, by view and in sensor units, and as many cells of
+    C per standard deviation; None: fine for grey values at σ_ε.  On densities that are `shared`, at
+    σ_ε, views hold the body's own detections, and others only where they are out of its reach.
     """
-    if steps_per_sigma is None:
-        at_last = all(
-            view.observation.cell is not None and sigma <= view.observation.sigma
-            for view, sigma in zip(views, sigmas, strict=True)
-        )
-        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
-    projection = project_body(tuple(view.sensor for view in views), body)
     observations = [view.observation for view in views]
-    energies = np.array([o.energy(sigma) for o, sigma in zip(observations, sigmas, strict=True)])
+    pairs = list(zip(observations, sigmas, strict=True))
+    if steps_per_sigma is None:
+        at_last = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
+        steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
+    projection = project_body(tuple([view.sensor for view in views]), body)
+    energies = np.array([o.energy(sigma) for o, sigma in pairs])
     variances = np.array([2 * sigma * sigma for sigma in sigmas])
     tops = np.array([peak(*one) for one in zip(variances.tolist(), projection.dimensions.tolist())])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
@@ -167,12 +238,19 @@ def matched_objective(
         atlas = shared.atlas
         parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
         energies = energies * np.square(parts)
-    return MatchedObjective(
-        views=tuple(views),
-        projection=projection,
-        atlas=atlas,
-        variances=variances[:, None],
-        tops=tops[:, None],
-        energies=energies[:, None],
-        weights=weights[:, None],
-    )
+    energies, weights = energies[:, None], weights[:, None]
+    rest = variances[:, None], tops[:, None], energies, weights
+    return MatchedObjective(tuple(views), projection, atlas, *rest)
+
+
+def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
+    """The objectives of several bodies, of bare points, on the same densities and blurs.
+
+    For a handful of features NumPy spends its time on calls, not on numbers: the poses that one
+    body is evaluated at in a batch may as well be those of several bodies, one of each.
+    """
+    bodies = [one.projection.body for one in objectives]
+    projection = project_body(objectives[0].projection.sensors, *bodies)
+    energies = np.concatenate([one.energies for one in objectives], axis=1)
+    weights = np.concatenate([one.weights for one in objectives], axis=1)
+    return replace(objectives[0], projection=projection, energies=energies, weights=weights)

@@ -1,8 +1,4 @@
-"""The paper's objectives, sampled: formula (4) and the product it warns of.
-
-* `PaperObjective`: (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)).  The product over sensors stands
-  inside, because all sensors see the same Z; with one sensor it is formula (2).
-* `IndependentObjective`: Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)), for comparison only.
+"""The paper's objectives, sampled: formula (4) and the product it warns of; objectives by name.
 
 Densities are looked up with `cv2.remap`, batched over poses.  A feature that a sensor cannot see
 has density 0 there.  Curvatures are those of mean-shift: every sample pulls with the weight of
@@ -11,22 +7,27 @@ its density, as if its feature were a Gaussian of the level's σ.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Literal, TypeAlias, get_args
 
 import cv2
 import numpy as np
 
-from mixpose.density import DRAWING, Density
-from mixpose.objective.base import View, region_of_interest
-from mixpose.objective.index_maps import ParallelMaps
+from mixpose.body import Body
+from mixpose.density import DRAWING, FAR, Density, remap
+from mixpose.objective.base import Objective, View, region_of_interest
+from mixpose.objective.matched import matched_objective
 from mixpose.objective.projection import pose_jacobian
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
-from mixpose.sensors import ParallelBeam, Sensor
+from mixpose.sensors import AffineSensor, Sensor
+
+ObjectiveName: TypeAlias = Literal["matched", "paper", "independent"]
+OBJECTIVES: tuple[ObjectiveName, ...] = get_args(ObjectiveName)
 
 
 @dataclass(frozen=True)
@@ -38,82 +39,60 @@ class SampledTerm:
 
 
 class _SampledObjective:
-    """What both objectives share: samples z_ir (N, R, 3) of every feature, and their densities.
-
-    `world_offsets` (R, 3) are displacements in the world that belong to the samples, as by gravity:
-    they do not turn with the pose.
-    """
+    """Of samples z_ir (N, R, 3), displaced in the world by offsets (R, 3), as by gravity."""
 
     def __init__(
-        self,
-        terms: Sequence[SampledTerm],
-        samples: Floats,
-        world_offsets: Floats | None = None,
+        self, terms: Sequence[SampledTerm], samples: Floats, world_offsets: Floats | None = None
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
-        self._poses_at_once = max(1, DRAWING.held // len(self.points))
-        self.offsets: Floats | None = None
+        self.offsets = np.zeros((1, 3))
         if world_offsets is not None and world_offsets.any():
             self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
-        if T_world_object.ndim == 2:
+        if T_world_object.ndim == 2:  # no time for more
             return self._values(T_world_object[None]).reshape(())
-        poses = T_world_object.reshape(-1, 4, 4)
-        starts = range(0, len(poses), self._poses_at_once)
-        values = [self._values(poses[k : k + self._poses_at_once]) for k in starts]
-        return np.concatenate([np.zeros(0), *values]).reshape(T_world_object.shape[:-2])
+        poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
+        values = [self._values(poses[k : k + at_once]) for k in range(0, len(poses), at_once)]
+        return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
+
+    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
+        """What is multiplied over sensors, (k, S) or (k, 1) each, of densities (k, S)."""
+        return densities
 
     def _values(self, poses: Floats) -> Floats:
         """Values (k,) at poses (k, 4, 4)."""
-        raise AssertionError("an objective says how sensors combine")
-
-    def _factors(self, densities: Floats) -> list[Floats]:
-        """What each sensor's density of a sample is multiplied by, (S,) each, of those (L, S)."""
-        raise AssertionError("an objective says how sensors combine")
+        product, *others = self._parts(self._densities(poses))
+        for part in others:
+            product *= part
+        return _means(product)
 
     @cached_property
     def _alone(self) -> list[Density]:
         """The densities without gradients, which values do not need."""
-        first = [np.atleast_3d(term.density.values)[..., 0] for term in self.terms]
-        return [
-            replace(term.density, values=np.ascontiguousarray(values))
-            for term, values in zip(self.terms, first, strict=True)
-        ]
+        drawn = [term.density for term in self.terms]
+        first = [np.ascontiguousarray(np.atleast_3d(one.values)[..., 0]) for one in drawn]
+        return [replace(one, values=values) for one, values in zip(drawn, first, strict=True)]
 
     @cached_property
-    def _maps(self) -> ParallelMaps | None:
-        """Where all sensors are parallel beams."""
-        sensors = [one.sensor for one in self.terms if isinstance(one.sensor, ParallelBeam)]
-        if len(sensors) < len(self.terms):
+    def _maps(self) -> _AffineMaps | None:
+        """Where no sensor has perspective."""
+        if not all(isinstance(term.sensor, AffineSensor) for term in self.terms):
             return None
-        windows = [term.density.window for term in self.terms]
-        return ParallelMaps(sensors, windows, self.points, self.offsets)
+        return _AffineMaps(self.terms, self.points, self.offsets)
 
     def _densities(self, poses: Floats) -> list[Singles]:
-        """g_l of samples, per sensor, in rows of as many for each of the poses (k, 4, 4)."""
+        """g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
         if self._maps is not None:
-            return [
-                _looked_up(g.values, u, v)
-                for g, (u, v) in zip(self._alone, self._maps(poses), strict=True)
-            ]
+            maps = self._maps.at(poses).swapaxes(0, 1)
+            pairs = zip(self._alone, maps[::2], maps[1::2], strict=True)
+            return [remap(g.values, u, v) for g, u, v in pairs]
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            points = transform(poses, self.points)
-            if self.offsets is not None:
-                points += self.offsets
+            points = transform(poses, self.points) + self.offsets
             places = [term.sensor.project(points)[0] for term in self.terms]
             return [g.sample(y) for g, y in zip(self._alone, places, strict=True)]
-
-    def _means(self, blocks: Singles, count: int) -> Floats:
-        """Means (k,) over the samples of k poses, summed in double precision."""
-        size = len(self.points)
-        if count * size == blocks.size == blocks.shape[1]:
-            return np.array([cv2.sumElems(blocks)[0] / size])
-        by_pose = blocks.reshape(count, -1)[:, :size]
-        sums = cv2.reduce(by_pose, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F)
-        return np.asarray(sums[:, 0] / size)
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
@@ -121,60 +100,96 @@ class _SampledObjective:
 
     def _model(self, T_world_object: Floats) -> tuple[float, Floats, Floats]:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
-        points = transform(T_world_object, self.points)
-        if self.offsets is not None:
-            points += self.offsets
+        points = transform(T_world_object, self.points) + self.offsets
         arms, count = self.points @ T_world_object[:3, :3].T, len(points)
         looked_up, jacobians = [], []
         for term in self.terms:
             y, by_world, _ = term.sensor.linearise(points)
             looked_up.append(term.density.sample(y).astype(np.float64))
             jacobians.append(pose_jacobian(by_world, arms))
-        factors = self._factors(np.array([g[:, 0] for g in looked_up]))
+        parts = self._parts([g[None, :, 0] for g in looked_up])
         gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for term, g, J, others in zip(self.terms, looked_up, jacobians, factors, strict=True):
+        for k, (term, g, J) in enumerate(zip(self.terms, looked_up, jacobians, strict=True)):
+            rest = (part[0] for j, part in enumerate(parts) if j != k)
+            others = math.prod(rest, start=np.ones(count))
             gradient += np.einsum("s,sm,smk->k", others, g[:, 1:], J) / count
             pull = others * g[:, 0] / (count * term.density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
-        value = float((factors[0] * looked_up[0][:, 0]).mean())
-        return value, gradient, curvature
+        return float((others * g[:, 0]).mean()), gradient, curvature
 
 
 class PaperObjective(_SampledObjective):
-    """Formula (4): sensors multiplied inside the integral over the object."""
-
-    def _values(self, poses: Floats) -> Floats:
-        product, *others = self._densities(poses)
-        for g in others:
-            product *= g
-        return self._means(product, len(poses))
-
-    def _factors(self, densities: Floats) -> list[Floats]:
-        return [np.prod(np.delete(densities, k, axis=0), axis=0) for k in range(len(densities))]
+    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)): all sensors see the same Z."""
 
 
 class IndependentObjective(_SampledObjective):
-    """The product of separate objectives: sensors as if they saw different objects."""
+    """Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)): sensors as if they saw different objects."""
 
-    def _values(self, poses: Floats) -> Floats:
-        means = [self._means(g, len(poses)) for g in self._densities(poses)]
-        return np.asarray(np.prod(means, axis=0))
-
-    def _factors(self, densities: Floats) -> list[Floats]:
-        means = densities.mean(axis=1)
-        ones = np.ones(densities.shape[1])
-        return [np.prod(np.delete(means, k)) * ones for k in range(len(means))]
+    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
+        return [_means(g)[:, None] for g in densities]
 
 
-def _looked_up(g: Singles, u: Singles, v: Singles) -> Any:
-    return cv2.remap(g, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+def _means(g: Floats | Singles) -> Floats:
+    """Means (k,) over the samples (k, S) of k poses, summed in double precision."""
+    return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F).ravel() / g.shape[1])
+
+
+class _AffineMaps:
+    """Where samples (S, 3) of a body lie in the arrays of densities, for `cv2.remap`.
+
+    One evaluation of a sampled objective is to cost hardly more than its look-ups.  So where no
+    sensor has perspective, samples are kept in single precision, and one matrix product for all of
+    them ends in array indices: they err by less than 1/1000 in arrays of up to 4000 a side, as
+    samples are relative to their centre.
+    """
+
+    def __init__(self, terms: Sequence[SampledTerm], points: Floats, offsets: Floats) -> None:
+        to_centre = np.eye(4)
+        to_centre[:3, 3] = centre = (points.min(axis=0) + points.max(axis=0)) / 2
+        parts = [points - centre, np.ones((len(points), 1))]
+        rows, limits = [], []
+        for term in terms:
+            assert isinstance(term.sensor, AffineSensor)
+            origin, step = term.density.window.origin, term.density.window.step
+            rows.append(term.sensor.affine / step)
+            rows[-1][:, 3] -= origin / step
+            limits.append((np.stack([term.sensor.lower, term.sensor.upper]) - origin) / step)
+        P = np.concatenate(rows)  # (2 L, 4) array indices of points in the world
+        # coefficients (16, 2 L c) of indices by the 16 numbers of a pose, the last of which is 1
+        by_pose = np.einsum("ia,bj->abij", P, to_centre)
+        middle = by_pose[..., 3].reshape(16, -1).copy()
+        if offsets.any():
+            parts.append(offsets)
+            by_pose = np.pad(by_pose, [(0, 0), (0, 0), (0, 0), (0, 3)])
+            by_pose[3, 3, :, 4:] = P[:, :3]
+        self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
+        lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
+        self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
+        # numbers within ±1 if the centre lies so that all samples are seen
+        reach = sum(float(np.linalg.norm(one, axis=1).max()) for one in (parts[0], offsets))
+        half = (upper - lower) / 2 - reach * np.linalg.norm(P[:, :3], axis=1)
+        middle[15] -= (lower + upper) / 2
+        self._width = by_pose[0, 0].size
+        is_seen = middle / np.where(half > 0, half, np.nan)
+        self._by_pose = np.hstack([by_pose.reshape(16, -1), is_seen])
+
+    def at(self, poses: Floats) -> Singles:
+        """Indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
+
+        `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
+        """
+        rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
+        with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
+            single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
+            maps = single.dot(self._samples).reshape(len(rows), -1, count)
+            if not cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+                lower, upper = self._limits
+                maps[~((maps >= lower) & (maps <= upper))] = FAR
+        return np.asarray(maps)
 
 
 def sampled_terms(
-    views: Sequence[View],
-    samples: Floats,
-    sigmas: Sequence[float],
-    near: Floats | None = None,
+    views: Sequence[View], samples: Floats, sigmas: Sequence[float], near: Floats | None = None
 ) -> list[SampledTerm]:
     """Densities g_l around the samples (N, R, 3) at a pose (4, 4), or wherever a sensor sees.
 
@@ -188,6 +203,21 @@ def sampled_terms(
             if not visible.any():
                 continue
             box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
-        density = view.observation.density(sigma, box, gradient=True)
-        terms.append(SampledTerm(view.sensor, density))
+        terms.append(SampledTerm(view.sensor, view.observation.density(sigma, box, gradient=True)))
     return terms
+
+
+def build_objective(
+    name: ObjectiveName,
+    views: Sequence[View],  # whose observation is not empty
+    body: Body,
+    samples: Floats,  # (N, R, 3) of the body; the matched objective does not use them
+    sigmas: Sequence[float],  # of a feature at this level, per view, in sensor units
+    near: Floats,  # (4, 4) pose around whose projection sampled densities are made
+) -> Objective:
+    """Build an objective of the pose at one level of blur."""
+    if name == "matched":
+        return matched_objective(views, body, sigmas)
+    kind = PaperObjective if name == "paper" else IndependentObjective
+    terms = sampled_terms(views, samples, sigmas, near)
+    return kind(terms, samples, body.world_offsets(samples.shape[1]))

@@ -1,82 +1,142 @@
-"""A body in several sensors at once, at one pose or many.
+"""A body in several sensors at once, at one pose or many; markers with a size.
 
 Arrays have the sensors first, then the poses: places y (L, H, n, 2), Jacobians J (L, H, n, 2, 6).
 Sensors of one coordinate have 0 as their second.
+
+The image of a sphere or of an oblique disk is an ellipse, and with a lens nearly one, whose centre
+is not where the marker's own centre is seen.  What a sensor sees of a sphere is the disk within the
+circle at which lines of sight touch it.  So both are disks, of which the centroid of the image is
+∫ y(x) |det ∂y| dx / ∫ |det ∂y| dx over the disk.  Four points at 1/√2 of the radius integrate
+polynomials of third degree; what is left is of the fourth order of the marker's size over its
+distance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.objective.markers import MarkerBatch
-from mixpose.records import Floats, Mask
-from mixpose.sensors import Sensor, facing, side_by_side
+from mixpose.records import Floats, Indices, Mask
+from mixpose.sensors import OUTSIDE, Sensor, facing, side_by_side
+
+_NOTHING = np.array([])
 
 
-class Projected(NamedTuple):
-    """A body in L sensors at H poses."""
+class Match(NamedTuple):
+    """A body's features in L sensors at H poses, and what an objective's densities have there."""
 
     y: Floats  # (L, H, n, 2)
     J: Floats  # (L, H, n, 2, 6) by the twist of the pose; zero where a feature is not visible
     seen: Mask  # (L, H, n) in view, and facing the sensor where normals are known
     faced: Mask  # (L, H, n) facing the sensor, in view or not
     weights: Floats  # (L, H, n) zero where a feature is not seen
+    # where they were looked up:
+    sampled: Floats = _NOTHING  # (L, H, n, 3) C and its gradient
+    norm: Floats = _NOTHING  # (L, H) ⟨h, h⟩, and what its derivatives are made of:
+    pairs: Indices = _NOTHING.astype(np.intp)  # (P, 2) close features i < j
+    bells: Floats = _NOTHING  # (L, H, P) w_i w_j N(p_i − p_j; 0, v); 0 where they do not overlap
+    away: Floats = _NOTHING  # (L, H, P, 2) p_i − p_j
+
+    def of(self, poses: slice | Indices, n: int | None = None) -> Match:
+        """The same at some of the poses, of the first n features; the others have no weight."""
+        bells = self.bells[:, poses]
+        near = bells.any(axis=(0, 1))
+        away = self.away[:, poses][:, :, near]
+        features = [part[:, poses, :n] for part in self[:6]]
+        over = self.norm[:, poses], self.pairs[near], bells[..., near], away
+        return Match._make([*features, *over])
 
 
 class BodyProjection:
     """Sensors that look at a body; made once for the same ones by `project_body`.
 
-    `dimensions` (L,) are m, the coordinates of each sensor.
+    Or at K bodies that `can_be_together`, at a pose of each (K, 4, 4): what one has fewer features
+    than others is filled up with its first, without weight.
     """
 
-    def __init__(self, sensors: Sequence[Sensor], body: Body) -> None:
-        self.sensors = tuple(sensors)
-        self.body = body
-        self.dimensions = np.array([sensor.dimension for sensor in sensors])
-        self._points = body.nodes.points
-        self._weights = body.nodes.weights
-        self._normals = body.node_normals
-        self._batch = side_by_side(self.sensors)
-        sized = body.node_radii is not None and bool(body.node_radii.any())
-        self._markers = MarkerBatch(self.sensors, body, self._batch) if sized else None
+    def __init__(self, sensors: tuple[Sensor, ...], bodies: tuple[Body, ...]) -> None:
+        self.sensors, self.bodies = sensors, bodies
+        self.body = body = max(bodies, key=lambda body: len(body.nodes.points))
+        self.dimensions = np.array([sensor.dimension for sensor in sensors])  # (L,)
+        self._points, self._weights = body.nodes.points, body.nodes.weights
+        if len(bodies) > 1:
+            shape = len(bodies), len(self._points)
+            self._points, self._weights = np.zeros((*shape, 3)), np.zeros(shape)
+            for points, weights, one in zip(self._points, self._weights, bodies):
+                nodes, n = one.nodes, len(one.nodes.points)
+                points[:], points[:n], weights[:n] = nodes.points[0], nodes.points, nodes.weights
+        self._normals, self._radii = body.node_normals, body.node_radii
+        self._batch = side_by_side(sensors)
 
-    def project(self, poses: Floats) -> Projected:
+    def project(self, poses: Floats) -> Match:
         """Where the sensors see the body at poses (H, 4, 4)."""
         H, n, L = len(poses), self._points.shape[-2], len(self.sensors)
         arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
         world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
-        if self._markers is None:
+        if self._radii is None or not self._radii.any():
             y, by_world, visible = self._batch.linearise(world)
         else:
-            y, by_world, visible = self._markers.linearise(poses, world)
+            y, by_world, visible = self._of_disks(poses, world, np.tile(self._radii, H)[:, None])
         J = pose_jacobian(by_world, arms.reshape(-1, 3)).reshape(L, H, n, 2, 6)
         seen = visible.reshape(L, H, n)
-        if self._normals is None:
-            faced = np.ones(seen.shape, dtype=np.bool_)
-        else:
+        faced = np.ones(seen.shape, dtype=np.bool_)
+        if self._normals is not None:
             points = world.reshape(H, n, 3)
-            each = [facing(one, poses, points, self._normals) for one in self.sensors]
-            faced = np.array(each)
+            faced = np.array([facing(one, poses, points, self._normals) for one in self.sensors])
             seen &= faced
-        return Projected(y.reshape(L, H, n, 2), J, seen, faced, self._weights * seen)
+        return Match(y.reshape(L, H, n, 2), J, seen, faced, self._weights * seen)
+
+    def _of_disks(self, poses: Floats, world: Floats, radii: Floats) -> tuple[Floats, Floats, Mask]:
+        """As `SensorBatch.linearise`, of spheres or disks (H * n, 3) that move without turning."""
+        L, count = len(self.sensors), len(world)
+        normals = self._normals if self.body.shape == "disk" else None
+        if normals is not None:
+            turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
+            middle, axes = world, turned.reshape(2, count, 3)
+        else:
+            towards = np.array([sensor.towards(world) for sensor in self.sensors])
+            squared = np.einsum("lni,lni->ln", towards, towards)[..., None]
+            share = np.minimum(radii**2 / squared, 0.81)  # no sensor is within a sphere
+            middle = world + share * towards
+            radii = radii * np.sqrt(1 - share)
+            axes = _across(towards / np.sqrt(squared))
+        steps = np.sqrt(0.5) * radii * axes  # where the four points are
+        signs = np.array([1, -1, 1, -1]).reshape(4, *[1] * middle.ndim)
+        nodes = (middle + signs * steps[[0, 0, 1, 1]]).swapaxes(0, -3).reshape(-1, 4 * count, 3)
+        if normals is not None:
+            nodes, axes = nodes[0], axes[:, None]
+        y, J, seen = self._batch.linearise(nodes)
+        y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
+        a, b = (np.einsum("lknij,lnj->lkni", J, axis) for axis in axes + np.zeros((1, L, 1, 1)))
+        weights = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+        total = weights.sum(axis=1)
+        visible = seen.reshape(L, 4, count).all(axis=1) & (total > 0)
+        weights /= np.where(visible, total, 1.0)[:, None]
+        y, J = (weights[..., None] * y).sum(axis=1), (weights[..., None, None] * J).sum(axis=1)
+        y[~visible], J[~visible] = OUTSIDE, 0.0
+        ranges = np.flatnonzero(self.dimensions == 1)
+        if len(ranges):  # to the centre
+            for own, other in zip((y, J, visible), self._batch.linearise(world), strict=True):
+                own[ranges] = other[ranges]
+        return y, J, visible
 
 
 @lru_cache(maxsize=64)
-def project_body(sensors: tuple[Sensor, ...], body: Body) -> BodyProjection:
-    """The projection of a body into sensors, which are the same objects from frame to frame."""
-    return BodyProjection(sensors, body)
+def project_body(sensors: tuple[Sensor, ...], *bodies: Body) -> BodyProjection:
+    """The projection of bodies into sensors, which are the same objects from frame to frame."""
+    return BodyProjection(sensors, bodies)
+
+
+def can_be_together(body: Body) -> bool:
+    """Whether a body has bare points only: no normals, and no size of markers."""
+    return body.normals is None and (body.node_radii is None or not body.node_radii.any())
 
 
 def in_image(spreads: Floats, J: Floats) -> Floats:
-    """How far features are off in a sensor's coordinates, mean variance along one (..., n).
-
-    For covariances (..., n, 3, 3) in the world, and J (..., n, m, 6) in a sensor's m coordinates.
-    """
+    """Mean variance (..., n) along an axis of a sensor, by J (..., n, m, 6), of (..., n, 3, 3)."""
     by_world = J[..., :3]
     total = np.einsum("...nmi,...nij,...nmj->...n", by_world, spreads, by_world)
     return np.asarray(total / J.shape[-2])
@@ -96,3 +156,13 @@ def pose_jacobian(by_world: Floats, arms: Floats) -> Floats:
     J[..., 4] = z * a - x * c
     J[..., 5] = x * b - y * a
     return J
+
+
+def _across(directions: Floats) -> Floats:
+    """Two unit vectors (2, ..., 3) across unit vectors (..., 3): Duff and others, JCGT 6 (2017)."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=-1)
+    return np.stack([first, np.stack([b, sign + y * y * a, -y], axis=-1)])

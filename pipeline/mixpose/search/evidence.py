@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from mixpose.judgement import odds_of, paid_by_count
 from mixpose.matching import Matches, crowding
-from mixpose.objective import Projected, project_body
+from mixpose.objective import Match, project_body
 from mixpose.records import Floats, Indices
 from mixpose.search.detections import SensorDetections
 from mixpose.search.problem import SearchProblem
@@ -41,7 +41,7 @@ def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
 
 
 def _matches_of(
-    problem: SearchProblem, sensors: Sequence[SensorDetections], projected: Projected
+    problem: SearchProblem, sensors: Sequence[SensorDetections], projected: Match
 ) -> Matches:
     """Detections that sensors have where they are predicted to see the features of K poses."""
     association, visible = problem.rules.association, projected.seen

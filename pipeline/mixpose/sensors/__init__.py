@@ -5,7 +5,7 @@ A new kind of sensor is one file beside these and one line in `SENSOR_MODELS`.
 
 from __future__ import annotations
 
-from mixpose.sensors.base import OUTSIDE, Sensor
+from mixpose.sensors.base import OUTSIDE, AffineSensor, Sensor
 from mixpose.sensors.batch import SensorBatch
 from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted
 from mixpose.sensors.facing import facing
@@ -26,6 +26,7 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
 __all__ = [
     "OUTSIDE",
     "SENSOR_MODELS",
+    "AffineSensor",
     "CalibrationError",
     "FisheyeCamera",
     "Motion",

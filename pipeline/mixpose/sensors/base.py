@@ -73,6 +73,16 @@ class Sensor(Protocol):
         ...
 
 
+@runtime_checkable
+class AffineSensor(Sensor, Protocol):
+    """A sensor without perspective."""
+
+    @property
+    def affine(self) -> Floats:
+        """Sensor coordinates as rows (m, 4) that are multiplied by (x, y, z, 1) in the world."""
+        ...
+
+
 def image_bounds(resolution: tuple[int, int] | None) -> tuple[Floats, Floats]:
     """Corners of an image (width, height) in pixel coordinates; infinite where unknown."""
     if resolution is None:

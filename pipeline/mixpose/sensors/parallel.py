@@ -46,6 +46,13 @@ class ParallelBeam:
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
 
+    @property
+    def affine(self) -> Floats:
+        """Pixels as rows (2, 4) that are multiplied by (x, y, z, 1) in the world."""
+        rows = self.T_sensor_world[:2] / self.pixel_size
+        rows[:, 3] += self.principal_point
+        return np.asarray(rows)
+
     def project(self, points_world: Floats) -> tuple[Floats, Mask]:
         """Pixels (..., 2) of world points (..., 3), and which of them the camera sees."""
         T = self.T_sensor_world
