@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
-from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
-from mixpose.search.detections import sensor_detections
-from mixpose.search.from_three_rays import from_three_rays
-from mixpose.search.inlier_counts import count_inliers, label_images
-from mixpose.search.problem import SearchProblem
+from mixpose.search import LIVE, THOROUGH, SearchBudget
+from mixpose.search.problem import SearchProblem, sensor_detections
+from mixpose.search.scoring import count_inliers, label_image
 from mixpose.search.search import generators_of
-from mixpose.search.three_points import align_triples
+from mixpose.search.three_points import align_triples, from_three_rays
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -36,15 +34,16 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
 ) -> None:
     camera = pinhole_cameras[0]
     y = camera.project(transform(TRUTH, EIGHT.means))[0]
-    detections = sensor_detections([view_of("0", camera, y)], EIGHT, SearchBudget())
-    images = label_images(SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4)))
+    detections = sensor_detections([view_of("0", camera, y)], EIGHT)
+    problem = SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4))
+    images = [label_image(problem, *camera) for camera in problem.cameras]
     towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     normals[5:] *= -1
     faced = Body("eight", EIGHT.features, normals)
-    counts, _ = count_inliers(images, faced, TRUTH[None], 1000)
+    counts, _ = count_inliers(images, faced, TRUTH[None])
     assert counts.tolist() == [[5.0]]
-    counts, _ = count_inliers(images, EIGHT, TRUTH[None], 1000)
+    counts, _ = count_inliers(images, EIGHT, TRUTH[None])
     assert counts.tolist() == [[8.0]]
 
 
@@ -77,7 +76,7 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
 ) -> None:
     def names(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
-        seen = sensor_detections(views, EIGHT, SearchBudget())
+        seen = sensor_detections(views, EIGHT)
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
         return [generator.name for generator in generators_of(problem)]
 

@@ -18,7 +18,7 @@ from mixpose.body import Body
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, rotation_angle_deg, transform
-from mixpose.search.spread import spread_turns
+from mixpose.search import spread_turns
 from mixpose.sensors import RangeSensor, Sensor
 from mixpose.session import SensorSetup
 
