@@ -309,7 +309,7 @@ _SEARCH = (
     Mutant(
         "search-bright-detections-count-more",
         "search/problem.py",
-        "alike = Observation(PointPattern(points, ones),",
+        "alike = Observation(PointPattern(points, np.ones(len(points))),",
         "alike = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
         "a bright blob is worth more features than a faint one",
     ),
@@ -344,8 +344,8 @@ _SEARCH = (
     Mutant(
         "search-peaks-on-the-other-side",
         "search/problem.py",
-        "slope = 0.5 * (after - before)",
-        "slope = 0.5 * (before - after)",
+        "slope, bend = 0.5 * (after - before),",
+        "slope, bend = 0.5 * (before - after),",
         "peaks of grey values are up to a pixel off",
     ),
     Mutant(
