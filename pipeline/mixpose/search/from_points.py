@@ -18,14 +18,7 @@ from scipy.spatial import cKDTree
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask, Singles
 from mixpose.search.problem import SearchProblem
-from mixpose.search.three_points import (
-    FIRST,
-    SECOND,
-    Generator,
-    align_triples,
-    far_apart,
-    gathered,
-)
+from mixpose.search.three_points import FIRST, SECOND, Generator, align_triples, far_apart, gathered
 from mixpose.sensors import Rays
 
 

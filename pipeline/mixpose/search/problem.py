@@ -168,10 +168,7 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     """
     spread = max(sigma / pattern.step, 0.5)
     blurred: Singles = cv2.GaussianBlur(  # type: ignore[assignment]
-        np.asarray(pattern.values, dtype=np.float32),
-        (0, 0),
-        spread,
-        borderType=cv2.BORDER_CONSTANT,
+        np.asarray(pattern.values, dtype=np.float32), (0, 0), spread, borderType=cv2.BORDER_CONSTANT
     )
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))

@@ -15,13 +15,7 @@ from mixpose.errors import SessionError
 from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats, Mask
-from mixpose.search.descent import (
-    Descent,
-    Stage,
-    first_of_each,
-    from_spread_orientations,
-    unlike,
-)
+from mixpose.search.descent import Descent, Stage, first_of_each, from_spread_orientations, unlike
 from mixpose.search.from_points import (
     by_promise,
     from_point_and_rays,
