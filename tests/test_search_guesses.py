@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search import LIVE, THOROUGH, SearchBudget
+from mixpose.search.from_points import TriangulatedPoints, from_point_triples
 from mixpose.search.problem import SearchProblem, sensor_detections
 from mixpose.search.scoring import count_inliers, label_image
 from mixpose.search.search import generators_of
@@ -105,8 +106,13 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
 
 
 def test_sizes_of_a_search_follow_from_its_numbers() -> None:
-    points = THOROUGH.promising
-    assert comb(points, 3) <= THOROUGH.max_triples < comb(points + 1, 3)
+    # as many of the most promising points as all triples of can be tried
+    none = np.zeros((100, 3))
+    points = TriangulatedPoints(
+        none, none[:, 0], np.tile([0, 1], (100, 1)), np.arange(200).reshape(-1, 2)
+    )
+    triples = from_point_triples(SearchProblem([], EIGHT, ALL_FREE, np.eye(4)), points).batches
+    assert sum(len(batch) for batch in triples) == comb(63, 3) <= THOROUGH.max_triples < comb(64, 3)
     # a search of 2,000 guesses is not spent on one batch
     assert (THOROUGH.batch, LIVE.batch) == (4096, 1000)
     # 1,200 features refined, and of any body a quarter of the guesses

@@ -397,8 +397,8 @@ _SEARCH = (
     Mutant(
         "search-starts-again-each-frame",
         "search/search.py",
-        "return SearchState(k, done)",
-        "return SearchState(k, 0)",
+        "after = SearchState(k, done)",
+        "after = SearchState(k, 0)",
         "a limited search tries the same guesses in every frame",
     ),
 )

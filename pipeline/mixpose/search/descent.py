@@ -166,23 +166,17 @@ def _starts(problem: SearchProblem) -> Floats:
     size = float(np.sqrt(((body.nodes.points - centre) ** 2).sum(axis=1).mean()))
     held = transform(problem.T_reference, centre[None])[0]
     starts = [] if problem.free.all() else [held]
-    sources, ranges = [], []
     for one in problem.detections:
         mean, spread = one.moments
         rays = one.view.sensor.rays(mean[None])
         if rays is None:
-            sources.append(one.view.sensor.towards(np.zeros(3)))
-            ranges.append(float(mean[0]))
+            source = one.view.sensor.towards(np.zeros(3))
+            starts += [source + sign * mean * axis for sign in (1, -1) for axis in np.eye(3)]
         elif len(rays):
             # a body as large as its features' spread is seen
             across = max(spread, one.sigma) * rays.slope
             far = np.sqrt(2 / 3) * size / across if rays.central else 0.0
             starts.append(rays.origins[0] + far * rays.directions[0])
-    if sources:
-        middle = np.mean(sources, axis=0)
-        normal = np.linalg.svd(np.array(sources) - middle)[2][-1]
-        ways = np.concatenate([[normal], np.eye(3)])
-        starts += list(middle + np.mean(ranges) * np.concatenate([ways, -ways]))
     return np.where(problem.free[:3], np.array(starts).reshape(-1, 3), held)
 
 

@@ -27,7 +27,6 @@ class TriangulatedPoints(NamedTuple):
 
     points: Floats  # (P, 3) in the world
     tolerance: Floats  # (P,) how far off the point may be, in length units
-    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
     sensors: Indices  # (P, 2) the two sensors, first before second
     rays: Indices  # (P, 2) the ray of either sensor
 
@@ -63,7 +62,6 @@ def triangulate(
             (
                 0.5 * (on_a[good] + on_b[good]),
                 tolerance[good] / np.sqrt(sine2[good]),
-                gap[good] / tolerance[good],
                 np.broadcast_to([first, second], pairs.shape),
                 pairs,
             )
@@ -77,32 +75,26 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
     They are combined in this order (PROSAC, Chum and Matas, CVPR 2005).
     """
     places, (support, error) = points.points, np.zeros((2, len(points.points)))
-    # the first of forty triples each
-    kept, most = list[int](), problem.budget.max_triples // 40
-    if len(problem.cameras) == 2:  # every feature once
-        kept = np.argsort(points.gap, kind="stable").tolist()
-    else:
-        for sensor, _ in problem.cameras:
-            y, seen = sensor.view.sensor.project(places)
-            reach = problem.reach(sensor)
-            away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
-            met = seen & np.isfinite(away)
-            support += met
-            error += np.where(met, away / reach, 0.0)
-        left = np.ones(len(places), dtype=np.bool_)
-        for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
-            if left[k] and len(kept) < most:
-                kept.append(k)
-                left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
-    first = np.array(kept[:most], dtype=np.intp)
-    return TriangulatedPoints._make(array[first] for array in points)
+    for sensor, _ in problem.cameras:
+        y, seen = sensor.view.sensor.project(places)
+        reach = problem.reach(sensor)
+        away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
+        met = seen & np.isfinite(away)
+        support += met
+        error += np.where(met, away / reach, 0.0)
+    kept, left = list[int](), np.ones(len(places), dtype=np.bool_)
+    for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
+        # the first of forty triples each
+        if left[k] and len(kept) < problem.budget.max_triples // 40:
+            kept.append(k)
+            left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
+    return TriangulatedPoints._make(array[np.array(kept, dtype=np.intp)] for array in points)
 
 
 def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
     """Poses of triples of points, the most promising first."""
     budget = problem.budget
-    # half of the triples, the features of each in all six orders
-    corners, tree = feature_triangles(problem.body, 3 * budget.max_triples, budget.min_sine)
+    corners, tree = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
     enough = len(corners) and len(points.points) > 2
     batches = _point_triples(problem, points) if enough else ()
     return Generator("point triples", batches, partial(_of_triples, problem, points, corners, tree))
@@ -112,14 +104,11 @@ def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Ge
 def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices, cKDTree]:
     """Ordered triples (K, 3) of features that span a triangle, and a tree of their sides (K, 3).
 
-    All of them, or `count` at random where they are more.  Left out are those whose height is a
-    smaller share of the longest side than `min_sine`.
+    Of `count` features far apart.  Left out are triangles whose height is a smaller share of the
+    longest side than `min_sine`.
     """
-    n = len(body)
-    if n * (n - 1) * (n - 2) <= count:
-        corners = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    else:
-        corners = np.random.default_rng(0).integers(0, n, (count, 3))
+    few = far_apart(body.means, count)
+    corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
     sides = _sides(body.means, corners)
     wide = _is_wide(sides, min_sine)
     return corners[wide], cKDTree(sides[wide].reshape(-1, 3))
@@ -157,12 +146,11 @@ def _of_triples(
 def _point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterator[Indices]:
     """Batches of triples (K, 3) of points that share no ray, the most promising first."""
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
-    triples = _combinations(min(len(points.points), problem.budget.promising))
-    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
-    size, end = problem.budget.batch // 32, 0
-    while end < len(triples):
-        start, end = end, min(end + max(end, size), end + 8 * size)
-        batch = triples[start:end]
+    # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
+    most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
+    triples, size = _combinations(min(len(points.points), most)), problem.budget.batch // 32
+    for start in range(0, len(triples), size):
+        batch = triples[start : start + size]
         six = np.sort(rays[batch].reshape(-1, 6), axis=1)
         yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 

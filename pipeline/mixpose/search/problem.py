@@ -83,11 +83,6 @@ class SearchBudget:
         return int(min(4096, self.max_guesses // 2))
 
     @property
-    def promising(self) -> int:
-        """Points of which all triples are tried: n (n - 1) (n - 2) / 6 is `max_triples` or less."""
-        return int(np.cbrt(6 * self.max_triples)) + 1
-
-    @property
     def hopeless(self) -> float:
         """Evidence that no fit saves: fits gain 3 nats or, of a board in motion, 12."""
         return -self.outdone - self.beyond_doubt

@@ -151,8 +151,19 @@ class _Search:
 
     def run(self, state: SearchState) -> SearchState:
         """Make as many guesses as are needed and allowed; where to go on in the next frame."""
-        after = self._from_rays(state) if self._images else SearchState()
-        doubtful = self._coverage() < self._budget.sufficient
+        budget, after = self._budget, SearchState()
+        generators = generators_of(self._problem) if self._images else []
+        if len(generators) > 1:
+            self._draw(generators.pop(0), budget.max_guesses / 2)
+        for k, generator in enumerate(generators[state.generator :], state.generator):
+            if self._coverage() >= budget.convincing or self._is_found():
+                break
+            skipped = state.batch if k == state.generator else 0
+            done = self._draw(generator, budget.max_guesses, skipped)
+            if self.cost["made"] >= budget.max_guesses:
+                after = SearchState(k, done)
+                break
+        doubtful = self._coverage() < budget.sufficient
         if doubtful and not (self._by_evidence and self.cost["made"]):
             poses, stages = from_spread_orientations(self._problem)
             self._keep(self._descent.refine(poses, stages))
@@ -165,20 +176,6 @@ class _Search:
             least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
-
-    def _from_rays(self, state: SearchState) -> SearchState:
-        """Guesses of one generator after the other; after the first, from where they stopped."""
-        generators, most = generators_of(self._problem), self._budget.max_guesses
-        if len(generators) > 1:
-            self._draw(generators.pop(0), most / 2)
-        for k, generator in enumerate(generators):
-            if self._coverage() >= self._budget.convincing or self._is_found():
-                break
-            if k >= state.generator:
-                done = self._draw(generator, most, state.batch if k == state.generator else 0)
-                if self.cost["made"] >= most:
-                    return SearchState(k, done)
-        return SearchState()
 
     def _draw(self, generator: Generator, most: float, skipped: int = 0) -> int:
         """Batches tried of a generator until `most` guesses were made, the best of them refined.
