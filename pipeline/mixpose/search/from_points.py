@@ -148,9 +148,12 @@ def _point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterat
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
     # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
     most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
-    triples, size = _combinations(min(len(points.points), most)), problem.budget.batch // 32
-    for start in range(0, len(triples), size):
-        batch = triples[start : start + size]
+    triples = _combinations(min(len(points.points), most))
+    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
+    size, end = problem.budget.batch // 32, 0
+    while end < len(triples):
+        start, end = end, end + min(max(end, size), 8 * size)
+        batch = triples[start:end]
         six = np.sort(rays[batch].reshape(-1, 6), axis=1)
         yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 

@@ -253,11 +253,11 @@ def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
         return
     near_rays, near_features = _nearest(rays.pixels), _nearest(features)
     # a body is seen in one place, larger or smaller
-    crowds = [min(size, M) for size in (budget.sample, 2 * budget.sample, 4 * budget.sample, M)]
+    crowds = [budget.sample, 2 * budget.sample, 4 * budget.sample, M]
     for k in range(most // batch):
         crowd = crowds[k % len(crowds)]
-        some_features = min(max(crowd // 2, 3), n)
-        yield _drawn(near_rays, crowd, batch, rng), _drawn(near_features, some_features, batch, rng)
+        some, few = min(crowd, M), min(max(crowd // 2, 3), n)
+        yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
 
 
 def _nearest(points: Floats) -> Indices:
