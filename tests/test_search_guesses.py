@@ -109,7 +109,7 @@ def test_sizes_of_a_search_follow_from_its_numbers() -> None:
     # as many of the most promising points as all triples of can be tried
     none = np.zeros((100, 3))
     points = TriangulatedPoints(
-        none, none[:, 0], np.tile([0, 1], (100, 1)), np.arange(200).reshape(-1, 2)
+        none, none[:, 0], none[:, 0], np.tile([0, 1], (100, 1)), np.arange(200).reshape(-1, 2)
     )
     triples = from_point_triples(SearchProblem([], EIGHT, ALL_FREE, np.eye(4)), points).batches
     assert sum(len(batch) for batch in triples) == comb(63, 3) <= THOROUGH.max_triples < comb(64, 3)

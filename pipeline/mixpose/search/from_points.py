@@ -27,6 +27,7 @@ class TriangulatedPoints(NamedTuple):
 
     points: Floats  # (P, 3) in the world
     tolerance: Floats  # (P,) how far off the point may be, in length units
+    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
     sensors: Indices  # (P, 2) the two sensors, first before second
     rays: Indices  # (P, 2) the ray of either sensor
 
@@ -62,6 +63,7 @@ def triangulate(
             (
                 0.5 * (on_a[good] + on_b[good]),
                 tolerance[good] / np.sqrt(sine2[good]),
+                gap[good] / tolerance[good],
                 np.broadcast_to([first, second], pairs.shape),
                 pairs,
             )
@@ -75,20 +77,25 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
     They are combined in this order (PROSAC, Chum and Matas, CVPR 2005).
     """
     places, (support, error) = points.points, np.zeros((2, len(points.points)))
-    for sensor, _ in problem.cameras:
-        y, seen = sensor.view.sensor.project(places)
-        reach = problem.reach(sensor)
-        away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
-        met = seen & np.isfinite(away)
-        support += met
-        error += np.where(met, away / reach, 0.0)
-    kept, left = list[int](), np.ones(len(places), dtype=np.bool_)
-    for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
-        # the first of forty triples each
-        if left[k] and len(kept) < problem.budget.max_triples // 40:
-            kept.append(k)
-            left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
-    return TriangulatedPoints._make(array[np.array(kept, dtype=np.intp)] for array in points)
+    # the first of forty triples each
+    kept, most = list[int](), problem.budget.max_triples // 40
+    if len(problem.cameras) == 2:  # every feature once
+        kept = np.argsort(points.gap, kind="stable").tolist()
+    else:
+        for sensor, _ in problem.cameras:
+            y, seen = sensor.view.sensor.project(places)
+            reach = problem.reach(sensor)
+            away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
+            met = seen & np.isfinite(away)
+            support += met
+            error += np.where(met, away / reach, 0.0)
+        left = np.ones(len(places), dtype=np.bool_)
+        for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
+            if left[k] and len(kept) < most:
+                kept.append(k)
+                left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
+    first = np.array(kept[:most], dtype=np.intp)
+    return TriangulatedPoints._make(array[first] for array in points)
 
 
 def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
@@ -107,7 +114,7 @@ def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices,
     Of `count` features far apart.  Left out are triangles whose height is a smaller share of the
     longest side than `min_sine`.
     """
-    few = far_apart(body.means, count)
+    few = np.sort(far_apart(body.means, count))
     corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
     sides = _sides(body.means, corners)
     wide = _is_wide(sides, min_sine)
