@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mixpose.body import Body, PointFeature
 from mixpose.density import peak
 from mixpose.fit.probable import LabelledPlaces, SensorDensity, fit_freed, misfit, own_peaks
-from mixpose.objective import BodyProjection
+from mixpose.objective import BodyProjection, project_body
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.sensors import ParallelBeam
 
@@ -57,7 +57,7 @@ def seen(sensor: ParallelBeam, centres: Floats, noise: float = 1e-6) -> SensorDe
 
 
 def projection(points: Floats = POINTS) -> BodyProjection:
-    return BodyProjection(BEAMS, Body("body", tuple(PointFeature(point) for point in points)))
+    return project_body(BEAMS, Body("body", tuple(PointFeature(point) for point in points)))
 
 
 def projected(points: Floats = POINTS) -> list[Floats]:

@@ -9,11 +9,9 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.budget import SearchBudget
-from mixpose.search.detections import peaks, sensor_detections
-from mixpose.search.inlier_counts import count_inliers, label_images
-from mixpose.search.problem import SearchProblem
-from mixpose.search.spread import spread_rotations, spread_turns
+from mixpose.search.descent import spread_rotations, spread_turns
+from mixpose.search.problem import SearchProblem, peaks, sensor_detections
+from mixpose.search.scoring import count_inliers, label_image
 from mixpose.sensors import PinholeCamera
 
 TRUTH = from_rotation_vector([0.3, -0.2, 0.5], [5.0, -3.0, 8.0])
@@ -31,12 +29,13 @@ def test_features_that_share_a_detection_count_once(
     paper_body: Body, pinhole_cameras: list[PinholeCamera]
 ) -> None:
     views = seen_by(pinhole_cameras, paper_body)
-    detections = sensor_detections(views, paper_body, SearchBudget())
-    images = label_images(SearchProblem(detections, paper_body, ALL_FREE, np.eye(4)))
+    detections = sensor_detections(views, paper_body)
+    problem = SearchProblem(detections, paper_body, ALL_FREE, np.eye(4))
+    images = [label_image(problem, *camera) for camera in problem.cameras]
     collapsed = TRUTH.copy()
     # far behind its place the whole body falls within one disk
     collapsed[:3, 3] = [50.0, 4e6, 40.0]
-    counts, _ = count_inliers(images, paper_body, np.array([TRUTH, collapsed]), 100_000)
+    counts, _ = count_inliers(images, paper_body, np.array([TRUTH, collapsed]))
     assert counts[:, 0].tolist() == [6, 6]
     assert counts[0, 1] <= 1
 
@@ -46,7 +45,7 @@ def test_peaks_of_an_image_are_found_between_pixels() -> None:
     v, u = np.mgrid[:64, :80]
     image = sum(np.exp(-0.5 * ((u - x) ** 2 + (v - y) ** 2) / 2.0**2) for x, y in places)
     pattern = GridPattern(np.asarray(image, dtype=np.float32), np.array([100.0, 50.0]), 1.0)
-    found = peaks(pattern, 1.5, SearchBudget())
+    found = peaks(pattern, 1.5)
     order = np.argsort(found[:, 0])
     # the vertex of a parabola through a Gaussian of 2.5 px is off by less than 0.02 px
     np.testing.assert_allclose(found[order], places + pattern.origin, atol=0.02)

@@ -16,10 +16,8 @@ from mixpose.matching import AssociationRules, ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search import search_frame
-from mixpose.search.budget import SearchBudget
-from mixpose.search.detections import sensor_detections
-from mixpose.search.evidence import evidence
-from mixpose.search.problem import SearchProblem
+from mixpose.search.problem import SearchProblem, sensor_detections
+from mixpose.search.scoring import evidence
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.proposers import candidates_of
@@ -43,7 +41,7 @@ def evidence_in(views: list[View], body: Body = EIGHT) -> float:
 def problem(
     views: list[View], body: Body = EIGHT, rules: JudgementRules = JudgementRules()
 ) -> SearchProblem:
-    detections = sensor_detections(views, body, SearchBudget())
+    detections = sensor_detections(views, body)
     return SearchProblem(detections, body, ALL_FREE, np.eye(4), rules)
 
 

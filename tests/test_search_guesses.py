@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
-from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
-from mixpose.search.detections import sensor_detections
-from mixpose.search.from_three_rays import from_three_rays
-from mixpose.search.inlier_counts import count_inliers, label_images
-from mixpose.search.problem import SearchProblem
+from mixpose.search import LIVE, THOROUGH, SearchBudget
+from mixpose.search.from_points import TriangulatedPoints, from_point_triples
+from mixpose.search.problem import SearchProblem, sensor_detections
+from mixpose.search.scoring import count_inliers, label_image
 from mixpose.search.search import generators_of
-from mixpose.search.three_points import align_triples
+from mixpose.search.three_points import align_triples, from_three_rays
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -36,15 +35,16 @@ def test_features_that_turn_their_back_to_a_camera_explain_no_detection(
 ) -> None:
     camera = pinhole_cameras[0]
     y = camera.project(transform(TRUTH, EIGHT.means))[0]
-    detections = sensor_detections([view_of("0", camera, y)], EIGHT, SearchBudget())
-    images = label_images(SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4)))
+    detections = sensor_detections([view_of("0", camera, y)], EIGHT)
+    problem = SearchProblem(detections, EIGHT, ALL_FREE, np.eye(4))
+    images = [label_image(problem, *camera) for camera in problem.cameras]
     towards = camera.towards(transform(TRUTH, EIGHT.means)) @ TRUTH[:3, :3]
     normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     normals[5:] *= -1
     faced = Body("eight", EIGHT.features, normals)
-    counts, _ = count_inliers(images, faced, TRUTH[None], 1000)
+    counts, _ = count_inliers(images, faced, TRUTH[None])
     assert counts.tolist() == [[5.0]]
-    counts, _ = count_inliers(images, EIGHT, TRUTH[None], 1000)
+    counts, _ = count_inliers(images, EIGHT, TRUTH[None])
     assert counts.tolist() == [[8.0]]
 
 
@@ -77,7 +77,7 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
 ) -> None:
     def names(false: int) -> list[str]:
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
-        seen = sensor_detections(views, EIGHT, SearchBudget())
+        seen = sensor_detections(views, EIGHT)
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
         return [generator.name for generator in generators_of(problem)]
 
@@ -106,8 +106,13 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
 
 
 def test_sizes_of_a_search_follow_from_its_numbers() -> None:
-    points = THOROUGH.promising
-    assert comb(points, 3) <= THOROUGH.max_triples < comb(points + 1, 3)
+    # as many of the most promising points as all triples of can be tried
+    none = np.zeros((100, 3))
+    points = TriangulatedPoints(
+        none, none[:, 0], none[:, 0], np.tile([0, 1], (100, 1)), np.arange(200).reshape(-1, 2)
+    )
+    triples = from_point_triples(SearchProblem([], EIGHT, ALL_FREE, np.eye(4)), points).batches
+    assert sum(len(batch) for batch in triples) == comb(63, 3) <= THOROUGH.max_triples < comb(64, 3)
     # a search of 2,000 guesses is not spent on one batch
     assert (THOROUGH.batch, LIVE.batch) == (4096, 1000)
     # 1,200 features refined, and of any body a quarter of the guesses

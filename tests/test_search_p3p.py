@@ -6,10 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body, PointFeature
 from mixpose.rigid import from_rotation_vector, rotation_angle_deg, transform
-from mixpose.search.budget import SearchBudget
-from mixpose.search.from_three_rays import from_three_rays
+from mixpose.search import SearchBudget
 from mixpose.search.problem import SearchProblem
-from mixpose.search.three_points import SIDES, align_triples, depths
+from mixpose.search.three_points import SIDES, align_triples, depths, from_three_rays
 from mixpose.sensors import PinholeCamera
 
 

@@ -11,14 +11,13 @@ from mixpose.objective import View
 from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
 from mixpose.search import SearchBudget
-from mixpose.search.detections import sensor_detections
-from mixpose.search.from_point_triples import (
+from mixpose.search.from_points import (
     by_promise,
     feature_triangles,
     from_point_triples,
+    triangulate,
 )
-from mixpose.search.problem import SearchProblem
-from mixpose.search.triangulation import triangulate
+from mixpose.search.problem import SearchProblem, sensor_detections
 from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, Sensor
 
 K = np.array([[900.0, 2.0, 639.5], [0, 880.0, 511.5], [0, 0, 1]])
@@ -72,12 +71,12 @@ def test_three_points_in_space_give_the_pose() -> None:
 def test_triangles_of_features_are_ordered_and_not_flat() -> None:
     corners = [[0.0, 0, 0], [30, 0, 0], [0, 40, 0], [60, 0, 0]]
     body = Body("four", tuple(PointFeature(np.array(point)) for point in corners))
-    triangles = feature_triangles(body, 1000, 0.05)
+    triples, tree = feature_triangles(body, 1000, 0.05)
     # of four triples three are no line, in six orders each
-    assert len(triangles.corners) == 18
-    away, index = triangles.tree.query([30.0, 40.0, 50.0])
+    assert len(triples) == 18
+    away, index = tree.query([30.0, 40.0, 50.0])
     assert away < 1e-9
-    assert triangles.corners[index].tolist() == [0, 1, 2]
+    assert triples[index].tolist() == [0, 1, 2]
 
 
 def test_points_that_more_cameras_confirm_come_first() -> None:
@@ -91,9 +90,9 @@ def test_points_that_more_cameras_confirm_come_first() -> None:
         y = np.concatenate([false, camera.project(points)[0]])
         views.append(View(str(k), camera, Observation(PointPattern(y, np.ones(45)), 1.0)))
     body = Body("five", tuple(PointFeature(point) for point in points))
-    detections = sensor_detections(views, body, SearchBudget())
+    detections = sensor_detections(views, body)
     rays = [each.rays for each in detections if each.rays is not None]
-    budget = SearchBudget(max_triples=20 * 10)
+    budget = SearchBudget(max_triples=40 * 10)
     problem = SearchProblem(detections, body, ALL_FREE, np.eye(4), budget=budget)
     found = by_promise(problem, triangulate(rays, [3.0] * 3, 0.02))
     off = np.linalg.norm(found.points[:5, None] - points, axis=2).min(axis=1)

@@ -21,7 +21,7 @@ from mixpose.calibration.starting import agreement
 from mixpose.calibration.task import Task
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse, rotation_angle_deg, transform
-from mixpose.search.three_points import SIDES, align_triples, depths
+from mixpose.search import SIDES, align_triples, depths
 from mixpose.sensors import facing
 
 _TRIED = 6  # starts that are adjusted

@@ -18,8 +18,7 @@ from mixpose.frames import Source, pair
 from mixpose.objective import View
 from mixpose.records import Floats, FrameSet, GridPattern, PointPattern
 from mixpose.runner import observe, open_sources
-from mixpose.search.budget import SearchBudget
-from mixpose.search.detections import is_pointlike, peaks
+from mixpose.search import is_pointlike, peaks
 from mixpose.session import Session
 
 _HIGHEST = 0.3  # of a profile's highest peak: a lower one is noise
@@ -126,7 +125,7 @@ def _points(view: View) -> Floats:
     if isinstance(pattern, PointPattern):
         return pattern.points[pattern.weights > 0]
     if view.observation.dimension == 2:
-        return peaks(pattern, view.observation.sigma, SearchBudget())
+        return peaks(pattern, view.observation.sigma)
     return _profile_peaks(pattern)
 
 

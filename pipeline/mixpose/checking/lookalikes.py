@@ -18,7 +18,7 @@ from mixpose.objective import BodyProjection, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, rotation_angle_deg
-from mixpose.search.spread import far_apart, sparse, spread_turns
+from mixpose.search import far_apart, sparse, spread_turns
 from mixpose.sensors import RangeSensor
 from mixpose.session import SensorSetup
 

@@ -1,21 +1,24 @@
 """Search: the first pose from nothing, over all orientations and positions."""
 
-from __future__ import annotations
-
-from mixpose.search.budget import LIVE, THOROUGH, SearchBudget
-from mixpose.search.problem import Candidate, SearchReport, SearchResult, SearchState
-from mixpose.search.refinement import Descent, Stage
-from mixpose.search.search import search_frame
-
-__all__ = [
-    "LIVE",
-    "THOROUGH",
-    "Candidate",
-    "Descent",
-    "SearchBudget",
-    "SearchReport",
-    "SearchResult",
-    "SearchState",
-    "Stage",
-    "search_frame",
-]
+from mixpose.search.descent import Descent as Descent, Stage as Stage, spread_turns as spread_turns
+from mixpose.search.problem import (
+    LIVE as LIVE,
+    THOROUGH as THOROUGH,
+    SearchBudget as SearchBudget,
+    is_pointlike as is_pointlike,
+    peaks as peaks,
+)
+from mixpose.search.search import (
+    Candidate as Candidate,
+    SearchReport as SearchReport,
+    SearchResult as SearchResult,
+    SearchState as SearchState,
+    search_frame as search_frame,
+    sparse as sparse,
+)
+from mixpose.search.three_points import (
+    SIDES as SIDES,
+    align_triples as align_triples,
+    depths as depths,
+    far_apart as far_apart,
+)

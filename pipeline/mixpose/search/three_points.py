@@ -1,6 +1,6 @@
-"""Poses from three points of the body and their places, or rays that meet in one centre (P3P).
+"""Guesses from three points of the body: at three places, or seen in three rays of one camera.
 
-The distances λ along the rays solve three quadratic equations
+Of rays that meet in one centre (P3P) the distances λ along the rays solve three quadratic equations
 ``λ_i² + λ_j² − 2 λ_i λ_j cos_ij = d_ij²``.  Two combinations without constant term are conics in
 the ratios of the λ; a member of their pencil that falls apart into two lines (a root of a cubic)
 is cut with another, which leaves two quadratic equations: at most four solutions
@@ -12,16 +12,26 @@ runs over long rows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+from itertools import combinations, permutations, product
+from math import comb, perm
+from typing import Any, NamedTuple, TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts
+from mixpose.search.problem import SearchProblem
+from mixpose.sensors import Rays
+
+Triples: TypeAlias = tuple[Indices, Indices]  # (3, K) detections, and the features they may be
 
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers
 
-SIDES = ((0, 1), (0, 2), (1, 2))
+SIDES = [(0, 1), (0, 2), (1, 2)]
 FIRST, SECOND = np.transpose(SIDES)
 
 
@@ -31,18 +41,10 @@ def gathered(points: Floats, corners: Indices) -> Floats:
 
 
 def align_triples(body: Floats, world: Floats) -> Floats:
-    """Rigid motions that bring triangles onto triangles of about the same shape.
+    """T_world_object (K, 4, 4) that bring triangles onto triangles of about the same shape.
 
-    Parameters
-    ----------
-    body, world : (3, 3, K) array
-        Corners of the triangles: corner, coordinate, triangle.
-
-    Returns
-    -------
-    (K, 4, 4) array
-        T_world_object: centres coincide, planes coincide, and within the plane the turn is the
-        least-squares one.
+    Corners are (3, 3, K): corner, coordinate, triangle.  Centres and planes coincide; within the
+    plane the turn is the least-squares one.
     """
     (x, y, z), side, third = _shape(body)
     axes, side_world, third_world = _shape(world)
@@ -88,21 +90,10 @@ def _dot(a: Floats, b: Floats) -> Floats:
 
 
 def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
-    """Distances from the centre to three points of a triangle.
+    """Positive distances (3, S) from the centre to three points, and which problem (S,) they solve.
 
-    Parameters
-    ----------
-    cosines : (3, K) array
-        Of the angles between rays 0 and 1, 0 and 2, 1 and 2.
-    squared : (3, K) array
-        Squared distances between points 0 and 1, 0 and 2, 1 and 2.
-
-    Returns
-    -------
-    (3, S) array
-        Positive distances of every solution.
-    (S,) int array
-        The problem that it solves.
+    Of K problems: cosines of the angles between rays, and squared distances between points, 0 and
+    1, 0 and 2, 1 and 2 (3, K) each.
     """
     with np.errstate(all="ignore"):
         D1, D2 = _conics(cosines, squared)
@@ -122,8 +113,7 @@ def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
 
 def _conics(cosines: Floats, squared: Floats) -> tuple[Floats, Floats]:
     """M01 d12² − M12 d01² and M02 d12² − M12 d02² (3, 3, K), where λᵀ M_ij λ = d_ij²."""
-    (c01, c02, c12), (a01, a02, a12) = -cosines, squared
-    o = np.zeros_like(a01)
+    (c01, c02, c12), (a01, a02, a12), o = -cosines, squared, np.zeros_like(squared[0])
     D1 = [[a12, c01 * a12, o], [c01 * a12, a12 - a01, -c12 * a01], [o, -c12 * a01, -a01]]
     D2 = [[a12, o, c02 * a12], [o, -a02, -c12 * a02], [c02 * a12, -c12 * a02, a12 - a02]]
     return np.array(D1), np.array(D2)
@@ -207,3 +197,112 @@ def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, list[Floats]]:
         slopes += [x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]]
         sides[k] = x[i] * slopes[-2] + x[j] * slopes[-1]
     return sides, slopes
+
+
+class Generator(NamedTuple):
+    """A way to make guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
+
+    name: str
+    batches: Iterable[Any]
+    poses: Callable[[Any], Floats]
+
+
+def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Generator:
+    """Poses from triples of one camera's rays, whose detections err by `reach` px at most."""
+    solve = _perspective if rays.central else _orthographic
+    chunks = _problems(problem, rays) if min(len(rays), len(problem.body)) > 2 else []
+    return Generator("three rays", chunks, partial(solve, problem.body.means, reach, rays))
+
+
+def far_apart(points: Floats, count: int) -> Indices:
+    """Indices of points that are far from one another, starting at the outermost."""
+    distance, chosen = np.linalg.norm(points - points.mean(axis=0), axis=1), list[int]()
+    for k in range(min(count, len(points))):
+        chosen.append(int(distance.argmax()))
+        from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
+        distance = np.minimum(distance, from_last) if k else from_last
+    return np.array(chosen)
+
+
+def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
+    """Chunks of problems: three detections (3, K) as three features (3, K).
+
+    All, where they can be tried; else of detections and features those far apart first, which
+    fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
+    near detections as features that are near each other, at random.
+    """
+    budget, features, cameras = problem.budget, problem.body.means, len(problem.cameras)
+    rng = np.random.default_rng(problem.seed)
+    n, M, batch, most = len(features), len(rays), budget.batch, budget.max_problems
+    if cameras > 1:  # a hit of one is enough: of half as many, one of two misses 1 body in 24
+        most //= 4 * cameras
+    all_tried = comb(M, 3) * perm(n, 3) <= most
+    if all_tried or budget.crowded * n >= M:
+        detections, corners = np.arange(M), np.arange(n)
+        if not all_tried:
+            most //= 2
+            detections = far_apart(rays.pixels, 3 * budget.sample // 2)
+            corners = far_apart(features, budget.sample)
+        by_detection = np.array(list(combinations(detections, 3)), dtype=np.intp).T
+        by_feature = np.array(list(permutations(corners, 3)), dtype=np.intp).T
+        order = rng.permutation(by_detection.shape[1] * by_feature.shape[1])[:most]
+        for start in range(0, len(order), batch):
+            a, b = np.divmod(order[start : start + batch], by_feature.shape[1])
+            yield by_detection[:, a], by_feature[:, b]
+    if all_tried:
+        return
+    near_rays, near_features = _nearest(rays.pixels), _nearest(features)
+    # a body is seen in one place, larger or smaller
+    crowds = [budget.sample, 2 * budget.sample, 4 * budget.sample, M]
+    for k in range(most // batch):
+        crowd = crowds[k % len(crowds)]
+        some, few = min(crowd, M), min(max(crowd // 2, 3), n)
+        yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
+
+
+def _nearest(points: Floats) -> Indices:
+    """Indices (n, n) of points, from each of them to its farthest."""
+    return np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
+
+
+def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
+    """Random triples (3, count): a point, and two of the `crowd - 1` nearest to it."""
+    first = rng.integers(0, len(nearest), count)
+    chosen = np.argsort(rng.random((count, crowd - 1)), axis=1)[:, :2].T + 1
+    return np.stack([first, *nearest[first, chosen]])
+
+
+def _perspective(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
+    """Rays that meet in one centre."""
+    detections, corners = triples
+    between = rays.directions @ rays.directions.T
+    squared = ((features[corners[FIRST]] - features[corners[SECOND]]) ** 2).sum(axis=-1)
+    distances, which = depths(between[detections[FIRST], detections[SECOND]], squared)
+    # smaller than the error in the image, nothing is told apart
+    largest = np.sqrt(squared.max(axis=0))[which]
+    near = largest > reach * rays.slope * distances.min(axis=0)
+    distances, which = distances[:, near], which[near]
+    directions = gathered(rays.directions, detections[:, which])
+    world = rays.origins[0][:, None] + directions * distances[:, None]
+    return align_triples(gathered(features, corners[:, which]), world)
+
+
+def _orthographic(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
+    """Three parallel rays: the sides' lengths give depth differences, which must add up.
+
+    The depth of the whole is not seen; the middle is put on the sensor's plane.
+    """
+    detections, corners = triples
+    body, seen = gathered(features, corners), gathered(rays.origins, detections)
+    tolerance = 2 * reach * rays.offset
+    length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))
+    rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
+    rise[flat > length + tolerance] = np.nan
+    direction = rays.directions[0][:, None]
+    poses = []
+    for sign, mirror in product((1.0, -1.0), repeat=2):
+        good = np.abs(np.abs(rise[1] - sign * rise[0]) - rise[2]) <= tolerance
+        depth = mirror * np.array([0 * rise[0], sign * rise[0], rise[1]])[:, None, good]
+        world = seen[..., good] + (depth - depth.mean(axis=0)) * direction
+        poses.append(align_triples(body[..., good], world))
+    return np.concatenate(poses)

@@ -1,0 +1,257 @@
+"""Guesses of several cameras: points in space where their rays meet, as features of the body.
+
+Three points find triangles of features by the lengths of their sides.  Where cameras see different
+features, few points are known: seen from one of them, a feature at a known distance lies where its
+ray cuts a sphere, and two such features must be as far apart as they are on the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mixpose.body import Body
+from mixpose.records import Floats, Indices, Mask, Singles
+from mixpose.search.problem import SearchProblem
+from mixpose.search.three_points import FIRST, SECOND, Generator, align_triples, far_apart, gathered
+from mixpose.sensors import Rays
+
+
+class TriangulatedPoints(NamedTuple):
+    """Points where a ray of one sensor comes close to a ray of another."""
+
+    points: Floats  # (P, 3) in the world
+    tolerance: Floats  # (P,) how far off the point may be, in length units
+    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
+    sensors: Indices  # (P, 2) the two sensors, first before second
+    rays: Indices  # (P, 2) the ray of either sensor
+
+
+def triangulate(
+    rays: Sequence[Rays], gates: Sequence[float], min_sine: float
+) -> TriangulatedPoints:
+    """All pairs of rays of two sensors or more that meet within the error of the detections.
+
+    That is a gate in px, one per sensor; `min_sine` is of an angle that still fixes a depth.
+    """
+    meetings = []
+    for first, second in combinations(range(len(rays)), 2):
+        a, b = rays[first], rays[second]
+        apart = b.origins[None] - a.origins[:, None]
+        cosine = a.directions @ b.directions.T
+        along_a = (apart * a.directions[:, None]).sum(axis=-1)
+        along_b = (apart * b.directions[None]).sum(axis=-1)
+        sine2 = np.maximum(1 - cosine**2, 1e-300)
+        s = (along_a - cosine * along_b) / sine2
+        t = (cosine * along_a - along_b) / sine2
+        on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
+        on_b = b.origins[None] + t[..., None] * b.directions[None]
+        gap = np.linalg.norm(on_a - on_b, axis=-1)
+        tolerance = np.hypot(
+            gates[first] * (a.offset + a.slope * np.abs(s)),
+            gates[second] * (b.offset + b.slope * np.abs(t)),
+        )
+        good = (gap <= tolerance) & (sine2 > min_sine**2)
+        good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
+        pairs = np.argwhere(good)
+        meetings.append(
+            (
+                0.5 * (on_a[good] + on_b[good]),
+                tolerance[good] / np.sqrt(sine2[good]),
+                gap[good] / tolerance[good],
+                np.broadcast_to([first, second], pairs.shape),
+                pairs,
+            )
+        )
+    return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
+
+
+def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> TriangulatedPoints:
+    """The points that most sensors confirm, the closest first, each place once.
+
+    They are combined in this order (PROSAC, Chum and Matas, CVPR 2005).
+    """
+    places, (support, error) = points.points, np.zeros((2, len(points.points)))
+    # the first of forty triples each
+    kept, most = list[int](), problem.budget.max_triples // 40
+    if len(problem.cameras) == 2:  # every feature once
+        kept = np.argsort(points.gap, kind="stable").tolist()
+    else:
+        for sensor, _ in problem.cameras:
+            y, seen = sensor.view.sensor.project(places)
+            reach = problem.reach(sensor)
+            away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
+            met = seen & np.isfinite(away)
+            support += met
+            error += np.where(met, away / reach, 0.0)
+        left = np.ones(len(places), dtype=np.bool_)
+        for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
+            if left[k] and len(kept) < most:
+                kept.append(k)
+                left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
+    first = np.array(kept[:most], dtype=np.intp)
+    return TriangulatedPoints._make(array[first] for array in points)
+
+
+def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
+    """Poses of triples of points, the most promising first."""
+    budget = problem.budget
+    corners, tree = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
+    enough = len(corners) and len(points.points) > 2
+    batches = _point_triples(problem, points) if enough else ()
+    return Generator("point triples", batches, partial(_of_triples, problem, points, corners, tree))
+
+
+@lru_cache(maxsize=16)
+def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices, cKDTree]:
+    """Ordered triples (K, 3) of features that span a triangle, and a tree of their sides (K, 3).
+
+    Of `count` features far apart.  Left out are triangles whose height is a smaller share of the
+    longest side than `min_sine`.
+    """
+    few = np.sort(far_apart(body.means, count))
+    corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
+    sides = _sides(body.means, corners)
+    wide = _is_wide(sides, min_sine)
+    return corners[wide], cKDTree(sides[wide].reshape(-1, 3))
+
+
+def _of_triples(
+    problem: SearchProblem,
+    points: TriangulatedPoints,
+    corners: Indices,
+    tree: cKDTree,
+    triples: Indices,
+) -> Floats:
+    """Poses that bring triangles of features onto those of triples (K, 3) of points."""
+    budget, body = problem.budget, problem.body
+    # of a side between two features that give way
+    bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
+    sides = _sides(points.points, triples)
+    slack = 2 * points.tolerance[triples].max(axis=1) + bent
+    possible = _is_wide(sides, budget.min_sine) & (sides.max(axis=1) < tree.data.max() + slack)
+    triples, sides = triples[possible], sides[possible]
+    squares = points.tolerance[triples] ** 2
+    allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bent**2)
+    away, index = tree.query(
+        sides,
+        k=np.arange(1, min(2 * budget.sample, len(corners)) + 1),
+        distance_upper_bound=float(allowed.max(initial=0.0)) * np.sqrt(3),
+    )
+    which, rank = np.nonzero(np.isfinite(away))
+    chosen = index[which, rank]
+    alike = (np.abs(sides[which] - tree.data[chosen]) <= allowed[which]).all(axis=1)
+    features, world = corners[chosen[alike]], triples[which[alike]]
+    return align_triples(gathered(body.means, features.T), gathered(points.points, world.T))
+
+
+def _point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterator[Indices]:
+    """Batches of triples (K, 3) of points that share no ray, the most promising first."""
+    rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
+    # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
+    most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
+    triples = _combinations(min(len(points.points), most))
+    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
+    size, end = problem.budget.batch // 32, 0
+    while end < len(triples):
+        start, end = end, end + min(max(end, size), 8 * size)
+        batch = triples[start:end]
+        six = np.sort(rays[batch].reshape(-1, 6), axis=1)
+        yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
+
+
+@lru_cache(maxsize=64)
+def _combinations(count: int) -> Indices:
+    """Triples (K, 3) of numbers below `count`, those of the first numbers first."""
+    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
+    return triples[np.argsort(triples[:, 2], kind="stable")]
+
+
+def _sides(points: Floats, triples: Indices) -> Floats:
+    sides = points[triples[:, FIRST]] - points[triples[:, SECOND]]
+    return np.asarray(np.linalg.norm(sides, axis=2))
+
+
+def _is_wide(sides: Floats, min_sine: float) -> Mask:
+    """Whether triangles with sides (K, 3) have a height, as a share of the longest side."""
+    a, b, c = np.sort(sides, axis=1).T
+    # Heron's formula; twice the area is height times longest side
+    area4 = np.maximum((a + b + c) * (a + b - c) * (a - b + c) * (b + c - a), 0.0)
+    return np.asarray(np.sqrt(area4) / 2 > min_sine * c * c)
+
+
+def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
+    """Poses with one point in space as each feature, point by point, the most promising first."""
+    most = min(len(points.points), 2 * problem.budget.sample)
+    return Generator("point and rays", range(most), partial(_of_point, problem, points))
+
+
+def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:
+    """For a point as each feature, where rays cut the spheres on which the others lie."""
+    means, budget = problem.body.means, problem.budget
+    features = means[far_apart(means, budget.sample)]
+    distances = np.linalg.norm(features[:, None] - features, axis=-1)
+    origins, directions, across, along, error, start = _rays_near(problem, points, p)
+    most, body, world = budget.batch // len(features), [], []
+    for i, distance in enumerate(distances):
+        half2 = distance**2 - across[:, None] ** 2
+        cuts = (half2 >= 0) | (np.abs(across[:, None] - distance) <= error[:, None])
+        cuts[:, i] = False
+        half = np.sqrt(np.maximum(half2[cuts], 0.0))
+        ray, feature = np.tile(np.nonzero(cuts), 2)
+        depth = along[ray] + np.concatenate([half, -half])
+        ahead = depth > start[ray]
+        ray, feature, depth = ray[ahead], feature[ahead], depth[ahead]
+        places = origins[ray] + depth[:, None] * directions[ray]
+        off = _off(places, distances.astype(np.float32)[np.ix_(feature, feature)])
+        allowed = (np.sqrt(0.5) * error[ray]).astype(np.float32)
+        a, b = np.nonzero(off <= allowed + allowed[:, None])
+        apart = (a < b) & (ray[a] != ray[b]) & (feature[a] != feature[b])
+        a, b = a[apart], b[apart]
+        if len(a) > most:
+            best = np.argpartition(off[a, b], most)[:most]
+            a, b = a[best], b[best]
+        body.append(features[np.stack([np.full(len(a), i), feature[a], feature[b]])])
+        point = np.broadcast_to(points.points[p], (len(a), 3))
+        world.append(np.stack([point, places[a], places[b]]))
+    return align_triples(*(np.concatenate(one, axis=1).swapaxes(1, 2) for one in (body, world)))
+
+
+def _rays_near(problem: SearchProblem, points: TriangulatedPoints, p: int) -> tuple[Floats, ...]:
+    """Rays that pass nearest to a point, without those that made it.
+
+    Origins (R, 3), directions (R, 3), distances of the point across and along them, by how much a
+    place on them may be off, and where they start (R,).
+    """
+    parts = []
+    for k, (sensor, rays) in enumerate(problem.cameras):
+        used = points.rays[p][points.sensors[p] == k]
+        rest = rays.select(np.setdiff1d(np.arange(len(rays)), used))
+        away = points.points[p] - rest.origins
+        along = (away * rest.directions).sum(axis=1)
+        across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
+        error = problem.reach(sensor) * (rest.offset + rest.slope * np.abs(along))
+        error = np.hypot(error, points.tolerance[p])
+        start = np.full(len(rest), 0.0 if rest.central else -np.inf)
+        parts.append((rest.origins, rest.directions, across, along, error, start))
+    columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    nearest = np.argsort(columns[2], kind="stable")[: 3 * problem.budget.sample]
+    return tuple(column[nearest] for column in columns)
+
+
+def _off(places: Floats, expected: Singles) -> Singles:
+    """How far pairs of places (K, 3) are from the expected distance (K, K)."""
+    x = (places - places[:1]).astype(np.float32)
+    squares = (x * x).sum(axis=1)
+    # in place: the arrays are large
+    off = -2 * x @ x.T
+    off += squares
+    off += squares[:, None]
+    np.sqrt(np.maximum(off, 0, out=off), out=off)
+    off -= expected
+    return np.asarray(np.abs(off, out=off))
