@@ -171,7 +171,7 @@ def _starts(problem: SearchProblem) -> Floats:
         rays = one.view.sensor.rays(mean[None])
         if rays is None:
             source = one.view.sensor.towards(np.zeros(3))
-            starts += [source + sign * mean * axis for sign in (1, -1) for axis in np.eye(3)]
+            starts += [source + sign * mean[0] * axis for sign in (1, -1) for axis in np.eye(3)]
         elif len(rays):
             # a body as large as its features' spread is seen
             across = max(spread, one.sigma) * rays.slope
