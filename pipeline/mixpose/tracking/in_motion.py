@@ -16,8 +16,7 @@ import numpy as np
 
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverses, nearest_alike
-from mixpose.matching import ErrorRules, Matches, associate, errors_seen
-from mixpose.objective import View
+from mixpose.matching import LEAST_VARIANCE, ErrorRules, Matches, associate, errors_seen
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
@@ -27,7 +26,6 @@ from mixpose.tracking.track import DelayEvidence
 
 LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
 SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
-LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
 SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
 
 
@@ -39,6 +37,7 @@ class Offsets(NamedTuple):
     offsets: Floats  # (K,), observed minus predicted
     sensor: Indices  # (K,)
     unsure: tuple[tuple[int, float], ...]  # sensors with estimated delays, standard deviations
+    beside: float  # how far features may be off by velocity and delay, in σ_ε
 
     def by_delay(self, velocity: Floats, sensors: Sequence[int]) -> Floats:
         """How the features of some sensors would move with their delays, (K, q) per second."""
@@ -87,17 +86,15 @@ def fit_in_motion(
     σ_ε, to the best pose near it.
     """
     motion = frame.expected(T_start, is_there=False).at(T_start)
-    T, expected, moved, rules = T_start, frame.expected(T_start), np.inf, frame.rules.judgement
+    T, moved, rules = T_start, np.inf, frame.rules.judgement
     errors = rules.noise.errors
     for _ in range(6):
-        seen = frame.in_motion(motion)
+        seen, expected = frame.in_motion(motion), frame.expected(T)
         if moved > LINEAR:
-            at, views = seen.finest.projection.project(T[None]), (frame.still or frame).views
-            J, there = at.J[:, 0] / np.array(seen.sigmas)[:, None, None, None], at.seen[:, 0]
-            late = _seconds(views, at.y[:, 0], there)
-            fit = climb(seen, T, _unsure_by(J, late, there, views, expected))
+            matches = associate(seen.finest, T, rules.association, errors.narrowest)
+            fit = climb(seen, T, offsets_of(seen, matches, expected).beside)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
-        expected = frame.expected(T)
+            expected = frame.expected(T)
         matches = associate(seen.finest, T, rules.association, errors.narrowest)
         met = offsets_of(seen, matches, expected)
         change = _change(met, motion.velocity, expected, frame.free, errors)
@@ -135,15 +132,20 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
     """
     names = [view.name for view in frame.views]
     chosen = [names.index(name) for name in matches.names]
-    views, blurs = [(frame.still or frame).views[k] for k in chosen], np.ones(len(chosen))
-    seen = matches.weights > 0
-    late = _seconds(views, matches.places, seen)
+    views, seen = [(frame.still or frame.views)[k] for k in chosen], matches.weights > 0
+    pairs = zip(views, matches.places, strict=True)
+    seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in pairs]
+    late, blurs, beside = np.where(seen, seconds, 0.0), np.ones(len(chosen)), 0.0
     if expected is not None:
+        delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
+        speed = np.hypot(expected.velocity, expected.deviation)
+        ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
+        squares = ((matches.J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
+        beside = float(np.sqrt(squares.max(initial=0.0, where=seen)))
         errors, known = frame.rules.judgement.noise.errors, frame.noise[:, chosen]
         noise = errors_seen(matches, int(frame.free.sum()), known, errors).blurs
         # a pose that was climbed to at another velocity is off by as much in all sensors
-        unsure = _unsure_by(matches.J, late, seen, views, expected)
-        blurs = np.minimum(np.hypot(noise, errors.blur * unsure), 1.0)
+        blurs = np.minimum(np.hypot(noise, errors.blur * beside), 1.0)
     pull = np.sqrt(matches.shares * np.exp(-0.25 * matches.squared / blurs[:, None] ** 2))
     kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
     numbers = np.arange(len(views))[:, None, None]
@@ -153,25 +155,8 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         offsets=(matches.offsets * pull[..., None])[kept],
         sensor=np.broadcast_to(numbers, kept.shape)[kept],
         unsure=tuple((k, view.unsure) for k, view in enumerate(views) if view.unsure is not None),
+        beside=beside,
     )
-
-
-def _seconds(views: Sequence[View], y: Floats, seen: Mask) -> Floats:
-    """Seconds (L, n) after the common time at which features at places (L, n, 2) are seen."""
-    each = zip(views, y, strict=True)
-    late = [moments(view.sensor, own, view.delay, view.readout) for view, own in each]
-    return np.where(seen, late, 0.0)
-
-
-def _unsure_by(
-    J: Floats, late: Floats, seen: Mask, views: Sequence[View], expected: Expected
-) -> float:
-    """How far features may be off by velocity and delay, in σ_ε; J (L, n, 2, 6) in σ_ε."""
-    delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
-    speed = np.hypot(expected.velocity, expected.deviation)
-    ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
-    squares = ((J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
-    return float(np.sqrt(squares.max(initial=0.0, where=seen)))
 
 
 def _change(

@@ -26,7 +26,7 @@ from mixpose.tracking.associations import (
 )
 from mixpose.tracking.frame import Frame, given
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
-from mixpose.tracking.track import Prediction
+from mixpose.tracking.track import Branch
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Start:
 
     T_world_object: Floats  # (4, 4)
     uncertainty: Floats | None = None  # (6,), standard deviations; None: the pose is there already
-    prediction: Prediction | None = None  # that it comes from
+    prediction: Branch | None = None  # that it comes from
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
@@ -48,18 +48,19 @@ class MatchedLikelihood:
         self.frame = frame
         # whether each feature's detection is known, so that one may be left out
         self.knows_detections = frame.options.objective == "matched"
+        # from the first prediction, where several bodies were fitted together
+        self.together: tuple[Fit, ScoredPose] | None = None
         self._climbed: dict[frozenset[str], list[Fit]] = {}  # by sensors left out
 
     def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
-        uncertainty = start.uncertainty
+        uncertainty, frame = start.uncertainty, self.frame.without(start.left_out)
         if uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        frame, known = self.frame.without(start.left_out), self.frame.begun
-        if known is not None and known.fit and start.prediction is frame.predictions[0]:
-            return known.fit
+        if self.together and start.prediction is frame.predictions[0]:
+            return self.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
-        climbed = self._climbed.setdefault(frozenset(start.left_out), [])
+        climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, start.T_world_object) if self.knows_detections else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
@@ -72,7 +73,7 @@ class MatchedLikelihood:
                 seen.samples,
                 finest=seen.finest,
                 begun=begun,
-                climbed=None if timed else climbed,
+                climbed=climbed,
                 blur=start.blur,
                 noise=seen.noise,
                 beside=max(beside, spread),
@@ -87,9 +88,9 @@ class MatchedLikelihood:
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
-        begun, frame, motion = self.frame.begun, self.frame, fit.motion
-        if begun is not None and fit is begun.fit and begun.judged is not None:
-            return begun.judged
+        frame, motion = self.frame, fit.motion
+        if self.together and fit is self.together[0]:
+            return self.together[1]
         T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         if frame.is_timed:
             motion = motion or frame.expected(T).at(T)
@@ -125,7 +126,7 @@ class AssociationLikelihood:
     def fit(self, start: Start) -> Fit:
         """Climb the posterior, at first with ranges that err as far as the prior may."""
         T, frame, known, widths = start.T_world_object, self.frame, start.prediction, [self._noise]
-        if known is None or not known.is_prior:  # nothing is known: matched densities lead there
+        if known is None or known.spread is None:  # nothing is known: matched densities lead there
             T = MatchedLikelihood(frame).fit(start).T_world_object
             T = nearest_alike(T, frame.body, frame.T_reference)
         else:
@@ -169,7 +170,7 @@ class AssociationLikelihood:
         """Likelihood and prior, of ranges that err by so much in σ_ε."""
         frame, known, detection = self.frame, start.prediction, self.frame.rules.judgement.detection
         terms: list[Term] = [AssociationTerm(frame.views, frame.body, frame.free, noise, detection)]
-        if known is not None and known.is_prior:
+        if known is not None and known.spread is not None:
             terms.append(NormalPrior(known.T_world_object, known.uncertainty, frame.free))
         return Sum(tuple(terms))
 

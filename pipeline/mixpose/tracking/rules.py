@@ -9,7 +9,7 @@ from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.associations import RangeRules
-from mixpose.tracking.motion import CourseRules, MotionRules
+from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.static_clutter import StaticRules
 
 
@@ -60,7 +60,6 @@ class Rules:
     judgement: JudgementRules = JudgementRules()
     acceptance: AcceptanceRules = AcceptanceRules()
     motion: MotionRules = MotionRules()
-    course: CourseRules = CourseRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()
