@@ -228,7 +228,7 @@ _GATING = (
 _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-any-clutter",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
@@ -236,7 +236,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-missed-for-free",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "missed = expected * np.log(1 - probability) +",
         "missed = 0 * expected +",
         "poses whose tags have no range are as good as those that meet all",
@@ -244,7 +244,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-noise-never-learnt",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "return max(1.0, float(np.sqrt(squares / degrees)))",
         "return 1.0",
         "ranges that err by more than said are believed",

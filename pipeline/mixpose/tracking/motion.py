@@ -83,10 +83,7 @@ class RandomWalk:
         return cls(squares / max(elapsed, 1e-9), rules.guess_weight, rules)
 
     def joined(self, moved: Floats, radius: float, elapsed: float) -> RandomWalk:
-        """Add a displacement (6,) of a body of some radius to what is remembered.
-
-        A turn is not unlikely for not having been seen so far: features that shift may turn, too.
-        """
+        """Add a displacement (6,) of a body of some radius; what only shifted so far may turn."""
         lever = np.repeat([1.0, radius], 3)
         squares = ((moved * lever) ** 2).reshape(2, 3)
         # of the lengths and of the angles, the mean of those that are not zero

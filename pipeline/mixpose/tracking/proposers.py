@@ -44,8 +44,7 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
-    Of a body that was followed for some frames it is enough that no more is missed all at once:
-    what slips by a step of its grid, or turns over, meets less.
+    Once it was followed for some frames, a pose convinces that misses no more all at once.
     """
     if not ranked:
         return True
@@ -144,30 +143,27 @@ def candidates_of(frame: Frame) -> list[Candidate]:
 def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Poses at which the body looks the same, or nearly so, as at the best pose of the frame.
 
-    What is met there may lie like other features: a chessboard of which a rim is hidden explains
-    what is seen a step of its grid off, too.  A flat body that is small in an image looks almost
-    the same tilted the other way.  The sum of evidence tells which is right, or that none can.
+    What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
+    that is small in an image looks almost the same tilted the other way.
     """
     kinds = frame.rules.look_alikes.kinds
     best = None
     # once more, where what is moved is better and meets more
     for _ in range(2 if "congruent" in kinds else 0):
-        if not ranked or ranked[0] is best:
-            break
-        best = ranked[0]
-        yield from _as_evident(frame, best)
+        if ranked and ranked[0] is not best:
+            best = ranked[0]
+            yield from _as_evident(frame, best)
     if ranked and "tilted" in kinds:
-        close = frame.start_uncertainty / frame.rules.proposals.narrowing
+        moved = _moves_alike(frame, ranked[0].T_world_object)
         for T in _tilted(frame, ranked[0]):
-            yield Start(T, close, T_moved=_moves_alike(frame, ranked[0].T_world_object))
+            yield Start(T, frame.close * frame.rules.proposals.narrowing, T_moved=moved)
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
     """In words, if one of the rivals is a look-alike of the best pose; else empty."""
-    alike = _congruent(frame, best)
+    T, body, alike = best.T_world_object, frame.body, _congruent(frame, best)
     if not alike:
         return ""
-    T, body = best.T_world_object, frame.body
     corners = np.vstack([body.means.T, np.ones(len(body))])
     points = np.array([T @ one.T_body_other for one in alike]) @ corners
     for rival in rivals:
@@ -199,14 +195,10 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
 
 
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The best pose moved, where as much is met and motion does not tell against it.
-
-    What motion says against a pose must be made up for by features that it meets more.
-    """
-    alike = _congruent(frame, best)
+    """The best pose moved, where it meets as much, and more where motion tells against it."""
+    rules, T, alike = frame.rules, best.T_world_object, _congruent(frame, best)
     if not alike:
         return
-    rules, T = frame.rules, best.T_world_object
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
     met = float(best.matches.met.max())
     # the value grows as the square of the features met
@@ -249,8 +241,8 @@ def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> 
 def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
     """Sensors that see the body elsewhere than two others or more do.
 
-    One that meets little of it, with as many detections beside it that belong to nothing; or one
-    whose residuals are far larger than the others', more than chance would make them.
+    They meet little of it, with as many detections beside it that belong to nothing, or with
+    residuals that are far larger than the others', more than chance would make them.
     """
     agreeing = seen.coverage >= rules.agreeing
     apart = ~agreeing & (seen.expected > 0)
@@ -284,7 +276,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
 
 
 def _paired(seen: Matches, reach: float) -> Matches:
-    """Two features in one: in each sensor the one not met nearest to the detection of another.
+    """In each sensor the feature missed nearest to the detection of another, as one with that.
 
     `reach` is how far that may be, squared, in variances of C.
     """
@@ -316,9 +308,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
 
     Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
-    if not judged.is_unlike or not likelihood.knows_detections:
-        return
-    if any(view.observation.cell is not None for view in frame.views):
+    has_cells = any(view.observation.cell is not None for view in frame.views)
+    if not judged.is_unlike or not likelihood.knows_detections or has_cells:
         return
     errors = frame.rules.judgement.noise.errors
     variances = pooled(frame.noise, errors, errors.typical_degrees)

@@ -8,7 +8,6 @@ from mixpose.constants import constant
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
-from mixpose.tracking.associations import RangeRules
 from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.static_clutter import StaticRules
 
@@ -50,6 +49,15 @@ class LookAlikeRules:
         14.0,
         "coordinates met beyond six up to which it may be by chance: 5 features, 2 cameras",
     )
+
+
+@dataclass(frozen=True)
+class RangeRules:
+    """What is believed of single ranges."""
+
+    max_features: int = constant(8, "of a body: the subsets that are summed double with each")
+    stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
+    min_information: float = constant(0.02, "of that of known labels, which any direction has")
 
 
 @dataclass(frozen=True)

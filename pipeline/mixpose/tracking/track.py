@@ -37,16 +37,13 @@ class Branch:
     course: Course | None = None  # for its velocity at a moment, there
 
     def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> float:
-        """Of a pose before the frame that this predicts, in the directions that are free.
-
-        How far a prediction errs is known from a step or two: errors are Student's.
-        """
+        """Of a pose before the frame that this predicts, in the directions that are free."""
         u = self.uncertainty[free]
         scaled = twist_between(self.T_world_object, T_world_object)[free] / u
         count, volume = len(u), float(np.log(u).sum())
         if self.spread is not None:
             return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
-        n = rules.known_from
+        n = rules.known_from  # from a step or two: errors are Student's
         peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
         tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
         return count * peak - tails - volume
@@ -64,8 +61,6 @@ class DelayEvidence:
     @cached_property
     def seconds(self) -> Mapping[str, DelaySeen]:
         """How late each sensor is, as far as it is known, and how surely."""
-        if not self.names:
-            return {}
         inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / UNKNOWN_S**2)
         late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
         return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
@@ -80,8 +75,8 @@ class DelayEvidence:
         for k, view in enumerate(views):
             if view.unsure is not None:
                 late = self.seconds.get(view.name, DelaySeen(0.0, UNKNOWN_S))
-                told = replace(view, unsure=late.deviation, estimated=late.seconds)
-                applied[k] = replace(told, delay=view.delay + late.seconds)
+                known = replace(view, unsure=late.deviation, estimated=late.seconds)
+                applied[k] = replace(known, delay=view.delay + late.seconds)
         # a clock that differs by ten standard deviations is not the same: none is late then
         longest = min(10 * UNKNOWN_S, np.inf if elapsed is None else max(elapsed, 0.0))
         if all(abs(view.delay) <= longest for view in applied):
@@ -91,10 +86,7 @@ class DelayEvidence:
 
 @dataclass(frozen=True)
 class Companion:
-    """The poses of a body seen from another one, in frames that were sure of both.
-
-    They tell where a limb, or a tool, may be beside another that is sure.
-    """
+    """The poses of a body, a limb say, seen from another one, in frames that were sure of both."""
 
     T_other_object: Floats  # (4, 4), their mean
     squares: Floats  # (6,), mean squared twists from it, in the axes of the other body
@@ -106,8 +98,7 @@ class Companion:
     ) -> Companion:
         """What was known, and one more frame that is sure of both."""
         T = inverse(T_world_other) @ T_world_object
-        if before is None:
-            return cls(T, np.zeros(6), 1)
+        before = before or cls(T, np.zeros(6), 0)
         away = twist_between(before.T_other_object, nearest_alike(T, body, before.T_other_object))
         n = before.count + 1
         squares = before.squares + (away**2 * (1 - 1 / n) - before.squares) / n
@@ -187,10 +178,7 @@ def predict(
 
 
 def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
-    """What the body's own track lets expect of a pose, or another body, the less the more misses.
-
-    Both are densities: no more poses made by chance are believed than without the other body.
-    """
+    """What a body's own track lets expect of a pose, or another body, the less the more misses."""
     share = rules.beside * (1 - rules.surprise) ** misses
     mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
     spread = own.spread if mine > theirs else beside.spread
