@@ -21,7 +21,7 @@ from mixpose.records import Estimate, PointPattern, RawFrame
 from mixpose.rigid import transform
 from mixpose.selection import Selection
 from mixpose.session import Session
-from mixpose.tracking import Expectation, Prediction
+from mixpose.tracking import Branch, Expectation
 
 Floats = NDArray[np.float64]
 Edit = Callable[[str, int, NDArray[np.uint8]], None]
@@ -222,8 +222,8 @@ def test_windows_hold_the_features_however_the_body_may_have_moved(session: Sess
     expectation = Expectation(session.body, cameras, np.ones(6, dtype=np.bool_))
     assert session.start is not None
     T = session.start.T_world_object
-    narrow = expectation.windows([Prediction(T, np.full(6, 1e-6), 1.0)])
-    wide = expectation.windows([Prediction(T, np.repeat([8.0, 0.02], 3), 1.0)])
+    narrow = expectation.windows([Branch(T, 1.0, np.full(6, 1e-6))])
+    wide = expectation.windows([Branch(T, 1.0, np.repeat([8.0, 0.02], 3))])
     for name, sensor in cameras.items():
         y, _ = sensor.project(transform(T, session.body.means))
         u0, v0, u1, v1 = narrow[name]
@@ -234,7 +234,7 @@ def test_windows_hold_the_features_however_the_body_may_have_moved(session: Sess
         assert wide[name][2] > u1 + 25
     away = T.copy()
     away[:3, 3] += 1e5
-    assert expectation.windows([Prediction(away, np.full(6, 1e-6), 1.0)]) == {}
+    assert expectation.windows([Branch(away, 1.0, np.full(6, 1e-6))]) == {}
 
 
 def test_recordings_without_images_have_no_windows(windows: list[Any]) -> None:

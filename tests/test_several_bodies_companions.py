@@ -88,13 +88,13 @@ def test_what_was_beside_is_a_mean_and_a_spread_that_narrows_with_the_frames() -
     rules = Rules().motion
     assert np.abs(known.T_other_object[:3, 3]).max() < 6  # 40 mm of 400 frames, three times
     # what is guessed counts as three frames: a radius, and 30 degrees
-    _, wide = known.expected(np.eye(4), other, rules)
+    wide = known.expected(np.eye(4), other, rules).uncertainty
     guess = 3 / 403 * np.array([other.radius] * 3 + [np.pi / 6] * 3) ** 2
     true = np.sqrt(np.array([5, 20, 40, 0.2, 0.2, 0.2]) ** 2 + guess)
     assert np.allclose(wide, true, rtol=0.12)  # three standard deviations of a spread of 400
     # a quarter turn of the other body turns what is known with it
     quarter = from_rotation_vector([0, 0, np.pi / 2], [0, 0, 0])
-    _, turned = known.expected(quarter, other, rules)
+    turned = known.expected(quarter, other, rules).uncertainty
     assert turned[[1, 0, 2]] == pytest.approx(wide[:3])
 
 

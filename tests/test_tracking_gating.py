@@ -11,8 +11,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.judgement import AcceptanceRules
 from mixpose.rigid import from_parts
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Expectation, Prediction, are_as_good, have_fewer, is_convincing
-from mixpose.tracking.track import SensorTally
+from mixpose.tracking import Branch, Expectation, are_as_good, have_fewer, is_convincing
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +27,7 @@ def body_of(*points: tuple[float, float, float], normals: Floats | None = None) 
 
 
 def window(body: Body, *places: tuple[float, float, float]) -> tuple[int, int, int, int]:
-    predictions = [Prediction(from_parts(np.eye(3), place), SURE, 1.0) for place in places]
+    predictions = [Branch(from_parts(np.eye(3), place), 1.0, SURE) for place in places]
     return Expectation(body, {"0": CAMERA}, FREE).windows(predictions)["0"]
 
 
@@ -64,24 +63,24 @@ def test_features_that_a_camera_does_not_see_have_no_part_in_its_window() -> Non
 
 @pytest.mark.parametrize(("count", "fewer"), [(7, True), (8, False), (9, False)])
 def test_fewer_detections_than_were_met_are_noticed(count: int, fewer: bool) -> None:
-    before = {"0": SensorTally(8, 8)}
+    before = {"0": (8, 8)}
     views = [view_of("0", CAMERA, np.zeros((count, 2)))]
     assert have_fewer(views, before) is fewer
     assert have_fewer(views, {}) is False
 
 
 def test_a_sensor_that_misses_one_more_is_not_as_good() -> None:
-    before = {"0": SensorTally(7, 8)}
-    assert are_as_good({"0": SensorTally(7, 8)}, before)
-    assert not are_as_good({"0": SensorTally(6, 8)}, before)
-    assert are_as_good({"1": SensorTally(0, 8)}, before)
+    before = {"0": (7, 8)}
+    assert are_as_good({"0": (7, 8)}, before)
+    assert not are_as_good({"0": (6, 8)}, before)
+    assert are_as_good({"1": (0, 8)}, before)
 
 
 def test_a_covered_camera_does_not_count_where_two_others_agree() -> None:
     tallies = {
-        "0": SensorTally(8, 8),
-        "1": SensorTally(7, 8),
-        "2": SensorTally(1, 8),
+        "0": (8, 8),
+        "1": (7, 8),
+        "2": (1, 8),
     }
     assert is_convincing(tallies, ["0", "1", "2"], AcceptanceRules())
     # of 16 features 9 are met

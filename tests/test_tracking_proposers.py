@@ -28,8 +28,13 @@ from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.proposers import PROPOSERS, look_alikes
-from mixpose.tracking.refinements import REFINEMENTS, merged_pair, narrowed
+from mixpose.tracking.proposers import (
+    PROPOSERS,
+    REFINEMENTS,
+    look_alikes,
+    merged_pair,
+    narrowed,
+)
 
 Floats = NDArray[np.float64]
 

@@ -24,15 +24,16 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import RangeSensor
 from mixpose.tracking import Rules, Tracker
-from mixpose.tracking.associations import (
+from mixpose.tracking.likelihood import (
     AssociationTerm,
-    RangeRules,
+    Start,
     _summed,
     are_associated,
+    likelihood_of,
     noise_ratio,
     sum_associations,
 )
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.rules import RangeRules
 
 Floats = NDArray[np.float64]
 

@@ -35,6 +35,7 @@ from mixpose.tracking import ASIDE, Rules, Track, Tracker
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import (
+    disagreeing,
     is_doubtful,
     look_alikes,
     multistart,
@@ -42,8 +43,7 @@ from mixpose.tracking.proposers import (
     searched,
     starts_around,
 )
-from mixpose.tracking.refinements import disagreeing
-from mixpose.tracking.track import Branch, SensorTally
+from mixpose.tracking.track import Branch
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ def data_of(tracker: Tracker, views: Sequence[View], track: Track | None = None)
 
 def test_every_place_where_the_body_may_be_is_a_start() -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    branches = tuple(Branch(T, 0.5, None, np.ones(6)) for T in (TRUTH, ELSEWHERE))
+    branches = tuple(Branch(T, 0.5, np.ones(6)) for T in (TRUTH, ELSEWHERE))
     starts = list(predicted(data_of(tracker, [], Track(branches, frame=0)), []))
     assert len(starts) == 2
     np.testing.assert_allclose(starts[0].T_world_object, TRUTH)
@@ -217,7 +217,7 @@ def test_a_pose_that_does_not_convince_is_in_doubt() -> None:
 
 def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    track = replace(tracker.begin(), tallies={"0": SensorTally(5, 8)}, believed=3, frame=0)
+    track = replace(tracker.begin(), tallies={"0": (5, 8)}, believed=3, frame=0)
 
     def doubted(track: Track, met: int, log_evidence: float = 20.0) -> bool:
         seen = replace(sensor("0", met), shares=np.where(np.arange(8) < met, 1.0, 0.0))
@@ -229,7 +229,7 @@ def test_a_body_of_which_as_much_is_met_as_before_is_not_looked_for_elsewhere() 
     assert doubted(track, 5, log_evidence=5.0)
     assert not doubted(track, 4)
     # a quarter is gone all at once, as where a grid slips by a step; or little was believed before
-    assert doubted(replace(track, tallies={"0": SensorTally(8, 8)}), 5)
+    assert doubted(replace(track, tallies={"0": (8, 8)}), 5)
     for other in (
         replace(track, believed=2),
         replace(track, misses=1),

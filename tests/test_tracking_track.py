@@ -24,7 +24,7 @@ from mixpose.objective import matched_objective
 from mixpose.rigid import perturb, transform, twist_between
 from mixpose.search import SearchState
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Prediction, Track, Tracker, predict
+from mixpose.tracking import Track, Tracker, predict
 from mixpose.tracking.frame import follow
 from mixpose.tracking.motion import MotionRules, RandomWalk
 from mixpose.tracking.track import Branch
@@ -38,7 +38,7 @@ VELOCITY = np.array([10.0, -20.0, 5.0, 0.1, -0.2, 0.3])
 
 
 def branch(T: Floats = TRUTH, velocity: Floats | None = None) -> Branch:
-    return Branch(T, 1.0, velocity, NARROW)
+    return Branch(T, 1.0, NARROW, velocity)
 
 
 def moved(frame: float) -> Floats:
@@ -53,7 +53,7 @@ def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> T
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
     track = Track((branch(),), frame=0, misses=misses)
     data = Tracker.create(body, EstimatorOptions()).data(track, 1, None, [])
-    prior = replace(data, predictions=[Prediction(TRUTH, NARROW, 1.0)]).prior(T)
+    prior = replace(data, predictions=[Branch(TRUTH, 1.0, NARROW)]).prior(T)
     return prior.log_density, prior.spread
 
 

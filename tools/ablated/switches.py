@@ -10,8 +10,15 @@ from mixpose.judgement import DetectionModel
 from mixpose.objective import View
 from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.proposers import Proposer, multistart, searched
-from mixpose.tracking.refinements import Refinement, merged_pair, narrowed, without_sensor
+from mixpose.tracking.proposers import (
+    Proposer,
+    Refinement,
+    merged_pair,
+    multistart,
+    narrowed,
+    searched,
+    without_sensor,
+)
 
 FREE = 0.0
 NEVER = float("inf")

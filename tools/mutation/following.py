@@ -21,7 +21,7 @@ _PREDICTION = (
     Mutant(
         "tracking-predictions-without-tails",
         "tracking/track.py",
-        "if self.is_prior:",
+        "if self.spread is not None:",
         "if True:",
         "a body that turns suddenly is lost",
     ),
@@ -44,16 +44,16 @@ _PREDICTION = (
     Mutant(
         "tracking-coasts-for-ever",
         "tracking/track.py",
-        "if branch.velocity is not None and track.misses <= rules.coasting:",
-        "if branch.velocity is not None:",
+        "elif branch.velocity is not None and track.misses <= rules.coasting:",
+        "elif branch.velocity is not None:",
         "after an occlusion the body is looked for far beyond where it can be",
         (_TRACK,),
     ),
     Mutant(
         "tracking-prediction-never-widens",
         "tracking/track.py",
-        "Prediction(T, branch.uncertainty * widening, branch.weight)",
-        "Prediction(T, branch.uncertainty, branch.weight)",
+        "branch.T_world_object, branch.uncertainty * widening",
+        "branch.T_world_object, branch.uncertainty",
         "after an occlusion the body is expected as surely as before it",
         (_TRACK,),
     ),
@@ -108,16 +108,16 @@ _PREDICTION = (
     Mutant(
         "tracking-sudden-motion-goes-unnoticed",
         "tracking/frame.py",
-        "np.maximum(np.repeat(change.max(axis=1), 3), per_kind(body, steady))",
-        "per_kind(body, steady)",
+        "np.maximum(np.repeat(change.max(axis=1), 3), steady)",
+        "steady",
         "a body that changes its speed is expected as surely as a steady one",
         (_TRACK,),
     ),
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "int(np.argmin(np.linalg.norm(twists, axis=1)))",
-        "int(np.argmax(np.linalg.norm(twists, axis=1)))",
+        "min(self.branches, key=away, default=None)",
+        "max(self.branches, key=away, default=None)",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),
@@ -202,7 +202,7 @@ _GATING = (
     Mutant(
         "tracking-fewer-detections-go-unnoticed",
         "tracking/gating.py",
-        "points is not None and len(points) < before[name].met",
+        "points is not None and len(points) < before[name][0]",
         "points is not None and len(points) < 0",
         "a window that cuts features off is not noticed",
         (_WINDOWS,),
@@ -210,8 +210,8 @@ _GATING = (
     Mutant(
         "tracking-as-good-whatever-is-missed",
         "tracking/gating.py",
-        "one.in_view - one.met <= before[name].in_view - before[name].met",
-        "one.in_view - one.met <= 1000",
+        "in_view - met <= before[name][1] - before[name][0]",
+        "in_view - met <= 1000",
         "a window that cuts features off is not noticed",
         (_WINDOWS,),
     ),
@@ -228,7 +228,7 @@ _GATING = (
 _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-any-clutter",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "false = np.maximum(found - probability * expected, 1 - probability)",
         "false = np.full(expected.shape, 1 - probability)",
         "ranges are believed alike however many are false",
@@ -236,7 +236,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-missed-for-free",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "missed = expected * np.log(1 - probability) +",
         "missed = 0 * expected +",
         "poses whose tags have no range are as good as those that meet all",
@@ -244,7 +244,7 @@ _RANGE_POSTERIOR = (
     ),
     Mutant(
         "tracking-ranges-noise-never-learnt",
-        "tracking/associations.py",
+        "tracking/likelihood.py",
         "return max(1.0, float(np.sqrt(squares / degrees)))",
         "return 1.0",
         "ranges that err by more than said are believed",

@@ -43,7 +43,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-no-sensor-left-out",
-        "tracking/refinements.py",
+        "tracking/proposers.py",
         "return names if np.count_nonzero(agreeing & ~apart) >= 2 else []",
         "return []",
         "a camera that was bumped bends the pose",
@@ -51,7 +51,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-another-sensor-left-out",
-        "tracking/refinements.py",
+        "tracking/proposers.py",
         "names = [seen.names[k] for k in np.flatnonzero(apart)]",
         "names = [seen.names[k - 1] for k in np.flatnonzero(apart)]",
         "of three cameras a sound one is left out",
@@ -59,7 +59,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-sensor-left-out-where-two-are-left",
-        "tracking/refinements.py",
+        "tracking/proposers.py",
         "len(frame.views) < 3 or judged.left_out:",
         "len(frame.views) < 99 or judged.left_out:",
         "a camera that was bumped bends the pose",
@@ -99,7 +99,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-merged-pairs-never-mended",
-        "tracking/refinements.py",
+        "tracking/proposers.py",
         "return [] if at is judged else",
         "return [] if at is not judged else",
         "two features seen as one bend the pose",
@@ -115,7 +115,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
-        "tracking/refinements.py",
+        "tracking/proposers.py",
         "> np.count_nonzero(met, axis=1) / 2",
         "> np.count_nonzero(met, axis=1)",
         "of sensors that are out of step the one that is right by itself is believed",

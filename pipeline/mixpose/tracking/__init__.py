@@ -15,7 +15,7 @@ from mixpose.tracking.scene import Scene as Scene
 from mixpose.tracking.scene import Tracker as Tracker
 from mixpose.tracking.scene import estimate_pose as estimate_pose
 from mixpose.tracking.track import UNKNOWN_S as UNKNOWN_S
+from mixpose.tracking.track import Branch as Branch
 from mixpose.tracking.track import Companion as Companion
-from mixpose.tracking.track import Prediction as Prediction
 from mixpose.tracking.track import Track as Track
 from mixpose.tracking.track import predict as predict

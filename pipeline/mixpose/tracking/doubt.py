@@ -81,7 +81,7 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
     track = Track(residuals=data.track.residuals)
     # what explains more than this pose is met by the first guesses already
     options = replace(data.options, search="live")
-    nothing = replace(data, predictions=(), beside=None, begun=None)
+    nothing = replace(data, predictions=(), beside=None, drawn=None)
     alone = replace(nothing, track=track, searches=[], options=options)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     least = own - rules.search.outdone
@@ -99,7 +99,7 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
         rules = other.rules
         limit = best.log_evidence + float(np.log(rules.acceptance.rival))
         tolerance = tolerance_of(data.body, other.body, rules.look_alikes.alike)
-        seen = replace(other, views=data.views, begun=None)
+        seen = replace(other, views=data.views, still=data.still, drawn=None)
         for part in like_features(data.body, met, other.body, tolerance):
             if len(part.features) == len(met):
                 T = best.T_world_object @ part.T_body_other
@@ -141,4 +141,4 @@ def _evidence(data: Frame, start: Start) -> float:
 def _mirrored(data: Frame, chosen: Mask) -> Frame:
     """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
     near = frozenset(np.flatnonzero(chosen).tolist())
-    return replace(data, body=mirror_image(data.body, near), begun=None)
+    return replace(data, body=mirror_image(data.body, near), drawn=None)

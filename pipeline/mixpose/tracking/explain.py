@@ -29,7 +29,7 @@ from mixpose.tracking.frame import Frame, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Likelihood, Start, likelihood_of
 from mixpose.tracking.proposers import reason
-from mixpose.tracking.track import Branch, SensorTally, Track
+from mixpose.tracking.track import Branch, Track
 
 if TYPE_CHECKING:
     from mixpose.tracking.scene import Tracker
@@ -179,16 +179,15 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
     met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
-    tallies = dict(zip(used.names, map(SensorTally, met.tolist(), in_view.tolist())))
-    least = data.rules.acceptance.agreeing
+    agreeing = (met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)).sum() > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     return replace(
         follow(data, found),
         residuals=best.noise if is_ok else track.residuals,
-        tallies=tallies,
+        tallies=dict(zip(used.names, zip(met.tolist(), in_view.tolist()))),
         delays=delays_after(data, best) if is_ok or late else track.delays,
-        agreed=track.agreed or sum(one.is_met(least) for one in tallies.values()) > 1,
+        agreed=track.agreed or bool(agreeing),
         known=is_known(data, best),
         believed=track.believed + is_ok,
         doubted=not is_ok,

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import Prior, ScoredPose, flat_prior, nearest_alike
+from mixpose.fit import EstimatorOptions, free_mask
+from mixpose.judgement import Prior, flat_prior, nearest_alike
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -19,15 +18,7 @@ from mixpose.search import SearchReport, SearchState
 from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import Course, Expected, RandomWalk, per_kind
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.track import Branch, Prediction, Track, either, nearest_branch
-
-
-class Begun(NamedTuple):
-    """What is known of the fit from the first prediction, where bodies were fitted together."""
-
-    objective: MatchedObjective  # at σ_ε
-    fit: Fit | None = None  # that this was climbed to with others'
-    judged: ScoredPose | None = None  # the pose of that fit
+from mixpose.tracking.track import Branch, Track, either
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +30,17 @@ class Frame:
     options: EstimatorOptions
     samples: Floats  # (N, R, 3) of the body, for the objectives that integrate by sampling
     track: Track
-    predictions: Sequence[Prediction]
+    predictions: Sequence[Branch]
     T_reference: Floats | None  # (4, 4), that tells poses apart that look the same
     start_uncertainty: Floats  # (6,)
     rules: Rules
     frame: int
     time_s: float | None
-    begun: Begun | None = None
+    drawn: MatchedObjective | None = None  # `finest`, where it is at hand
     # what searches of the frame cost, and where they go on in the next; the proposer adds to it
     searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
-    still: Frame | None = None  # where views are as of the common time: sensors as they stand
-    beside: Prediction | None = None  # where another body lets expect one that is not where it was
+    still: Sequence[View] = ()  # where views are as of the common time: sensors as they stand
+    beside: Branch | None = None  # where another body lets expect one that is not where it was
 
     @cached_property
     def free(self) -> Mask:
@@ -85,13 +76,7 @@ class Frame:
     @cached_property
     def finest(self) -> MatchedObjective:
         """The matched objective at σ_ε."""
-        if self.still is not None:  # densities do not move with the sensors
-            views = tuple(self.views)
-            projection = project_body(tuple(view.sensor for view in views), self.body)
-            return replace(self.still.finest, views=views, projection=projection)
-        if self.begun is not None:
-            return self.begun.objective
-        return matched_objective(self.views, self.body, self.sigmas)
+        return self.drawn or matched_objective(self.views, self.body, self.sigmas)
 
     def prior(self, T_world_object: Floats) -> Prior:
         """What was known of a pose before the frame."""
@@ -101,7 +86,7 @@ class Frame:
             return own
         return either(own, self._prior(T_world_object, [self.beside], 0), misses, rules)
 
-    def _prior(self, T_world_object: Floats, some: Sequence[Prediction], misses: int) -> Prior:
+    def _prior(self, T_world_object: Floats, some: Sequence[Branch], misses: int) -> Prior:
         """Density of a pose by predictions, or now and then anywhere."""
         anywhere, rules = self.anywhere, self.rules.motion
         if not some:
@@ -120,25 +105,29 @@ class Frame:
         """The frame without some sensors."""
         if not names:
             return self
-        views = [view for view in self.views if view.name not in names]
-        still = self.still.without(names) if self.still else None
-        return replace(self, views=views, still=still, begun=None)
+        views, still = (
+            [v for v in some if v.name not in names] for some in (self.views, self.still)
+        )
+        return replace(self, views=views, still=still, drawn=None)
 
     def in_motion(self, motion: Motion) -> Frame:
         """The frame as of the common time, of a body that moves."""
-        still = self.still or self
-        views = [
+        still = self.still or self.views
+        views = tuple(
             replace(view, sensor=in_motion(view.sensor, motion, view.delay, view.readout))
-            for view in still.views
-        ]
-        return replace(still, views=views, still=still)
+            for view in still
+        )
+        projection = project_body(tuple(view.sensor for view in views), self.body)
+        # densities do not move with the sensors
+        drawn = replace(self.finest, views=views, projection=projection)
+        return replace(self, views=views, still=still, drawn=drawn)
 
     def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
         """The velocity that the frames before let expect of a pose, or near it."""
-        elapsed, rules = self.track.seconds_until(self.time_s), self.rules.course
+        elapsed, rules = self.track.seconds_until(self.time_s), self.rules.motion
         # where nothing was seen before: rest, give or take what hands can do
         rest = Expected(np.zeros(6), np.zeros(6), per_kind(self.body, rules.fastest), np.zeros(6))
-        branch = nearest_branch(self.track, T_world_object, self.body)
+        branch = self.track.nearest(T_world_object, self.body)
         if branch is None or not elapsed:
             return rest
         T = nearest_alike(T_world_object, self.body, branch.T_world_object)
@@ -148,7 +137,7 @@ class Frame:
             return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))
         if branch.course is None or elapsed > rules.longest_s:
             return rest
-        expected = branch.course.expected(moved if is_there else None, elapsed, rules)
+        expected = branch.course.expected(moved if is_there else None, elapsed)
         return rest if (np.abs(expected.velocity) > rest.deviation).any() else expected
 
 
@@ -167,12 +156,12 @@ def given(frame: Frame, T_world_object: Floats) -> float:
 def follow(frame: Frame, found: Sequence[Branch]) -> Track:
     """The track after a frame with poses, the best first: how each goes on, as far as they tell."""
     track, body, rules = frame.track, frame.body, frame.rules.motion
-    elapsed, walk, steady = track.elapsed(frame.frame, frame.time_s), track.walk, rules.steady
-    branches: list[Branch] = []
+    elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
+    steady, branches = per_kind(body, rules.steady), list[Branch]()
     for one in found:
         T, deviation = one.T_world_object, one.deviation
-        velocity, course, uncertainty = None, None, rules.unsteady * per_kind(body, steady)
-        parent = nearest_branch(track, T, body)
+        velocity, course, uncertainty = None, None, rules.unsteady * steady
+        parent = track.nearest(T, body)
         if parent is not None and track.frame is not None and elapsed > 0:
             moved = twist_between(parent.T_world_object, T)
             if one.spread is not None and not branches:
@@ -184,12 +173,11 @@ def follow(frame: Frame, found: Sequence[Branch]) -> Track:
                 change = moved / 2 if last is None else moved - last * elapsed
                 # of one frame, where it was seen over several
                 change = np.abs(change / (1 + track.misses)).reshape(2, 3)
-                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), per_kind(body, steady))
-            is_near = elapsed <= frame.rules.course.longest_s
-            if deviation is not None and parent.course is not None and is_near:
-                course = parent.course.followed(moved, deviation, elapsed, frame.rules.course)
+                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), steady)
+            if deviation is not None and parent.course and elapsed <= rules.longest_s:
+                course = parent.course.followed(moved, deviation, elapsed)
         if deviation is not None:
-            course = course or Course.begun(deviation, body, frame.rules.course)
+            course = course or Course.begun(deviation, body, rules)
         branches.append(replace(one, velocity=velocity, uncertainty=uncertainty, course=course))
     return replace(
         track,

@@ -18,10 +18,10 @@ from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Mask
 from mixpose.sensors import Sensor
 from mixpose.tracking.scene import Scene
-from mixpose.tracking.track import Prediction, SensorTally, Track
+from mixpose.tracking.track import Branch, Track
 
 Box: TypeAlias = tuple[int, int, int, int]
-Tallies: TypeAlias = Mapping[str, SensorTally]
+Tallies: TypeAlias = Mapping[str, tuple[int, int]]  # of features met, and in view
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Expectation:
         apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
         return float(apart / 2 + self.reach * self.body.spread)
 
-    def windows(self, predictions: Sequence[Prediction]) -> dict[str, Box]:
+    def windows(self, predictions: Sequence[Branch]) -> dict[str, Box]:
         """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
 
         There is none where the body is not in view, or has one feature: nothing tells how large.
@@ -70,16 +70,16 @@ class Expectation:
 def is_convincing(tallies: Tallies, cameras: Iterable[str], rules: AcceptanceRules) -> bool:
     """Whether cameras met so much of the body that the next frame need not be seen whole."""
     some = [tallies[name] for name in cameras if name in tallies]
-    agreeing = [one for one in some if one.is_met(rules.agreeing)]
-    some = agreeing if len(agreeing) > 1 else some
-    return sum(one.met for one in some) > rules.convincing * sum(one.in_view for one in some)
+    agreeing = [(met, in_view) for met, in_view in some if met >= rules.agreeing * in_view > 0]
+    met, in_view = np.sum(agreeing if len(agreeing) > 1 else [*some, (0, 0)], axis=0)
+    return bool(met > rules.convincing * in_view)
 
 
 def are_as_good(tallies: Tallies, before: Tallies) -> bool:
     """Whether no sensor misses more of the body than in the frame before."""
     return all(
-        one.in_view - one.met <= before[name].in_view - before[name].met
-        for name, one in tallies.items()
+        in_view - met <= before[name][1] - before[name][0]
+        for name, (met, in_view) in tallies.items()
         if name in before
     )
 
@@ -88,7 +88,7 @@ def have_fewer(views: Sequence[View], before: Tallies) -> bool:
     """Whether a camera has fewer detections than it met features in the frame before."""
     seen = {view.name: view.observation.points for view in views if view.name in before}
     return any(
-        points is not None and len(points) < before[name].met for name, points in seen.items()
+        points is not None and len(points) < before[name][0] for name, points in seen.items()
     )
 
 

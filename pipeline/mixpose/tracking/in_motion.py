@@ -16,8 +16,7 @@ import numpy as np
 
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverses, nearest_alike
-from mixpose.matching import ErrorRules, Matches, associate, errors_seen
-from mixpose.objective import View
+from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
@@ -27,7 +26,6 @@ from mixpose.tracking.track import DelayEvidence
 
 LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
 SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
-LEAST_VARIANCE = 1e-6  # in σ_ε²: residuals below are rounding
 SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
 
 
@@ -39,6 +37,7 @@ class Offsets(NamedTuple):
     offsets: Floats  # (K,), observed minus predicted
     sensor: Indices  # (K,)
     unsure: tuple[tuple[int, float], ...]  # sensors with estimated delays, standard deviations
+    beside: float  # how far features may be off by velocity and delay, in σ_ε
 
     def by_delay(self, velocity: Floats, sensors: Sequence[int]) -> Floats:
         """How the features of some sensors would move with their delays, (K, q) per second."""
@@ -48,10 +47,9 @@ class Offsets(NamedTuple):
     def least_squares(
         self, velocity: Floats, expected: Expected, free: Mask, variance: float
     ) -> tuple[Floats, Floats, Floats]:
-        """All unknowns by a Gauss-Newton step, their covariance, and offsets (K,) that are left.
+        """Gauss-Newton step of all unknowns, their covariance, and offsets (K,) that are left.
 
-        The unknowns are the pose, the velocity, the estimated delays, and of each delay the way of
-        the body in it at a velocity other than this.
+        Unknown are pose, velocity, delays, and in each delay the body's way at another velocity.
         """
         rows, fast = self.rows[:, free], expected.deviation[free]
         count, late = len(fast), np.array([deviation for _, deviation in self.unsure])
@@ -81,26 +79,29 @@ def gauss_newton(J: Floats, offsets: Floats, free: Mask) -> Floats:
 def fit_in_motion(
     frame: Frame, T_start: Floats, climb: Callable[[Frame, Floats, float], Fit]
 ) -> Fit:
-    """Climb to the most likely pose and velocity near a start.
+    """Climb to the most likely pose and velocity near a start (4, 4).
 
-    `climb` takes a frame as of the common time, a pose (4, 4), and how far features may be off, in
-    σ_ε, to the best pose near it.
+    `climb` takes a frame as of the common time, a start, and how far off features may be, in σ_ε.
     """
     motion = frame.expected(T_start, is_there=False).at(T_start)
-    T, expected, moved, rules = T_start, frame.expected(T_start), np.inf, frame.rules.judgement
+    T, moved, count, rules = T_start, np.inf, int(frame.free.sum()), frame.rules.judgement
     errors = rules.noise.errors
     for _ in range(6):
-        seen = frame.in_motion(motion)
+        seen, expected = frame.in_motion(motion), frame.expected(T)
         if moved > LINEAR:
-            at, views = seen.finest.projection.project(T[None]), (frame.still or frame).views
-            J, there = at.J[:, 0] / np.array(seen.sigmas)[:, None, None, None], at.seen[:, 0]
-            late = _seconds(views, at.y[:, 0], there)
-            fit = climb(seen, T, _unsure_by(J, late, there, views, expected))
+            matches = associate(seen.finest, T, rules.association, errors.narrowest)
+            fit = climb(seen, T, offsets_of(seen, matches, expected).beside)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
-        expected = frame.expected(T)
+            expected = frame.expected(T)
         matches = associate(seen.finest, T, rules.association, errors.narrowest)
         met = offsets_of(seen, matches, expected)
-        change = _change(met, motion.velocity, expected, frame.free, errors)
+        change, variance = np.zeros(6), errors.typical**2
+        for _ in range(2):  # the second time with the variance that the first leaves
+            x, _, rest = met.least_squares(motion.velocity, expected, frame.free, variance)
+            total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
+            degrees = errors.typical_degrees + max(len(rest) - count, 0)
+            variance = max(total / degrees, LEAST_VARIANCE)
+        change[frame.free] = x[count : 2 * count]
         way = met.late * (met.rows @ change)
         T = np.asarray(perturb(T, gauss_newton(met.rows, met.offsets - way, frame.free)))
         motion = Motion(T, motion.velocity + change, expected.acceleration)
@@ -114,36 +115,36 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     """A judged pose, as sure as its velocity lets it be."""
     free, expected = frame.free, frame.expected(judged.T_world_object)
     met, inner = offsets_of(frame, judged.used, expected), np.ix_(free, free)
-    count = int(free.sum())
-    rows, covariance = met.rows[:, free], judged.covariance.copy()
-    alone = rows.T @ rows
+    covariance, alone = judged.covariance.copy(), (met.rows.T @ met.rows)[inner]
     # the variance by which the covariance goes
-    scale = float(np.trace(alone @ covariance[inner])) / max(count, 1)
+    scale = float(np.trace(alone @ covariance[inner])) / max(len(alone), 1)
     if not np.isfinite(scale) or scale <= 0:
         return judged
     _, together, _ = met.least_squares(motion.velocity, expected, free, scale)
-    extra = together[:count, :count] - scale * inverses(alone)
+    extra = together[: len(alone), : len(alone)] - scale * inverses(alone)
     values, vectors = np.linalg.eigh((extra + extra.T) / 2)
     covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
     return replace(judged, covariance=covariance)
 
 
 def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:
-    """How far off features are met, as they pull, and when they were seen.
-
-    What is farther off than noise and an expected velocity let it be counts for little.
-    """
+    """Met features, as they pull: little, where farther off than noise and velocity explain."""
     names = [view.name for view in frame.views]
     chosen = [names.index(name) for name in matches.names]
-    views, blurs = [(frame.still or frame).views[k] for k in chosen], np.ones(len(chosen))
-    seen = matches.weights > 0
-    late = _seconds(views, matches.places, seen)
+    views, seen = [(frame.still or frame.views)[k] for k in chosen], matches.weights > 0
+    pairs = zip(views, matches.places, strict=True)
+    seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in pairs]
+    late, blurs, beside = np.where(seen, seconds, 0.0), np.ones(len(chosen)), 0.0
     if expected is not None:
+        delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
+        speed = np.hypot(expected.velocity, expected.deviation)
+        ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
+        squares = ((matches.J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
+        beside = float(np.sqrt(squares.max(initial=0.0, where=seen)))
         errors, known = frame.rules.judgement.noise.errors, frame.noise[:, chosen]
         noise = errors_seen(matches, int(frame.free.sum()), known, errors).blurs
         # a pose that was climbed to at another velocity is off by as much in all sensors
-        unsure = _unsure_by(matches.J, late, seen, views, expected)
-        blurs = np.minimum(np.hypot(noise, errors.blur * unsure), 1.0)
+        blurs = np.minimum(np.hypot(noise, errors.blur * beside), 1.0)
     pull = np.sqrt(matches.shares * np.exp(-0.25 * matches.squared / blurs[:, None] ** 2))
     kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
     numbers = np.arange(len(views))[:, None, None]
@@ -153,39 +154,8 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         offsets=(matches.offsets * pull[..., None])[kept],
         sensor=np.broadcast_to(numbers, kept.shape)[kept],
         unsure=tuple((k, view.unsure) for k, view in enumerate(views) if view.unsure is not None),
+        beside=beside,
     )
-
-
-def _seconds(views: Sequence[View], y: Floats, seen: Mask) -> Floats:
-    """Seconds (L, n) after the common time at which features at places (L, n, 2) are seen."""
-    each = zip(views, y, strict=True)
-    late = [moments(view.sensor, own, view.delay, view.readout) for view, own in each]
-    return np.where(seen, late, 0.0)
-
-
-def _unsure_by(
-    J: Floats, late: Floats, seen: Mask, views: Sequence[View], expected: Expected
-) -> float:
-    """How far features may be off by velocity and delay, in σ_ε; J (L, n, 2, 6) in σ_ε."""
-    delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
-    speed = np.hypot(expected.velocity, expected.deviation)
-    ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
-    squares = ((J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
-    return float(np.sqrt(squares.max(initial=0.0, where=seen)))
-
-
-def _change(
-    met: Offsets, velocity: Floats, expected: Expected, free: Mask, errors: ErrorRules
-) -> Floats:
-    """Change (6,) of the velocity by one Gauss-Newton step of it and the pose."""
-    variance, count, change = errors.typical**2, int(free.sum()), np.zeros(6)
-    for _ in range(2):  # the second time with the variance that the first leaves
-        x, _, rest = met.least_squares(velocity, expected, free, variance)
-        total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
-        degrees = errors.typical_degrees + max(len(rest) - count, 0)
-        variance = max(total / degrees, LEAST_VARIANCE)
-    change[free] = x[count : 2 * count]
-    return change
 
 
 def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
@@ -196,9 +166,8 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
         return before
     expected = frame.expected(best.T_world_object)
     own = {name: k for k, name in enumerate(used.names)}
-    views = [view for view in frame.views if view.name in own]
-    told = [view.name for view in views if view.unsure is None]
-    reference = before.reference or (told[0] if told else "")
+    told = (view.name for view in frame.views if view.name in own and view.unsure is None)
+    reference = before.reference or next(told, "")
     if not expected.gain.any() or reference not in own:
         return before
     names = (*before.names, *(n for n in own if n != reference and n not in before.names))
@@ -213,7 +182,7 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     columns = np.pad(late, ((0, 6), (0, 0)))
     columns -= other @ np.linalg.lstsq(other, columns, rcond=1e-9)[0]
     information = columns.T @ columns / variance
-    estimated = {view.name: view.estimated for view in views}
+    estimated = {view.name: view.estimated for view in frame.views}
     vector = columns[: len(late)].T @ met.offsets / variance
     vector += information @ np.array([estimated.get(name, 0.0) for name in names])
     n = len(before.names)

@@ -1,32 +1,34 @@
 """What one frame says of a pose: how to fit it near a start, and how to judge it.
 
 Matched densities, or, for single ranges of small bodies, the sum over all associations: where
-errors are as large as distances of features, densities waste information.
+errors are as large as distances of features, densities waste information, and what a range belongs
+to remains in doubt whatever the pose.  With n features in view and M detections of one sensor,
+every association λ gives each feature at most one detection and the reverse,
+
+    L = Σ_λ  Π_met P_D N(offset; 0, s²)  Π_missed (1 − P_D)  Π_rest c/W,
+
+c being the number of false detections to be expected and W the room they have.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from mixpose.body import Body
 from mixpose.fit import Fit, blur_schedule, fit_near
-from mixpose.judgement import RememberedNoise, ScoredPose, judge, nearest_alike
-from mixpose.objective import NormalPrior
+from mixpose.judgement import DetectionModel, RememberedNoise, ScoredPose, judge, nearest_alike
+from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask, PointPattern
 from mixpose.rigid import perturb
-from mixpose.tracking.associations import (
-    AssociationTerm,
-    are_associated,
-    noise_ratio,
-    sum_associations,
-)
 from mixpose.tracking.frame import Frame, given
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
-from mixpose.tracking.track import Prediction
+from mixpose.tracking.rules import RangeRules
+from mixpose.tracking.track import Branch
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class Start:
 
     T_world_object: Floats  # (4, 4)
     uncertainty: Floats | None = None  # (6,), standard deviations; None: the pose is there already
-    prediction: Prediction | None = None  # that it comes from
+    prediction: Branch | None = None  # that it comes from
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
@@ -48,31 +50,28 @@ class MatchedLikelihood:
         self.frame = frame
         # whether each feature's detection is known, so that one may be left out
         self.knows_detections = frame.options.objective == "matched"
+        # from the first prediction, where several bodies were fitted together
+        self.together: tuple[Fit, ScoredPose] | None = None
         self._climbed: dict[frozenset[str], list[Fit]] = {}  # by sensors left out
 
     def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
-        uncertainty = start.uncertainty
+        uncertainty, frame = start.uncertainty, self.frame.without(start.left_out)
         if uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        frame, known = self.frame.without(start.left_out), self.frame.begun
-        if known is not None and known.fit and start.prediction is frame.predictions[0]:
-            return known.fit
+        if self.together and start.prediction is frame.predictions[0]:
+            return self.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
-        climbed = self._climbed.setdefault(frozenset(start.left_out), [])
+        climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, start.T_world_object) if self.knows_detections else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
+            where = seen.views, seen.body, T_start, uncertainty, seen.options, seen.samples
             return fit_near(
-                seen.views,
-                seen.body,
-                T_start,
-                uncertainty,
-                seen.options,
-                seen.samples,
+                *where,
                 finest=seen.finest,
                 begun=begun,
-                climbed=None if timed else climbed,
+                climbed=climbed,
                 blur=start.blur,
                 noise=seen.noise,
                 beside=max(beside, spread),
@@ -81,15 +80,14 @@ class MatchedLikelihood:
                 rules=seen.rules.fit,
             )
 
-        if timed:
-            return fit_in_motion(frame, start.T_world_object, climb)
-        return climb(frame, start.T_world_object)
+        T = start.T_world_object
+        return fit_in_motion(frame, T, climb) if timed else climb(frame, T)
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
-        begun, frame, motion = self.frame.begun, self.frame, fit.motion
-        if begun is not None and fit is begun.fit and begun.judged is not None:
-            return begun.judged
+        frame, motion = self.frame, fit.motion
+        if self.together and fit is self.together[0]:
+            return self.together[1]
         T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         if frame.is_timed:
             motion = motion or frame.expected(T).at(T)
@@ -110,11 +108,128 @@ class MatchedLikelihood:
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
 
 
-class AssociationLikelihood:
-    """All associations of single ranges with the features of a small body.
+def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
+    """Whether all sensors gave single ranges, of a body of few points."""
+    return (
+        len(body.nodes.points) == len(body) <= rules.max_features
+        and all(view.sensor.dimension == 1 for view in views)
+        and all(isinstance(view.observation.pattern, PointPattern) for view in views)
+    )
 
-    The pose of a frame before is a normal prior, widened as the body may have moved since.
+
+def noise_ratio(noise: Floats, rules: RangeRules) -> float:
+    """Standard deviation of ranges in σ_ε, by squares and degrees of freedom (2,) so far."""
+    squares, degrees = noise + rules.stated_degrees
+    return max(1.0, float(np.sqrt(squares / degrees)))
+
+
+class AssociationSum(NamedTuple):
+    """The likelihood over all associations in all sensors, at H poses."""
+
+    log_odds: Floats  # (H,), logarithm of the likelihood, over that of mere clutter
+    gradient: Floats  # (H, 6), of it, by the twist of the pose
+    information: Floats  # (H, 6, 6), what the ranges would say if their labels were known
+    met: Floats  # (H,), expected number of detections that belong to features
+    squares: Floats  # (H,), expected sum of their squared offsets, in σ_ε²
+
+
+def sum_associations(
+    views: Sequence[View],  # `are_associated`, none with an empty observation
+    body: Body,
+    poses: Floats,  # (H, 4, 4)
+    noise: float = 1.0,  # standard deviation of offsets, in σ_ε
+    detection: DetectionModel = DetectionModel(),
+) -> AssociationSum:
+    """Sum the likelihood over all associations at poses."""
+    patterns = [view.observation.pattern for view in views]
+    ranges = [one.points[one.weights > 0, 0] for one in patterns if isinstance(one, PointPattern)]
+    counts = np.array([len(one) for one in ranges])
+    there = np.arange(counts.max()) < counts[:, None]
+    detected = np.zeros(there.shape)  # those that never were make widths alike
+    detected[there] = np.concatenate(ranges)
+    sigma = np.array([[view.observation.sigma] for view in views])
+    at = project_body(tuple(view.sensor for view in views), body).project(poses)
+    J, away = at.J[..., 0, :], detected[:, None, None] - at.y[..., :1]
+    probability, found = detection.probability, counts[:, None]
+    expected = at.seen.sum(axis=2)
+    false = np.maximum(found - probability * expected, 1 - probability)
+    room = np.maximum(2 * detection.room * body.radius, 20 * sigma)
+    missed = expected * np.log(1 - probability) + found * np.log(false / found) + found - false
+    error = (noise * sigma)[..., None, None]
+    odds = np.exp(-0.5 * (away / error) ** 2) / (np.sqrt(2 * np.pi) * error)
+    odds *= (probability / (1 - probability) * room / false)[..., None, None]
+    odds *= at.seen[..., None] & there[:, None, None]
+    total, shares = _summed(odds.reshape(-1, *odds.shape[2:]))
+    shares = shares.reshape(odds.shape)
+    weights = shares / error**2
+    return AssociationSum(
+        log_odds=(missed + np.log(total).reshape(missed.shape)).sum(axis=0),
+        gradient=np.einsum("lhnj,lhnj,lhnk->hk", weights, away, J),
+        information=np.einsum("lhnj,lhnk,lhnq->hkq", weights, J, J),
+        met=shares.sum(axis=(0, 2, 3)),
+        squares=noise**2 * (weights * away**2).sum(axis=(0, 2, 3)),
+    )
+
+
+def _summed(odds: Floats) -> tuple[Floats, Floats]:
+    """Sum over associations (H,) and how probable each pair is (H, n, M), of odds (H, n, M).
+
+    From the first detection to the last, the odds of each subset of features being taken so far;
+    and the same backwards.
     """
+    count, n, M = odds.shape
+    subsets = np.arange(2**n)
+    without = [subsets[(subsets >> i) & 1 == 0] for i in range(n)]
+    taken = np.zeros((M + 1, count, 2**n))
+    taken[0, :, 0] = 1.0
+    for j in range(M):
+        taken[j + 1] = taken[j]
+        for i, rest in enumerate(without):
+            taken[j + 1][:, rest | 1 << i] += odds[:, i, j, None] * taken[j][:, rest]
+    left, shares = np.ones((count, 2**n)), np.zeros_like(odds)
+    total = taken[M].sum(axis=1)
+    for j in range(M - 1, -1, -1):
+        before = left.copy()
+        for i, rest in enumerate(without):
+            then = odds[:, i, j, None] * left[:, rest | 1 << i]
+            shares[:, i, j] = (taken[j][:, rest] * then).sum(axis=1) / total
+            before[:, rest] += then
+        left = before
+    return total, shares
+
+
+@dataclass(frozen=True, eq=False)
+class AssociationTerm:
+    """Logarithm of `sum_associations`, whose second derivatives are differences of gradients."""
+
+    views: Sequence[View]
+    body: Body
+    free: Mask
+    noise: float
+    detection: DetectionModel
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        free, count = self.free, len(poses)
+        error = self.noise * min(view.observation.sigma for view in self.views)
+        arm = float(np.linalg.norm(self.body.means, axis=1).max())
+        # steps that move ranges by a hundredth of their error: half of the digits are left
+        scale = 0.01 * np.repeat([error, error / max(arm, error)], 3)[free]
+        steps = scale[:, None] * np.eye(6)[free]
+        twists = np.vstack([np.zeros(6), steps, -steps])
+        around = perturb(poses[:, None], twists).reshape(-1, 4, 4)
+        found = sum_associations(self.views, self.body, around, self.noise, self.detection)
+        gradients = found.gradient.reshape(count, -1, 6)
+        here, ahead, behind = np.split(gradients, [1, 1 + len(steps)], axis=1)
+        H = np.zeros((count, 6, 6))
+        H[:, free] = (behind - ahead) / (2 * scale[:, None])
+        at = slice(None, None, len(twists))
+        H = (H + H.swapaxes(1, 2)) / 2
+        return Quadratic(found.log_odds[at], here[:, 0], found.information[at], H)
+
+
+class AssociationLikelihood:
+    """All associations of single ranges with a small body, and the pose before as a prior."""
 
     knows_detections = False
 
@@ -125,7 +240,7 @@ class AssociationLikelihood:
     def fit(self, start: Start) -> Fit:
         """Climb the posterior, at first with ranges that err as far as the prior may."""
         T, frame, known, widths = start.T_world_object, self.frame, start.prediction, [self._noise]
-        if known is None or not known.is_prior:  # nothing is known: matched densities lead there
+        if known is None or known.spread is None:  # nothing is known: matched densities lead there
             T = MatchedLikelihood(frame).fit(start).T_world_object
             T = nearest_alike(T, frame.body, frame.T_reference)
         else:
@@ -169,7 +284,7 @@ class AssociationLikelihood:
         """Likelihood and prior, of ranges that err by so much in σ_ε."""
         frame, known, detection = self.frame, start.prediction, self.frame.rules.judgement.detection
         terms: list[Term] = [AssociationTerm(frame.views, frame.body, frame.free, noise, detection)]
-        if known is not None and known.is_prior:
+        if known is not None and known.spread is not None:
             terms.append(NormalPrior(known.T_world_object, known.uncertainty, frame.free))
         return Sum(tuple(terms))
 
@@ -191,6 +306,5 @@ Likelihood: TypeAlias = MatchedLikelihood | AssociationLikelihood
 def likelihood_of(frame: Frame) -> Likelihood:
     """The likelihood for a frame."""
     is_matched = frame.options.objective == "matched"
-    if is_matched and are_associated(frame.views, frame.body, frame.rules.ranges):
-        return AssociationLikelihood(frame)
-    return MatchedLikelihood(frame)
+    are_ranges = is_matched and are_associated(frame.views, frame.body, frame.rules.ranges)
+    return AssociationLikelihood(frame) if are_ranges else MatchedLikelihood(frame)

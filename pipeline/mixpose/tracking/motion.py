@@ -1,10 +1,4 @@
-"""How a body moves: how far from frame to frame, and how fast at a moment.
-
-Each of the six coordinates of the pose is followed with its first three derivatives, of which the
-last takes a random walk (a Kalman filter).  Filters from very steady to very sudden motion run side
-by side, and the one is believed that foretold the last poses best.  It says how the velocity
-depends on the frame's pose, and nothing of the pose itself: that is estimated from its frame.
-"""
+"""How a body moves: how far from frame to frame, and how fast at a moment."""
 
 from __future__ import annotations
 
@@ -23,7 +17,7 @@ Scale: TypeAlias = tuple[float, float]  # radii of the body, and degrees
 
 @dataclass(frozen=True)
 class MotionRules:
-    """What is believed of motion from frame to frame before it is seen."""
+    """What is believed of motion before it is seen."""
 
     coasting: int = constant(5, "frames for which a velocity is believed without a pose")
     steady: Scale = constant(
@@ -53,12 +47,6 @@ class MotionRules:
         0.5, "weight of where another body lets a lost one be expected: a wrong one costs half"
     )
     start: Scale = constant((0.1, 5.0), "uncertainty of a [start] that states none: 6° at the rim")
-
-
-@dataclass(frozen=True)
-class CourseRules:
-    """What is believed of a velocity before the frame is seen."""
-
     fastest: Scale = constant(
         (5.0, 180.0), "per second, where no velocity is known: half a metre for a hand's, its wave"
     )
@@ -95,10 +83,7 @@ class RandomWalk:
         return cls(squares / max(elapsed, 1e-9), rules.guess_weight, rules)
 
     def joined(self, moved: Floats, radius: float, elapsed: float) -> RandomWalk:
-        """Add a displacement (6,) of a body of some radius to what is remembered.
-
-        A turn is not unlikely for not having been seen so far: features that shift may turn, too.
-        """
+        """Add a displacement (6,) of a body of some radius; what only shifted so far may turn."""
         lever = np.repeat([1.0, radius], 3)
         squares = ((moved * lever) ** 2).reshape(2, 3)
         # of the lengths and of the angles, the mean of those that are not zero
@@ -114,12 +99,12 @@ class RandomWalk:
 
 
 class Expected(NamedTuple):
-    """A velocity that is expected of a pose."""
+    """A velocity that is expected of a pose; six numbers of each."""
 
-    velocity: Floats  # (6,), twist per second
-    gain: Floats  # (6,), more per second for a pose farther on; 0 where none was seen before
-    deviation: Floats  # (6,), standard deviation
-    acceleration: Floats  # (6,), per second more
+    velocity: Floats  # twist per second
+    gain: Floats  # more per second for a pose farther on; 0 where none was seen before
+    deviation: Floats  # standard deviation
+    acceleration: Floats  # per second more
 
     def at(self, T_world_object: Floats) -> Motion:
         """How a body moves at that pose."""
@@ -128,24 +113,30 @@ class Expected(NamedTuple):
 
 @dataclass(frozen=True)
 class Course:
-    """How fast a body goes at its last pose, to which states are relative, and how sure that is."""
+    """How fast a body goes at its last pose, to which states are relative, and how sure that is.
 
-    means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F filters
+    Each coordinate of the pose is followed with its first three derivatives, of which the last
+    takes a random walk.  Filters from very steady to very sudden motion run side by side, and the
+    one is believed that foretold the last poses best.
+    """
+
+    means: Floats  # (F, 6, 4), place, velocity, acceleration and jerk by F Kalman filters
     covariances: Floats  # (F, 6, 4, 4)
     log_likelihoods: Floats  # (F, 2), of lengths and of angles
     body: Body
+    rules: MotionRules
 
     @classmethod
-    def begun(cls, deviation: Floats, body: Body, rules: CourseRules) -> Course:
+    def begun(cls, deviation: Floats, body: Body, rules: MotionRules) -> Course:
         """A course of one pose with standard deviations (6,)."""
         count, fastest = rules.sudden[2], per_kind(body, rules.fastest)
         spread = np.stack([deviation, *(fastest * rules.quickest**k for k in range(3))], axis=1)
         covariances = np.broadcast_to(spread[:, :, None] ** 2 * np.eye(4), (count, 6, 4, 4))
-        return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), body)
+        return cls(np.zeros((count, 6, 4)), covariances, np.zeros((count, 2)), body, rules)
 
-    def expected(self, moved: Floats | None, elapsed: float, rules: CourseRules) -> Expected:
+    def expected(self, moved: Floats | None, elapsed: float) -> Expected:
         """The velocity some seconds and a twist (6,) after the last pose; None: that foretold."""
-        means, covariances = self._foretold(elapsed, rules)
+        means, covariances = self._foretold(elapsed)
         likeliest = self.log_likelihoods.argmax(axis=0).repeat(3), np.arange(6)
         mean, covariance = means[likeliest], covariances[likeliest]
         moved = mean[:, 0] if moved is None else moved
@@ -156,16 +147,14 @@ class Course:
         deviation = np.sqrt(np.maximum(variance, 0.0))
         return Expected(rates[:, 0], gains[:, 0], deviation, rates[:, 1])
 
-    def followed(
-        self, moved: Floats, deviation: Floats, elapsed: float, rules: CourseRules
-    ) -> Course:
+    def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> Course:
         """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""
-        means, covariances = self._foretold(elapsed, rules)
+        means, covariances = self._foretold(elapsed)
         rest = moved - means[:, :, 0]
         variance = covariances[:, :, 0, 0] + deviation**2
         off = rest**2 / variance
-        if off.min(axis=0).max() > rules.lost:
-            return Course.begun(deviation, self.body, rules)
+        if off.min(axis=0).max() > self.rules.lost:
+            return Course.begun(deviation, self.body, self.rules)
         gains = covariances[..., 0] / variance[..., None]
         means = means + gains * rest[..., None]
         covariances = covariances - gains[..., None] * covariances[..., None, 0, :]
@@ -173,10 +162,10 @@ class Course:
         # derivatives by the turn itself, not by its logarithm
         means[:, 3:, 1:] += np.cross(moved[3:], means[:, 3:, 1:], axisb=1, axisc=1) / 2
         seen = -0.5 * (np.log(variance) + off)
-        logs = rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
-        return Course(means, covariances, logs - logs.max(axis=0), self.body)
+        logs = self.rules.memory * self.log_likelihoods + seen.reshape(-1, 2, 3).sum(axis=2)
+        return Course(means, covariances, logs - logs.max(axis=0), self.body, self.rules)
 
-    def _foretold(self, elapsed: float, rules: CourseRules) -> tuple[Floats, Floats]:
+    def _foretold(self, elapsed: float) -> tuple[Floats, Floats]:
         """Means and covariances of all filters some seconds later."""
         i, j = np.indices((4, 4))
         factorial, on, ahead = np.array([1.0, 1.0, 2.0, 6.0]), np.maximum(j - i, 0), 7 - i - j
@@ -184,5 +173,7 @@ class Course:
         # of white noise in the derivative of the jerk
         Q = elapsed**ahead / (ahead * factorial[3 - i] * factorial[3 - j])
         units = np.repeat([self.body.radius**2, 1.0], 3)
-        noise = 10 ** np.linspace(*rules.sudden)[:, None, None, None] * units[:, None, None] * Q
+        noise = (
+            10 ** np.linspace(*self.rules.sudden)[:, None, None, None] * units[:, None, None] * Q
+        )
         return self.means @ F.T, F @ self.covariances @ F.T + noise

@@ -1,36 +1,38 @@
-"""Where the body of a frame may be, in the order in which it is tried.
+"""Where the body of a frame may be: starts for fits, in the order in which they are tried.
 
-A proposer yields starts for a frame, given the poses found so far; it says itself when it applies.
+A proposer yields starts for a frame, given the poses found so far.  A refinement yields starts that
+may do better than a judged pose: without a sensor, with merged features, at narrow blurs.  Each
+says itself when it applies.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import add
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
+from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.fit import blur_schedule
-from mixpose.judgement import ScoredPose, convinces, is_sure
+from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
+from mixpose.matching import LEAST_VARIANCE, Matches, pooled
 from mixpose.objective import matched_objective
 from mixpose.records import Floats
 from mixpose.rigid import perturb
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, Stage, search_frame
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Start
+from mixpose.tracking.in_motion import gauss_newton
+from mixpose.tracking.likelihood import Likelihood, Start
 
+# from the poses found so far, the most evident first
+Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
+Refinement: TypeAlias = Callable[[Frame, Likelihood, ScoredPose], Iterable[Start]]
 
-class Proposer(Protocol):
-    """Starts for a frame, given the poses found so far, the most evident first."""
-
-    __name__: str
-
-    def __call__(self, frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-        """Where fits may begin; nothing where the proposer does not apply."""
+OUT_OF_STEP = "out of step or bumped"
 
 
 def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -42,8 +44,7 @@ def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     """Whether no pose convinces yet, so that the body is to be looked for elsewhere.
 
-    Of a body that was followed for some frames it is enough that no more is missed all at once:
-    what slips by a step of its grid, or turns over, meets less.
+    Once it was followed for some frames, a pose convinces that misses no more all at once.
     """
     if not ranked:
         return True
@@ -53,7 +54,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
         return not convinces(*given)
     if track.believed < rules.proposals.believed or track.misses or track.doubted:
         return True
-    before = sum(tally.met for tally in track.tallies.values())
+    before = sum(met for met, _ in track.tallies.values())
     met = int(np.count_nonzero(best.used.shares))
     return len(track.branches) != 1 or met <= rules.acceptance.convincing * before
 
@@ -142,30 +143,27 @@ def candidates_of(frame: Frame) -> list[Candidate]:
 def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Poses at which the body looks the same, or nearly so, as at the best pose of the frame.
 
-    What is met there may lie like other features: a chessboard of which a rim is hidden explains
-    what is seen a step of its grid off, too.  A flat body that is small in an image looks almost
-    the same tilted the other way.  The sum of evidence tells which is right, or that none can.
+    What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
+    that is small in an image looks almost the same tilted the other way.
     """
     kinds = frame.rules.look_alikes.kinds
     best = None
     # once more, where what is moved is better and meets more
     for _ in range(2 if "congruent" in kinds else 0):
-        if not ranked or ranked[0] is best:
-            break
-        best = ranked[0]
-        yield from _as_evident(frame, best)
+        if ranked and ranked[0] is not best:
+            best = ranked[0]
+            yield from _as_evident(frame, best)
     if ranked and "tilted" in kinds:
-        close = frame.start_uncertainty / frame.rules.proposals.narrowing
+        moved = _moves_alike(frame, ranked[0].T_world_object)
         for T in _tilted(frame, ranked[0]):
-            yield Start(T, close, T_moved=_moves_alike(frame, ranked[0].T_world_object))
+            yield Start(T, frame.close * frame.rules.proposals.narrowing, T_moved=moved)
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
     """In words, if one of the rivals is a look-alike of the best pose; else empty."""
-    alike = _congruent(frame, best)
+    T, body, alike = best.T_world_object, frame.body, _congruent(frame, best)
     if not alike:
         return ""
-    T, body = best.T_world_object, frame.body
     corners = np.vstack([body.means.T, np.ones(len(body))])
     points = np.array([T @ one.T_body_other for one in alike]) @ corners
     for rival in rivals:
@@ -197,14 +195,10 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
 
 
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
-    """The best pose moved, where as much is met and motion does not tell against it.
-
-    What motion says against a pose must be made up for by features that it meets more.
-    """
-    alike = _congruent(frame, best)
+    """The best pose moved, where it meets as much, and more where motion tells against it."""
+    rules, T, alike = frame.rules, best.T_world_object, _congruent(frame, best)
     if not alike:
         return
-    rules, T = frame.rules, best.T_world_object
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
     met = float(best.matches.met.max())
     # the value grows as the square of the features met
@@ -235,4 +229,102 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Floats]:
         yield other_tilt(body, T, views[0].sensor.towards(middle[None])[0])
 
 
+def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
+    """The pose fitted without the sensors that disagree with two others or more."""
+    if not likelihood.knows_detections or len(frame.views) < 3 or judged.left_out:
+        return
+    rules = frame.rules
+    if apart := disagreeing(judged.matches, rules.acceptance, rules.judgement.noise):
+        yield Start(judged.T_world_object, frame.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
+
+
+def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> list[str]:
+    """Sensors that see the body elsewhere than two others or more do.
+
+    They meet little of it, with as many detections beside it that belong to nothing, or with
+    residuals that are far larger than the others', more than chance would make them.
+    """
+    agreeing = seen.coverage >= rules.agreeing
+    apart = ~agreeing & (seen.expected > 0)
+    apart &= seen.unmatched_nearby >= rules.agreeing * seen.missed
+    squares, degrees = seen.squares * agreeing, seen.measurements * agreeing
+    for k in np.flatnonzero(agreeing & (degrees > 0)):
+        rest, own = float(degrees.sum() - degrees[k]), float(degrees[k])
+        if np.count_nonzero(agreeing) < 3 or rest == 0:
+            continue
+        variance = float(squares.sum() - squares[k]) / rest
+        limit = max(rules.disagreeing, float(fdtri(own, rest, model.by_chance)))
+        apart[k] = squares[k] / own > limit * max(variance, LEAST_VARIANCE)
+    names = [seen.names[k] for k in np.flatnonzero(apart)]
+    return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
+
+
+def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
+    """Least squares with the middle of two features that run into each other in one detection."""
+    if not likelihood.knows_detections:
+        return []
+    at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
+    for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
+        if not seen.merged.any():
+            break
+        J, offsets = seen.rows()
+        step = gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free)
+        start = Start(perturb(at.T_world_object, step))
+        at = likelihood.judge(likelihood.fit(start), start)
+        seen = at.matches
+    return [] if at is judged else [Start(at.T_world_object)]
+
+
+def _paired(seen: Matches, reach: float) -> Matches:
+    """In each sensor the feature missed nearest to the detection of another, as one with that.
+
+    `reach` is how far that may be, squared, in variances of C.
+    """
+    if not seen.missed.any():
+        return seen
+    shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
+    merged = seen.merged.copy()
+    for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
+        met = np.flatnonzero(seen.detections[k] >= 0)
+        lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
+        if not len(met) or not len(lost):
+            continue
+        apart = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k]
+        away = apart + offsets[k, met]
+        squared = (away * away).sum(axis=2) / 2
+        i, j = np.unravel_index(int(squared.argmin()), squared.shape)
+        if squared[i, j] > reach:
+            continue
+        pair = [lost[i], met[j]]
+        shares[k, pair] = shares[k, met[j]] / 2
+        offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
+        J[k, pair] = J[k, pair].mean(axis=0)
+        merged[k] = 1
+    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged)
+
+
+def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
+    """The predictions at narrow blurs, where residuals are larger than chance makes them.
+
+    Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
+    """
+    has_cells = any(view.observation.cell is not None for view in frame.views)
+    if not judged.is_unlike or not likelihood.knows_detections or has_cells:
+        return
+    errors = frame.rules.judgement.noise.errors
+    variances = pooled(frame.noise, errors, errors.typical_degrees)
+    largest = errors.outlying**2 * variances[:, None]
+    narrowest = errors.blur * float(np.sqrt(variances.max()))
+    for one in frame.predictions:
+        for blur in [blur for blur in frame.rules.proposals.blurs if blur > narrowest]:
+            start = Start(one.T_world_object, one.uncertainty, blur=blur)
+            found = likelihood.judge(likelihood.fit(start), start)
+            met = found.matches.shares > 0
+            off = np.count_nonzero(met & (found.matches.squared > largest), axis=1)
+            # where all of a sensor are off it is out of step, and the others no better for it
+            if not (off > np.count_nonzero(met, axis=1) / 2).any():
+                yield Start(found.T_world_object)
+
+
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)
+REFINEMENTS: tuple[Refinement, ...] = (without_sensor, merged_pair, narrowed)

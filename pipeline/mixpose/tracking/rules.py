@@ -8,8 +8,7 @@ from mixpose.constants import constant
 from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
-from mixpose.tracking.associations import RangeRules
-from mixpose.tracking.motion import CourseRules, MotionRules
+from mixpose.tracking.motion import MotionRules
 from mixpose.tracking.static_clutter import StaticRules
 
 
@@ -53,6 +52,15 @@ class LookAlikeRules:
 
 
 @dataclass(frozen=True)
+class RangeRules:
+    """What is believed of single ranges."""
+
+    max_features: int = constant(8, "of a body: the subsets that are summed double with each")
+    stated_degrees: float = constant(20.0, "degrees of freedom that σ_ε counts as, as stated")
+    min_information: float = constant(0.02, "of that of known labels, which any direction has")
+
+
+@dataclass(frozen=True)
 class Rules:
     """What a tracker goes by; `docs/constants.md` lists every field."""
 
@@ -60,7 +68,6 @@ class Rules:
     judgement: JudgementRules = JudgementRules()
     acceptance: AcceptanceRules = AcceptanceRules()
     motion: MotionRules = MotionRules()
-    course: CourseRules = CourseRules()
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()

@@ -32,11 +32,10 @@ from mixpose.tracking.doubt import look_alike_of
 from mixpose.tracking.explain import Explanation, estimate_of, explain, followed
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, Proposer
-from mixpose.tracking.refinements import REFINEMENTS, Refinement
+from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules, SceneRules
 from mixpose.tracking.sharing import Sharing
-from mixpose.tracking.track import Branch, Companion, Prediction, Track, predict
+from mixpose.tracking.track import Branch, Companion, Track, predict
 
 # poses that a body may have instead of its own, with odds; its own, with those that it has none
 Rivals: TypeAlias = list[tuple[ScoredPose, float]]
@@ -92,7 +91,7 @@ class Tracker:
         """The track before the first frame."""
         if self.T_start is None:
             return Track()
-        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),), known=True)
+        return Track((Branch(self.T_start, 1.0, self.start_uncertainty),), known=True)
 
     def advance(
         self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
@@ -105,7 +104,7 @@ class Tracker:
     def _alone(self) -> Scene:
         return Scene((self,))
 
-    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
+    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
         """Where the track expects the body in a frame."""
         return predict(track, self.body, frame, time_s, self.rules.motion)
 

@@ -21,10 +21,10 @@ from mixpose.objective import SharedDensities, View, can_be_together, matched_ob
 from mixpose.records import Floats, Mask
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.explain import Explanation, explain, judged_by
-from mixpose.tracking.frame import Begun, Frame
-from mixpose.tracking.likelihood import MatchedLikelihood, Start
+from mixpose.tracking.frame import Frame
+from mixpose.tracking.likelihood import Likelihood, MatchedLikelihood, Start, likelihood_of
 from mixpose.tracking.rules import SceneRules
-from mixpose.tracking.track import Prediction, Track
+from mixpose.tracking.track import Branch, Track
 
 if TYPE_CHECKING:
     from mixpose.tracking.scene import Tracker
@@ -89,9 +89,9 @@ class Sharing:
             and not self._are_near(k, ~one.left, places[k])
         ]
         if alike and self._shared is not None:
-            frames = climbed_together([begun[k].frame for k in alike], self._shared)
-            for k, frame in zip(alike, frames, strict=True):
-                begun[k] = replace(begun[k], frame=frame)
+            climbed = climbed_together([begun[k].frame for k in alike], self._shared)
+            for k, one in zip(alike, climbed, strict=True):
+                begun[k] = replace(begun[k], frame=one.frame, likelihood=one)
         return {k: explain(one, quickly=True) for k, one in begun.items()}
 
     def _on_the_rest(self, waiting: list[int]) -> None:
@@ -188,18 +188,18 @@ class Sharing:
                 if beside and (before is None or _width(beside) < _width(before)):
                     self.found[k] = self._again(k, one.left, beside)
 
-    def _companion(self, k: int) -> Prediction | None:
+    def _companion(self, k: int) -> Branch | None:
         """Where the body is expected beside that sure one which tells most."""
         tracked, told = self.bodies[k], []
         for j in self.claimed:
             known = self.tracks[k].companions.get(self.bodies[j].label)
             if known and self.found[j].verdict.status == "ok":
                 T = self.found[j].ranked[0].T_world_object
-                told.append(Prediction(*known.expected(T, tracked.body, tracked.rules.motion), 1.0))
+                told.append(known.expected(T, tracked.body, tracked.rules.motion))
         return min(told, key=_width, default=None)
 
     def _again(
-        self, k: int, left: Mask, beside: Prediction | None = None, *, fitted: bool = False
+        self, k: int, left: Mask, beside: Branch | None = None, *, fitted: bool = False
     ) -> Explanation:
         """The poses of a body by what is left for it by now, and fitted to that."""
         before = self.found[k].frame
@@ -250,39 +250,48 @@ class Sharing:
         return len(self._nobody.near(chosen, places, reach)) > 0
 
 
-def _width(expected: Prediction) -> float:
+def _width(expected: Branch) -> float:
     """How little a prediction tells: the logarithm of the volume that it leaves."""
     return float(np.log(expected.uncertainty).sum())
 
 
-def climbed_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Frame]:
-    """The frames of several bodies with what is climbed from their first predictions, and judged.
+def climbed_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Likelihood]:
+    """Likelihoods of several bodies, with what is climbed from their first predictions, and judged.
 
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
-    begun, some = list(frames), []
-    for k, one in enumerate(frames):
+    likelihoods, some = list[Likelihood](), list[MatchedLikelihood]()
+    for one in frames:
+        data = one
         if not one.is_timed:
             drawn = matched_objective(one.views, one.body, one.sigmas, shared=shared)
-            begun[k] = replace(one, begun=Begun(drawn))
-            if one.options.objective == "matched" and can_be_together(one.body):
-                some.append(k)
+            data = replace(one, drawn=drawn)
+        likelihood = likelihood_of(data)
+        likelihoods.append(likelihood)
+        if (
+            isinstance(likelihood, MatchedLikelihood)
+            and likelihood.knows_detections
+            and can_be_together(one.body)
+            and not one.is_timed
+        ):
+            some.append(likelihood)
     if len(some) < 2:
-        return begun
-    objectives = [begun[k].finest for k in some]
-    starts = [begun[k].predictions[0].T_world_object for k in some]
-    free, rules = begun[some[0]].free, begun[some[0]].rules
-    fits, cases = {}, []
-    for k, end in zip(some, fit_together(objectives, starts, free, rules.fit), strict=True):
-        if end is not None:
-            data = begun[k] = replace(begun[k], begun=Begun(end[0]))
-            expected = data.predictions[0]
-            start = Start(expected.T_world_object, expected.uncertainty, expected)
-            fit = fits[k] = MatchedLikelihood(data).fit(start, end[1])
-            T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
-            seen = (fit.matches, fit.noise) if T is fit.T_world_object else (None, None)
-            cases.append((data.finest, T, data.track.residuals, data.prior(T), *seen))
+        return likelihoods
+    objectives = [one.frame.finest for one in some]
+    starts = [one.frame.predictions[0].T_world_object for one in some]
+    free, rules = some[0].frame.free, some[0].frame.rules
+    fits, cases = [], []
+    for it, end in zip(some, fit_together(objectives, starts, free, rules.fit), strict=True):
+        if end is None:
+            continue
+        it.frame = data = replace(it.frame, drawn=end[0])
+        first = data.predictions[0]
+        fit = it.fit(Start(first.T_world_object, first.uncertainty, first), end[1])
+        fits.append((it, fit))
+        T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+        seen = (fit.matches, fit.noise) if T is fit.T_world_object else (None, None)
+        cases.append((data.finest, T, data.track.residuals, data.prior(T), *seen))
     judged = judge_together(cases, free, rules.judgement) if cases else []
-    for (k, fit), pose in zip(fits.items(), judged, strict=True):
-        begun[k] = replace(begun[k], begun=Begun(begun[k].finest, fit, pose))
-    return begun
+    for (it, fit), pose in zip(fits, judged, strict=True):
+        it.together = fit, pose
+    return likelihoods

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -24,29 +23,30 @@ UNKNOWN_S = 0.1  # standard deviation of a delay of which nothing is known
 
 @dataclass(frozen=True)
 class Branch:
-    """One place where the body may be, and how it goes on from there."""
+    """One place where the body may be, after a frame or as predicted for the next."""
 
     T_world_object: Floats  # (4, 4)
-    weight: float  # belief in this branch among its rivals
-    velocity: Floats | None = None  # (6,), twist per second where frames have times, else per frame
+    weight: float = 1.0  # belief in this branch among its rivals
     # (6,), standard deviations of the next pose about the prediction
     uncertainty: Floats = field(default_factory=lambda: np.zeros(6))
+    velocity: Floats | None = None  # (6,), twist per second where frames have times, else per frame
     # (6,), of the pose itself, where that is as large as its motion: the next frame takes the pose
     # as a prior, and no velocity is believed
     spread: Floats | None = None
     deviation: Floats | None = None  # (6,), the same, where anybody asks for velocities at moments
     course: Course | None = None  # for its velocity at a moment, there
 
-
-class SensorTally(NamedTuple):
-    """How many features a sensor met in the last frame with a pose, and how many it should have."""
-
-    met: int
-    in_view: int
-
-    def is_met(self, share: float) -> bool:
-        """Whether it met at least a share of the body."""
-        return self.met >= share * self.in_view > 0
+    def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> float:
+        """Of a pose before the frame that this predicts, in the directions that are free."""
+        u = self.uncertainty[free]
+        scaled = twist_between(self.T_world_object, T_world_object)[free] / u
+        count, volume = len(u), float(np.log(u).sum())
+        if self.spread is not None:
+            return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
+        n = rules.known_from  # from a step or two: errors are Student's
+        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+        tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
+        return count * peak - tails - volume
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,6 @@ class DelayEvidence:
     @cached_property
     def seconds(self) -> Mapping[str, DelaySeen]:
         """How late each sensor is, as far as it is known, and how surely."""
-        if not self.names:
-            return {}
         inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / UNKNOWN_S**2)
         late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
         return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
@@ -77,8 +75,8 @@ class DelayEvidence:
         for k, view in enumerate(views):
             if view.unsure is not None:
                 late = self.seconds.get(view.name, DelaySeen(0.0, UNKNOWN_S))
-                told = replace(view, unsure=late.deviation, estimated=late.seconds)
-                applied[k] = replace(told, delay=view.delay + late.seconds)
+                known = replace(view, unsure=late.deviation, estimated=late.seconds)
+                applied[k] = replace(known, delay=view.delay + late.seconds)
         # a clock that differs by ten standard deviations is not the same: none is late then
         longest = min(10 * UNKNOWN_S, np.inf if elapsed is None else max(elapsed, 0.0))
         if all(abs(view.delay) <= longest for view in applied):
@@ -88,10 +86,7 @@ class DelayEvidence:
 
 @dataclass(frozen=True)
 class Companion:
-    """The poses of a body seen from another one, in frames that were sure of both.
-
-    They tell where a limb, or a tool, may be beside another that is sure.
-    """
+    """The poses of a body, a limb say, seen from another one, in frames that were sure of both."""
 
     T_other_object: Floats  # (4, 4), their mean
     squares: Floats  # (6,), mean squared twists from it, in the axes of the other body
@@ -103,21 +98,20 @@ class Companion:
     ) -> Companion:
         """What was known, and one more frame that is sure of both."""
         T = inverse(T_world_other) @ T_world_object
-        if before is None:
-            return cls(T, np.zeros(6), 1)
+        before = before or cls(T, np.zeros(6), 0)
         away = twist_between(before.T_other_object, nearest_alike(T, body, before.T_other_object))
         n = before.count + 1
         squares = before.squares + (away**2 * (1 - 1 / n) - before.squares) / n
         return cls(perturb(before.T_other_object, away / n), squares, n)
 
-    def expected(self, T_other: Floats, body: Body, rules: MotionRules) -> tuple[Floats, Floats]:
-        """Where the body is expected beside the other one, and standard deviations (6,) of that."""
+    def expected(self, T_other: Floats, body: Body, rules: MotionRules) -> Branch:
+        """Where the body is expected beside the other one."""
         n, few, guess = self.count, rules.known_from, per_kind(body, rules.unknown) ** 2
         # what is guessed before anything is known counts as some frames
         spread = (n * self.squares + few * guess) / (n + few) * (1 + 1 / n)
         variances = np.maximum(spread, per_kind(body, rules.steady) ** 2)
         wide = variances.reshape(2, 3) @ T_other[:3, :3].T ** 2
-        return T_other @ self.T_other_object, np.sqrt(wide.ravel())
+        return Branch(T_other @ self.T_other_object, uncertainty=np.sqrt(wide.ravel()))
 
 
 @dataclass(frozen=True)
@@ -130,7 +124,8 @@ class Track:
     misses: int = 0  # frames since then
     residuals: RememberedNoise = RememberedNoise()  # so far
     walk: RandomWalk | None = None  # None before two uncertain poses
-    tallies: Mapping[str, SensorTally] = field(default_factory=dict)  # of the last pose, by sensor
+    # features of the last pose that each sensor met, and that it should have
+    tallies: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
     delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
     doubted: bool = False  # whether another body may have what the last pose meets
@@ -153,67 +148,38 @@ class Track:
         """The track after a frame without a pose."""
         return replace(self, misses=self.misses + 1, search=search, clutter=clutter)
 
+    def nearest(self, T_world_object: Floats, body: Body) -> Branch | None:
+        """The branch that a pose goes on from: the nearest."""
+        scale = np.repeat([body.radius, 1.0], 3)
 
-@dataclass(frozen=True)
-class Prediction:
-    """Where a branch expects the body in a frame."""
+        def away(branch: Branch) -> float:
+            twist = twist_between(branch.T_world_object, T_world_object) / scale
+            return float(np.linalg.norm(twist))
 
-    T_world_object: Floats
-    uncertainty: Floats
-    weight: float
-    is_prior: bool = False
-
-    def log_density(self, T_world_object: Floats, free: Mask, rules: MotionRules) -> float:
-        """Of a pose before its frame, in the directions that are free.
-
-        How far a prediction errs is known from a step or two: errors are Student's.
-        """
-        u = self.uncertainty[free]
-        scaled = twist_between(self.T_world_object, T_world_object)[free] / u
-        count, volume = len(u), float(np.log(u).sum())
-        if self.is_prior:
-            return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
-        n = rules.known_from
-        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-        tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
-        return count * peak - tails - volume
+        return min(self.branches, key=away, default=None)
 
 
 def predict(
     track: Track, body: Body, frame: int, time_s: float | None, rules: MotionRules = MotionRules()
-) -> list[Prediction]:
+) -> list[Branch]:
     """Where the branches of a track expect the body; wider, the longer nothing was seen."""
     elapsed = track.elapsed(frame, time_s)
     widening = min(rules.widening**track.misses, rules.widest * (1 + track.misses / 10))
     predictions = []
     for branch in track.branches:
-        T = branch.T_world_object
+        T, uncertainty = branch.T_world_object, branch.uncertainty * widening
         if branch.spread is not None:
             walk = track.walk or RandomWalk.unknown(body, elapsed, rules)
-            u = np.sqrt(branch.spread**2 + walk.variance(elapsed))
-            predictions.append(Prediction(T, u, branch.weight, is_prior=True))
-            continue
-        if branch.velocity is not None and track.misses <= rules.coasting:
+            uncertainty = np.sqrt(branch.spread**2 + walk.variance(elapsed))
+        elif branch.velocity is not None and track.misses <= rules.coasting:
             T = perturb(T, branch.velocity * elapsed)
-        predictions.append(Prediction(T, branch.uncertainty * widening, branch.weight))
+        predictions.append(replace(branch, T_world_object=T, uncertainty=uncertainty))
     return predictions
 
 
 def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
-    """What the body's own track lets expect of a pose, or another body, the less the more misses.
-
-    Both are densities: no more poses made by chance are believed than without the other body.
-    """
+    """What a body's own track lets expect of a pose, or another body, the less the more misses."""
     share = rules.beside * (1 - rules.surprise) ** misses
     mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
     spread = own.spread if mine > theirs else beside.spread
     return Prior(float(np.logaddexp(mine, theirs)), spread)
-
-
-def nearest_branch(track: Track, T: Floats, body: Body) -> Branch | None:
-    """The branch that a pose goes on from: the nearest."""
-    if not track.branches:
-        return None
-    scale = np.repeat([body.radius, 1.0], 3)
-    twists = [twist_between(branch.T_world_object, T) / scale for branch in track.branches]
-    return track.branches[int(np.argmin(np.linalg.norm(twists, axis=1)))]
