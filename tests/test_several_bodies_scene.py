@@ -85,7 +85,7 @@ def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> No
     # three markers of four are where three of five are; without them nothing speaks for the small
     small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
     scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
-    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, scene.rules)
     found = sharing.explained()
     keeps, hidden = found[1].ranked[0].log_evidence, found[0].ranked[:1]
     assert sharing.evidence_of_both(1, 0) == pytest.approx(keeps, abs=1e-6)
@@ -263,7 +263,7 @@ def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
     pattern = PointPattern(points, np.ones(len(points)))
     views[0] = replace(views[0], observation=Observation(pattern, 1.5))
     scene = scene_of(*bodies)
-    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, scene.rules)
     found = sharing.explained()
     assert sharing.merged == [len(points) - 1]
     assert not found[0].left[len(points) - 1]

@@ -11,17 +11,25 @@ few are met, it is looked for everywhere, in the first frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mixpose.body import Body, like_features, mirror_image, thickness, tolerance_of
-from mixpose.judgement import APART, ScoredPose, contradict, is_far_off
+from mixpose.judgement import (
+    APART,
+    ScoredPose,
+    Verdict,
+    contradict,
+    decide,
+    is_far_off,
+    is_sure,
+)
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.proposers import candidates_of, met_features, starts_at
+from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
 
 TRIANGLE = "three markers are met, which other things may have alike"
@@ -29,8 +37,22 @@ ALONE = "one sensor of several meets the body, which none of its frames was sure
 MIRRORED = "it shows the body's mirror image"
 
 
-def doubt_about(data: Frame, best: ScoredPose, sensors: int, *, has_rivals: bool) -> str:
-    """Why a pose is in doubt, of a moment at which some sensors had a frame; empty if it is not."""
+def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
+    """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
+    verdict = decide(ranked, data.free, data.rules.acceptance)
+    best, has_rivals = verdict.best, verdict.status != "ok"
+    if best is None:
+        return verdict
+    rivals = [one for one, _ in verdict.kept if one is not best]
+    why = reason(data, best, rivals) if has_rivals else ""
+    # a sure pose that has rivals may have them for a reason that can be told
+    if not why and is_sure(best, data.free, data.rules.acceptance):
+        why = _doubt_about(data, best, has_rivals=has_rivals)
+    return verdict.doubted(why)
+
+
+def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
+    """Why a sure pose is in doubt; empty if it is not."""
     rules, track = data.rules, data.track
     if is_reflection(data, best):
         return MIRRORED
@@ -41,7 +63,7 @@ def doubt_about(data: Frame, best: ScoredPose, sensors: int, *, has_rivals: bool
         return ""
     if not is_known(data, best):
         return TRIANGLE
-    is_alone = sensors > 1 and np.count_nonzero(best.matches.met) == 1
+    is_alone = len(data.sensors) > 1 and np.count_nonzero(best.matches.met) == 1
     return ALONE if is_alone and _is_from_doubt(data, best) else ""
 
 

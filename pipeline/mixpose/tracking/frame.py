@@ -50,6 +50,7 @@ class Frame:
     searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
     still: Frame | None = None  # where views are as of the common time: sensors as they stand
     beside: Prediction | None = None  # where another body lets expect one that is not where it was
+    sensors: Sequence[str] = ()  # all that had a frame, also those that saw nothing
 
     @cached_property
     def free(self) -> Mask:

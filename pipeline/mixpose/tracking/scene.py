@@ -12,125 +12,25 @@ x coordinate (then y, then z) of their origins.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, free_mask
 from mixpose.judgement import ScoredPose, Verdict
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Mask, label_of
-from mixpose.rigid import is_rigid
-from mixpose.threads import one_blas_thread
+from mixpose.records import Estimate
 from mixpose.tracking.doubt import look_alike_of
-from mixpose.tracking.explain import Explanation, estimate_of, explain, followed
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, Proposer
-from mixpose.tracking.refinements import REFINEMENTS, Refinement
-from mixpose.tracking.rules import Rules, SceneRules
-from mixpose.tracking.sharing import Sharing
-from mixpose.tracking.track import Branch, Companion, Prediction, Track, predict
+from mixpose.tracking.rules import SceneRules
+from mixpose.tracking.sharing import Explanation, Sharing
+from mixpose.tracking.track import Companion, Track
+from mixpose.tracking.tracker import Tracker, followed
 
 # poses that a body may have instead of its own, with odds; its own, with those that it has none
 Rivals: TypeAlias = list[tuple[ScoredPose, float]]
-
-
-@dataclass(frozen=True)
-class Tracker:
-    """A body, and how its poses are estimated: what stays the same from frame to frame."""
-
-    body: Body
-    options: EstimatorOptions
-    samples: Floats  # (N, R, 3), of the body, for the objectives that integrate by sampling
-    start_uncertainty: Floats  # (6,)
-    T_start: Floats | None = None  # (4, 4)
-    rules: Rules = Rules()
-    proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
-    refinements: tuple[Refinement, ...] = REFINEMENTS
-    instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
-
-    @classmethod
-    def create(
-        cls,
-        body: Body,
-        options: EstimatorOptions,
-        T_start: Floats | None = None,
-        *,
-        rotation_deg: float | None = None,
-        distance: float | None = None,
-        rules: Rules = Rules(),
-        instance: int | None = None,
-    ) -> Self:
-        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
-        motion = rules.motion
-        start = per_kind(body, motion.start)
-        if distance is not None:
-            start[:3] = distance
-        if rotation_deg is not None:
-            start[3:] = np.radians(rotation_deg)
-        samples = body.sample(options.samples, seed=options.seed)
-        return cls(body, options, samples, start, T_start, rules, instance=instance)
-
-    @property
-    def free(self) -> Mask:
-        """Which of the six directions are estimated."""
-        return free_mask(self.options)
-
-    @property
-    def label(self) -> str:
-        """The body in one word."""
-        return label_of(self.body.name, self.instance)
-
-    def begin(self) -> Track:
-        """The track before the first frame."""
-        if self.T_start is None:
-            return Track()
-        return Track((Branch(self.T_start, 1.0, None, self.start_uncertainty),), known=True)
-
-    def advance(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> tuple[Track, Estimate]:
-        """Estimate one frame, in a scene that has no other body; see `Scene.advance`."""
-        (after,), (estimate,) = self._alone.advance((track,), frame, time_s, views)
-        return after, estimate
-
-    @cached_property
-    def _alone(self) -> Scene:
-        return Scene((self,))
-
-    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Prediction]:
-        """Where the track expects the body in a frame."""
-        return predict(track, self.body, frame, time_s, self.rules.motion)
-
-    def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
-        """A frame, and what is known before it; sensors that saw nothing are left out."""
-        seen = [view for view in views if not view.observation.is_empty]
-        predictions = self.predictions(track, frame, time_s)
-        views = track.delays.applied(seen, time_s, track.seconds_until(time_s))
-        data = Frame(
-            views=views,
-            body=self.body,
-            options=self.options,
-            samples=self.samples,
-            track=track,
-            predictions=predictions,
-            T_reference=predictions[0].T_world_object if predictions else self.T_start,
-            start_uncertainty=self.start_uncertainty,
-            rules=self.rules,
-            frame=frame,
-            time_s=time_s,
-        )
-        if not predictions or not data.is_timed:
-            return data
-        T = predictions[0].T_world_object
-        return data.in_motion(data.expected(T).at(T))
 
 
 @dataclass(frozen=True)
@@ -152,12 +52,9 @@ class Scene:
         `views` are all sensors with a frame; those that saw nothing are reported and left out.
         """
         if len(self.bodies) == 1:
-            data = self.bodies[0].data(tracks[0], frame, time_s, views)
-            found = {0: explain(Explanation(self.bodies[0], data, len(views)))}
-        else:
-            seen = [view for view in views if not view.observation.is_empty]
-            sharing = Sharing(self.bodies, tracks, frame, time_s, seen, len(views), self.rules)
-            found = sharing.explained()
+            track, estimate = self.bodies[0].advance(tracks[0], frame, time_s, views)
+            return (track,), [estimate]
+        found = Sharing(self.bodies, tracks, frame, time_s, views, self.rules).explained()
         finders, rivals = {k: k for k in found}, dict[int, Rivals]()
         for group in self._identical:
             given, exchanged = identify(group, found)
@@ -168,11 +65,9 @@ class Scene:
             verdicts[k] = told[k] = verdicts[k].doubted(why)
         after, estimates = [], []
         for k, tracked in enumerate(self.bodies):
-            shown = told[k].best or next(iter(found[finders[k]].ranked), None)
-            after.append(followed(found[k].frame, verdicts[k]))
-            estimate = estimate_of(found[k].frame, views, told[k], shown)
-            delays = after[k].delays.seconds
-            estimates.append(replace(estimate, instance=tracked.instance, delays=delays))
+            data, ranked = found[k].frame, found[finders[k]].ranked
+            after.append(followed(data, verdicts[k]))
+            estimates.append(tracked.estimate(data, after[k], told[k], ranked))
         return self._acquainted(after, estimates), estimates
 
     @cached_property
@@ -189,7 +84,7 @@ class Scene:
         """Why sure poses might as well be another body's that is not surely elsewhere."""
         doubts = {}
         sure = {k: verdict.best for k, verdict in told.items() if verdict.status == "ok"}
-        for k, best in sure.items() if len(self.bodies) > 1 else ():
+        for k, best in sure.items():
             # a body's own markers may repeat themselves: then it may be turned another way
             others = [
                 found[j].frame
@@ -264,31 +159,3 @@ def identify(
             share = float(np.exp(min(odds[i, j], 0.0)))
             rivals.setdefault(known[i], []).append((poses[other], share))
     return assigned, rivals
-
-
-def estimate_pose(
-    views: Sequence[View],
-    model: Body,
-    start: Floats | None = None,
-    options: EstimatorOptions | None = None,
-) -> Estimate:
-    """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
-
-    Raises
-    ------
-    ValueError
-        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
-    """
-    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
-        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
-    for view in views:
-        found, allowed = view.observation.dimension, view.sensor.dimension
-        if found != allowed:
-            raise ValueError(
-                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
-            )
-    tracker = Tracker.create(model, options or EstimatorOptions(), start)
-    began = time.perf_counter()
-    with one_blas_thread():
-        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
-    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
