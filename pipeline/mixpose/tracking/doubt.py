@@ -17,15 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from mixpose.body import Body, like_features, mirror_image, thickness, tolerance_of
-from mixpose.judgement import (
-    APART,
-    ScoredPose,
-    Verdict,
-    contradict,
-    decide,
-    is_far_off,
-    is_sure,
-)
+from mixpose.judgement import APART, ScoredPose, Verdict, contradict, decide, is_far_off, is_sure
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of

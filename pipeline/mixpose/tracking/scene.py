@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -56,12 +55,20 @@ class Scene:
             return (track,), [estimate]
         found = Sharing(self.bodies, tracks, frame, time_s, views, self.rules).explained()
         finders, rivals = {k: k for k in found}, dict[int, Rivals]()
-        for group in self._identical:
+        for name in {one.body.name for one in self.bodies if one.instance is not None}:
+            group = [k for k, one in enumerate(self.bodies) if one.body.name == name]
             given, exchanged = identify(group, found)
             finders, rivals = finders | given, rivals | exchanged
         verdicts = {k: found[finders[k]].verdict for k in found}
         told = {k: _in_doubt(verdicts[k], rivals.get(k, [])) for k in found}
-        for k, why in self._look_alikes(told, found).items():
+        sure = [k for k, verdict in told.items() if verdict.status == "ok"]
+        for k in sure:
+            # another body that is not surely elsewhere, or its own markers where they repeat
+            # themselves: then it may be turned another way
+            own, best = self.bodies[k].body, told[k].best
+            away = [j for j, one in enumerate(self.bodies) if j not in sure and one.body is not own]
+            others = [found[j].frame for j in (k, *away)]
+            why = look_alike_of(found[k].frame, best, others) if best else ""
             verdicts[k] = told[k] = verdicts[k].doubted(why)
         after, estimates = [], []
         for k, tracked in enumerate(self.bodies):
@@ -70,47 +77,22 @@ class Scene:
             estimates.append(tracked.estimate(data, after[k], told[k], ranked))
         return self._acquainted(after, estimates), estimates
 
-    @cached_property
-    def _identical(self) -> list[list[int]]:
-        """Numbers of the bodies that are identical, group by group."""
-        groups: dict[int, list[int]] = {}
-        for k, tracked in enumerate(self.bodies):
-            groups.setdefault(id(tracked.body), []).append(k)
-        return [group for group in groups.values() if len(group) > 1]
-
-    def _look_alikes(
-        self, told: Mapping[int, Verdict], found: Mapping[int, Explanation]
-    ) -> dict[int, str]:
-        """Why sure poses might as well be another body's that is not surely elsewhere."""
-        doubts = {}
-        sure = {k: verdict.best for k, verdict in told.items() if verdict.status == "ok"}
-        for k, best in sure.items():
-            # a body's own markers may repeat themselves: then it may be turned another way
-            others = [
-                found[j].frame
-                for j, other in enumerate(self.bodies)
-                if j == k or not (j in sure or other.body is self.bodies[k].body)
-            ]
-            if best is not None and (why := look_alike_of(found[k].frame, best, others)):
-                doubts[k] = why
-        return doubts
-
     def _acquainted(
         self, tracks: Sequence[Track], estimates: Sequence[Estimate]
     ) -> tuple[Track, ...]:
-        """The tracks, and where bodies are beside each other; identical ones may be exchanged."""
+        """The tracks, and where sure bodies are beside each other, but for exchangeable ones."""
         sure = {
-            tracked.label: one.T_world_object
-            for tracked, one in zip(self.bodies, estimates, strict=True)
-            if tracked.instance is None and one.status == "ok"
+            k: one.T_world_object
+            for k, one in enumerate(estimates)
+            if one.instance is None and one.status == "ok" and one.T_world_object is not None
         }
         after = list(tracks)
-        for k, tracked in enumerate(self.bodies):
-            T, known = sure.get(tracked.label), dict(tracks[k].companions)
-            for label, T_other in sure.items():
-                if T is not None and T_other is not None and label != tracked.label:
-                    known[label] = Companion.joined(known.get(label), T, T_other, tracked.body)
-                    after[k] = replace(tracks[k], companions=known)
+        for k, T in sure.items():
+            body, known = self.bodies[k].body, dict(tracks[k].companions)
+            for j in sure.keys() - {k}:
+                label = self.bodies[j].label
+                known[label] = Companion.joined(known.get(label), T, sure[j], body)
+            after[k] = replace(tracks[k], companions=known)
         return tuple(after)
 
 

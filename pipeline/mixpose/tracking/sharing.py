@@ -118,7 +118,7 @@ class Sharing:
         claims, twins = self._claims(self.claimed), dict[int, Explanation]()
         for k in some:
             body, track, left = self.bodies[k].body, self.tracks[k], claims.left(k)
-            if not self._is_forgotten(k) or sum(one.body is body for one in self.bodies) == 1:
+            if self.bodies[k].instance is None or not self._is_forgotten(k):
                 self.found[k] = self._everywhere(k, left, track)
                 continue
             if id(body) not in twins:

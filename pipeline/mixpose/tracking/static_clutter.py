@@ -21,9 +21,7 @@ from mixpose.records import Floats, Indices
 class StaticRules:
     """When a detection counts as static."""
 
-    frames: int = constant(
-        10, "without the body in which a detection must be there: a moving one is for one or two"
-    )
+    frames: int = constant(10, "without the body in which it must be there: what moves is for two")
 
 
 @dataclass(frozen=True)
