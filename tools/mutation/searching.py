@@ -179,7 +179,7 @@ _PROPOSALS = (
     ),
     Mutant(
         "tracking-live-search-forgets",
-        "tracking/explain.py",
+        "tracking/tracker.py",
         "track.missed(state, clutter)",
         "track.missed(track.search, clutter)",
         "a live search tries the same guesses in every frame",

@@ -1,15 +1,15 @@
 """Tracking: propose, fit, judge, decide, follow, from frame to frame."""
 
 from mixpose.body import ASIDE as ASIDE
-from mixpose.tracking.gating import (
+from mixpose.tracking.rules import Rules as Rules
+from mixpose.tracking.scene import (
     Expectation as Expectation,
+    Scene as Scene,
     WindowedScene as WindowedScene,
     are_as_good as are_as_good,
     have_fewer as have_fewer,
     is_convincing as is_convincing,
 )
-from mixpose.tracking.rules import Rules as Rules
-from mixpose.tracking.scene import Scene as Scene
 from mixpose.tracking.track import (
     UNKNOWN_S as UNKNOWN_S,
     Companion as Companion,

@@ -105,8 +105,8 @@ class Claims:
 
     def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
         """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
-        near = cdist(self.places[chosen], places) < reach
-        return np.flatnonzero(chosen)[near.any(axis=1)]
+        near: Mask = cdist(self.places[chosen], places).min(axis=1, initial=np.inf) < reach
+        return np.flatnonzero(chosen)[near]
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:

@@ -63,7 +63,7 @@ class Sharing:
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._leave_merged()
-        self._judge_again(self.found)
+        self._judge_again()
         self._beside_others(away)
         return self.found
 
@@ -160,7 +160,7 @@ class Sharing:
         return kept + max([0.0, *(one.log_evidence for one in rest)])
 
     def _leave_merged(self) -> None:
-        """Take from bodies what they meet loosely beside another's feature, and fit them again."""
+        """Take from bodies what they meet loosely beside another's feature: it is both's."""
         claims = self._claims(self.claimed)
         places = {k: self._features(k) for k in self.claimed}
         for k in self.claimed:
@@ -169,17 +169,13 @@ class Sharing:
             others = np.concatenate([places[k][:0], *(places[j] for j in places if j != k)])
             near = claims.near(loose & (claims.owners == k), others, self.rules.touching)
             self.merged += near.tolist()
-        if self.merged:
-            self._judge_again(self.claimed, fitted=True)
 
-    def _judge_again(self, some: Iterable[int], *, fitted: bool = False) -> None:
-        """Judge poses for which other detections are left by now, and fit them to these."""
+    def _judge_again(self) -> None:
+        """Judge poses for which other detections are left by now; those that are sure are fitted."""
         claims = self._claims(self.claimed)
-        for k in some:
-            left = claims.left(k)
-            if not np.array_equal(left, self.found[k].left):
-                again = self._again(k, left, fitted=fitted)
-                self.found[k] = again if again.ranked or not fitted else self.found[k]
+        for k, one in self.found.items():
+            if not np.array_equal(left := claims.left(k), one.left):
+                self.found[k] = self._again(k, left, fitted=k in self.claimed)
 
     def _beside_others(self, some: Iterable[int]) -> None:
         """Bodies that are not sure, by what was found beside them since they looked."""

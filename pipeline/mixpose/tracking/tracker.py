@@ -191,10 +191,8 @@ def estimate_pose(
 ) -> Estimate:
     """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
 
-    Raises
-    ------
-    ValueError
-        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
+    Raises ValueError for a start that is no rigid motion, and for features of a view that have not
+    the dimension of its sensor.
     """
     if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
         raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
