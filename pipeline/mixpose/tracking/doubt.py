@@ -1,12 +1,9 @@
 """Why a pose that is sure by itself is in doubt: what was seen may not be the body.
 
-A body is known once more than three markers are met, which other things, or another body of the
-session, have in the same places, too; and stays so while it is followed.  What looks like it by
-chance does so for several frames, and what the track expects then tells nothing.
-
-Where features are missed, and detections about the body belong to none, its mirror image is a
-rival: reflected in the plane nearest to the features met, which it leaves where they are.  Where
-few are met, it is looked for everywhere, in the first frames.
+Other things, or another body of the session, may have three markers in the same places.  What
+looks like the body by chance does so for several frames: what the track expects then tells nothing.
+The mirror image of the body is a rival where features are missed beside detections that belong to
+none, reflected in the plane nearest to those met; of few in the first frames, wherever it is.
 """
 
 from __future__ import annotations
@@ -56,7 +53,7 @@ def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
     if not is_known(data, best):
         return TRIANGLE
     is_alone = len(data.sensors) > 1 and np.count_nonzero(best.matches.met) == 1
-    return ALONE if is_alone and _is_from_doubt(data, best) else ""
+    return ALONE if is_alone and not track.believed and _is_from_doubt(data, best) else ""
 
 
 def is_known(data: Frame, judged: ScoredPose) -> bool:
@@ -85,18 +82,15 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
         # no rival meets less than a quarter of what the body meets; values grow as the square
         value, own = (one.finest.value(T[None])[0] for one in (there, data))
-        if value > own / 16:
-            start = Start(T, data.close)
-            if _evidence(there, start) > judged.log_evidence + ahead:
-                return True
+        start, least = Start(T, data.close), judged.log_evidence + ahead
+        if value > own / 16 and _evidence(there, start) > least:
+            return True
     if not _is_by_chance(data, judged):
         return False
-    # wherever it is found, and nothing known of either
-    track = Track(residuals=data.track.residuals)
-    # what explains more than this pose is met by the first guesses already
-    options = replace(data.options, search="live")
-    nothing = replace(data, predictions=(), beside=None, begun=None)
-    alone = replace(nothing, track=track, searches=[], options=options)
+    # wherever it is found, and nothing known of either; the first guesses meet what explains more
+    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
+    nothing = replace(data, predictions=(), beside=None, begun=None, searches=[])
+    alone = replace(nothing, track=track, options=live)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     least = own - rules.search.outdone
     starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
@@ -124,8 +118,6 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
 
 def _is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
-    if data.track.believed:
-        return False
     gained = data.prior(judged.T_world_object).log_density - data.anywhere.log_density
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
@@ -137,14 +129,12 @@ def _is_flat(body: Body) -> bool:
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
-    rules, seen = data.rules, judged.matches
-    if judged.measurements - 6 > rules.look_alikes.by_chance:
+    rules, seen, track = data.rules, judged.matches, data.track
+    are_few = judged.measurements - 6 <= rules.look_alikes.by_chance
+    if not are_few or track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
-    if data.track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
-        return False
-    before, noise = data.track.residuals.total, rules.judgement.noise
-    off = is_far_off(seen, before, rules.acceptance, noise)
-    return off or bool((seen.missed > 0.5).any())
+    noise, is_missed = rules.judgement.noise, bool((seen.missed > 0.5).any())
+    return is_missed or is_far_off(seen, track.residuals.total, rules.acceptance, noise)
 
 
 def _evidence(data: Frame, start: Start) -> float:

@@ -10,7 +10,6 @@ from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.associations import RangeRules
 from mixpose.tracking.motion import CourseRules, MotionRules
-from mixpose.tracking.static_clutter import StaticRules
 
 
 @dataclass(frozen=True)
@@ -22,6 +21,7 @@ class ProposalRules:
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(3.0, "drawn poses are so much surer than starts; searched: squared")
     blurs: tuple[float, ...] = constant((0.5, 0.25), "σ_ε, to go on from where cut spots pull")
+    static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
     believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")
 
 
@@ -50,7 +50,6 @@ class Rules:
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()
-    static: StaticRules = StaticRules()
     search: SearchBudget = THOROUGH
     live: SearchBudget = LIVE
 

@@ -244,7 +244,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     """The track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
     if best is None:
-        clutter = track.clutter.learnt(data.views, data.rules.static)
+        clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
         state = data.searches[-1][1] if data.searches else Track.search
         return replace(track.missed(state, clutter), doubted=True)
     found = []
