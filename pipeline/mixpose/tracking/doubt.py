@@ -98,9 +98,9 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
 
 
 def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str:
-    """Why a pose might as well be one of another body, or another of its own; empty if not.
+    """Why all that a pose meets might as well be a part of other bodies, or another of its own.
 
-    All that is met is a part that both have.  `others` are the frames of the bodies in question.
+    `others` are the frames of the bodies in question; empty if it is none of theirs.
     """
     met = met_features(best)
     for other in others:

@@ -171,12 +171,11 @@ class Sharing:
             self.merged += near.tolist()
 
     def _judge_again(self) -> None:
-        """Judge poses for which other detections are left by now."""
+        """Judge poses for which other detections are left by now; without merged ones, fit them."""
         claims = self._claims(self.claimed)
         for k, one in self.found.items():
-            # without what is two bodies' in one, claimed poses are where their own detections are
             if not np.array_equal(left := claims.left(k), one.left):
-                self.found[k] = self._again(k, left, fitted=bool(self.merged) and k in self.claimed)
+                self.found[k] = self._again(k, left, fitted=bool(self.merged))
 
     def _beside_others(self, some: Iterable[int]) -> None:
         """Bodies that are not sure, by what was found beside them since they looked."""
