@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Self
@@ -22,7 +22,7 @@ from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, is_known
 from mixpose.tracking.frame import Frame, follow
 from mixpose.tracking.in_motion import delays_after
-from mixpose.tracking.likelihood import Likelihood, Start, likelihood_of
+from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, Proposer
 from mixpose.tracking.refinements import REFINEMENTS, Refinement
@@ -133,7 +133,9 @@ class Tracker:
             if start.T_moved is None and any(fit is one for one in fits):
                 return None  # judged before, and by the same prior
             fits.append(fit)
-            return _judged(likelihood, ranked, start, fit, proposer)
+            judged = replace(likelihood.judge(fit, start), proposer=proposer, blurs=fit.blurs)
+            insert(ranked, judged, data.body, data.free, data.rules.acceptance)
+            return judged
 
         for propose in self.proposers if data.views else ():
             for start in propose(data, ranked):
@@ -221,23 +223,11 @@ def judged_again(
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
     for one in poses if data.views else ():
         start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
-        _judged(likelihood, ranked, start, likelihood.fit(start), one.proposer, one.blurs)
+        fit = likelihood.fit(start)
+        judged, blurs = likelihood.judge(fit, start), fit.blurs or one.blurs
+        judged = replace(judged, proposer=one.proposer, blurs=blurs)
+        insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
-
-
-def _judged(
-    likelihood: Likelihood,
-    ranked: list[ScoredPose],
-    start: Start,
-    fit: Fit,
-    proposer: str,
-    blurs: tuple[Mapping[str, float], ...] = (),
-) -> ScoredPose:
-    """Judge a fit, and put it among the poses; `blurs` are those of the fit before."""
-    data, judged = likelihood.frame, likelihood.judge(fit, start)
-    judged = replace(judged, proposer=proposer, blurs=fit.blurs or blurs)
-    insert(ranked, judged, data.body, data.free, data.rules.acceptance)
-    return judged
 
 
 def followed(data: Frame, verdict: Verdict) -> Track:
