@@ -38,8 +38,8 @@ def test_static_clutter_is_searched_last_unless_that_is_switched_off() -> None:
         for switch, left in ((Switch("all on", all_on), 2), (STATIC, LAMPS)):
             tracker, clutter = switch.change(recording.tracker), StaticClutter()
             for frame in empty:
-                clutter = clutter.learnt(frame.views, tracker.rules.static)
-            (view,) = clutter.without(last.views, tracker.rules.static)
+                clutter = clutter.learnt(frame.views, tracker.rules.proposals.static)
+            (view,) = clutter.without(last.views, tracker.rules.proposals.static)
             # seven markers, and lamps of which one frame or another was 1.5 px off
             lamps = len(view.observation.pattern.points) - 7  # type: ignore[union-attr]
             assert lamps == left if left == LAMPS else lamps <= left

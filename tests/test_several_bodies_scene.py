@@ -81,11 +81,24 @@ def test_a_body_that_is_not_there_is_not_found_on_its_twin() -> None:
     assert [estimate.status for estimate in estimates] == ["ok", "lost"]
 
 
+def test_bodies_are_lost_where_no_sensor_sees_anything() -> None:
+    bodies = [body("tool", TOOL), body("other", OTHER)]
+    scene, views = scene_of(*bodies), views_of(bodies, [at(-100), at(110, 30)], 1)
+    tracks, _ = scene.advance(scene.begin(), 0, None, views)
+    nothing = Observation(PointPattern(np.zeros((0, 2)), np.zeros(0)), 1.5)
+    dark = [replace(view, observation=nothing) for view in views]
+    tracks, estimates = scene.advance(tracks, 1, None, dark)
+    assert [estimate.status for estimate in estimates] == ["lost", "lost"]
+    assert [list(estimate.sensors) for estimate in estimates] == [["left", "right"]] * 2
+    _, estimates = scene.advance(tracks, 2, None, views)
+    assert [estimate.status for estimate in estimates] == ["ok", "ok"]
+
+
 def test_a_body_that_is_hidden_takes_nothing_from_one_that_explains_more() -> None:
     # three markers of four are where three of five are; without them nothing speaks for the small
     small, large = body("small", np.vstack([OTHER[:3], [[-90.0, -80.0, 70.0]]])), body("l", OTHER)
     scene, views = scene_of(small, large), views_of([large], [at(20.0)], 0)
-    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, scene.rules)
     found = sharing.explained()
     keeps, hidden = found[1].ranked[0].log_evidence, found[0].ranked[:1]
     assert sharing.evidence_of_both(1, 0) == pytest.approx(keeps, abs=1e-6)
@@ -263,7 +276,7 @@ def test_a_spot_between_two_bodies_is_neither_one_s() -> None:
     pattern = PointPattern(points, np.ones(len(points)))
     views[0] = replace(views[0], observation=Observation(pattern, 1.5))
     scene = scene_of(*bodies)
-    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, 2, scene.rules)
+    sharing = Sharing(scene.bodies, scene.begin(), 0, None, views, scene.rules)
     found = sharing.explained()
     assert sharing.merged == [len(points) - 1]
     assert not found[0].left[len(points) - 1]

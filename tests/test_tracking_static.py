@@ -14,16 +14,18 @@ from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Track, Tracker
-from mixpose.tracking.static_clutter import StaticClutter, StaticRules
+from mixpose.tracking.rules import ProposalRules
+from mixpose.tracking.static_clutter import StaticClutter
 
 Floats = NDArray[np.float64]
 
-RULES = StaticRules()
+FRAMES = ProposalRules().static
 
 
-def tracker_of(rules: StaticRules = RULES) -> Tracker:
+def tracker_of(static: int = FRAMES) -> Tracker:
     tracker = Tracker.create(EIGHT, EstimatorOptions(search="live"))
-    return replace(tracker, rules=replace(tracker.rules, static=rules))
+    proposals = replace(tracker.rules.proposals, static=static)
+    return replace(tracker, rules=replace(tracker.rules, proposals=proposals))
 
 
 def room(cameras: list[PinholeCamera], seed: int, seen: bool) -> list[View]:
@@ -38,24 +40,24 @@ def room(cameras: list[PinholeCamera], seed: int, seen: bool) -> list[View]:
     return views
 
 
-def entered(cameras: list[PinholeCamera], rules: StaticRules) -> tuple[Track, Estimate]:
+def entered(cameras: list[PinholeCamera], static: int) -> tuple[Track, Estimate]:
     """The frame in which the body comes into a room that was watched for a while."""
-    tracker = tracker_of(rules)
+    tracker = tracker_of(static)
     track = tracker.begin()
-    for frame in range(RULES.frames):
+    for frame in range(FRAMES):
         views = room(cameras, frame, seen=False)
-        track = track.missed(track.search, track.clutter.learnt(views, rules))
-    return tracker.advance(track, RULES.frames, None, room(cameras, 99, seen=True))
+        track = track.missed(track.search, track.clutter.learnt(views, static))
+    return tracker.advance(track, FRAMES, None, room(cameras, 99, seen=True))
 
 
 def test_a_body_that_comes_into_a_room_full_of_lamps_is_found_among_what_moves(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     one = pinhole_cameras[:1]
-    _, known = entered(one, RULES)
+    _, known = entered(one, FRAMES)
     assert known.status == "ok"
     # 7,770 triples of 38 rays as 336 triples of features; 56 of the eight that move
-    _, unknown = entered(one, StaticRules(frames=1000))
+    _, unknown = entered(one, 1000)
     assert unknown.status == "lost"
 
 
@@ -64,9 +66,9 @@ def test_a_body_that_stands_still_is_found_all_the_same(
 ) -> None:
     views = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=0.2)
     clutter = StaticClutter()
-    for _ in range(RULES.frames):
-        clutter = clutter.learnt(views, RULES)
-    assert all(one.observation.is_empty for one in clutter.without(views, RULES))
+    for _ in range(FRAMES):
+        clutter = clutter.learnt(views, FRAMES)
+    assert all(one.observation.is_empty for one in clutter.without(views, FRAMES))
     tracker = tracker_of()
     track = tracker.begin().missed(tracker.begin().search, clutter)
     assert tracker.advance(track, 1, None, views)[1].status == "ok"
@@ -79,13 +81,13 @@ def test_a_place_counts_as_static_from_ten_frames_and_is_forgotten_as_slowly(
     off = [view_of("0", pinhole_cameras[0], np.array([[900.0, 50.0]]))]
     clutter = StaticClutter()
     for frame in range(1, 12):
-        clutter = clutter.learnt(lamp, RULES)
-        pattern = clutter.without(lamp, RULES)[0].observation.pattern
+        clutter = clutter.learnt(lamp, FRAMES)
+        pattern = clutter.without(lamp, FRAMES)[0].observation.pattern
         assert isinstance(pattern, PointPattern)
         assert len(pattern.points) == (1 if frame < 10 else 0)
     for frame in range(1, 12):
-        clutter = clutter.learnt(off, RULES)
-        pattern = clutter.without(lamp, RULES)[0].observation.pattern
+        clutter = clutter.learnt(off, FRAMES)
+        pattern = clutter.without(lamp, FRAMES)[0].observation.pattern
         assert isinstance(pattern, PointPattern)
         # eleven times there, and not there since
         assert len(pattern.points) == (0 if frame < 2 else 1)

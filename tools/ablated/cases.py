@@ -22,7 +22,7 @@ from mixpose.tracking import Tracker
 from mixpose.tracking import frame as tracked
 from mixpose.tracking.likelihood import Start
 from mixpose.tracking.proposers import candidates_of, is_doubtful, searched, starts_at
-from mixpose.tracking.static_clutter import StaticRules
+from mixpose.tracking.rules import ProposalRules
 
 Floats: TypeAlias = NDArray[np.float64]
 Change: TypeAlias = Callable[[Tracker], Tracker]
@@ -196,10 +196,10 @@ def room_case(trials: int) -> Case:
         (view,) = one.views
         lamps = rng.uniform(view.sensor.lower, view.sensor.upper, (LAMPS, 2))
         frames = []
-        for number in range(StaticRules().frames + 2):
+        for number in range(ProposalRules().static + 2):
             y = lamps + NOISE_PX * rng.standard_normal(lamps.shape)
             answers = np.zeros((0, 4, 4))
-            if number > StaticRules().frames:
+            if number > ProposalRules().static:
                 assert isinstance(view.observation.pattern, PointPattern)
                 y = np.concatenate([y, view.observation.pattern.points])
                 answers = one.T_world_object[None]

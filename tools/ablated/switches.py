@@ -107,7 +107,7 @@ def unfused(tracker: Tracker) -> Tracker:
 SWITCHES = (
     Switch("no multistart", without_proposer(multistart)),
     Switch("no searched", without_proposer(searched)),
-    Switch("static clutter searched alike", ruled("static", frames=NEVER_STATIC)),
+    Switch("static clutter searched alike", ruled("proposals", static=NEVER_STATIC)),
     Switch("no congruent features", ruled("look_alikes", kinds=("tilted", "mirrored"))),
     Switch("no other tilt", ruled("look_alikes", kinds=("congruent", "mirrored"))),
     Switch("no mirror image", ruled("look_alikes", kinds=("congruent", "tilted"))),

@@ -161,7 +161,7 @@ _MOTION = (
 _GATING = (
     Mutant(
         "tracking-windows-of-an-exact-prediction",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "margins = self.reach * np.sqrt(by_pose)",
         "margins = 0 * np.sqrt(by_pose)",
         "a body that moves otherwise than predicted is cut off",
@@ -169,7 +169,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-windows-without-a-rim",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "min_margin_px: float = constant(40.0,",
         "min_margin_px: float = constant(0.0,",
         "features at the rim are cut off",
@@ -177,7 +177,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-windows-of-points",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "np.maximum(scales * self._feature_reach, self.min_margin_px)",
         "np.maximum(0 * scales, self.min_margin_px)",
         "features that are large in the image are cut off",
@@ -185,7 +185,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-windows-of-the-last-branch",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "np.where(seen, at.y - margins, np.inf).min(axis=(1, 2))",
         "np.where(seen, at.y - margins, np.inf)[:, -1].min(axis=1)",
         "of two possible poses one is not looked at",
@@ -193,7 +193,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-windows-begin-at-hidden-features",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "lower = np.where(seen, at.y - margins, np.inf)",
         "lower = np.where(True, at.y - margins, np.inf)",
         "windows reach to features that no camera sees",
@@ -201,7 +201,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-fewer-detections-go-unnoticed",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "points is not None and len(points) < before[name][0]",
         "points is not None and len(points) < 0",
         "a window that cuts features off is not noticed",
@@ -209,7 +209,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-as-good-whatever-is-missed",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "in_view - met <= before[name][1] - before[name][0]",
         "in_view - met <= 1000",
         "a window that cuts features off is not noticed",
@@ -217,7 +217,7 @@ _GATING = (
     ),
     Mutant(
         "tracking-worse-than-before-convinces",
-        "tracking/gating.py",
+        "tracking/scene.py",
         "are_as_good(now.tallies, then.tallies)",
         "True",
         "features that left the window are not looked for",
@@ -271,7 +271,7 @@ _RANGE_POSTERIOR = (
 _TRACKER = (
     Mutant(
         "tracking-noise-of-doubtful-frames-kept",
-        "tracking/explain.py",
+        "tracking/tracker.py",
         "residuals=best.noise if is_ok else track.residuals,",
         "residuals=best.noise,",
         "residuals of a wrong pose make the frames after it unsure",
@@ -279,7 +279,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sensors-left-out-are-tallied",
-        "tracking/explain.py",
+        "tracking/tracker.py",
         "used = best.used\n",
         "used = best.matches\n",
         "the next frame is looked at as a whole although all is well",
@@ -287,7 +287,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-start-widths-ignored",
-        "tracking/scene.py",
+        "tracking/tracker.py",
         "start[:3] = distance",
         "start[:3] *= 1.0",
         "how far off a start may be does nothing",
@@ -295,7 +295,7 @@ _TRACKER = (
     ),
     Mutant(
         "tracking-sure-frames-have-rivals",
-        "tracking/explain.py",
+        "tracking/tracker.py",
         'rivals = verdict.kept if verdict.status == "ambiguous" else ()',
         "rivals = verdict.kept",
         "frames that are sure list hypotheses",

@@ -14,7 +14,7 @@ from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse
 from mixpose.sensors import Sensor
-from mixpose.tracking import Explanation, Tracker, explain
+from mixpose.tracking import Tracker
 
 _LEAST = 4  # detections: three leave four poses of any triangle
 
@@ -63,7 +63,7 @@ def hypotheses(
     views = [View(name, own, Observation(pattern, sigma))]
     tracker = Tracker.create(body, EstimatorOptions())
     frame = tracker.data(tracker.begin(), 0, None, views)
-    ranked = explain(Explanation(tracker, frame)).ranked
+    ranked = tracker.explain(frame)
     best = ranked[0].log_evidence if ranked else 0.0
     kept = [one for one in ranked if one.log_evidence > max(best - rules.margin, 0.0)]
     kept = kept[: rules.hypotheses]

@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.judgement import ScoredPose
@@ -75,7 +76,7 @@ class Claims:
         at, owners = np.concatenate(list(places.values())), self.owners.copy()
         for sensor in np.unique(at[:, 2]):
             rows, columns = (np.flatnonzero(some[:, 2] == sensor) for some in (self.places, at))
-            squared = np.minimum(_squared(self.places[rows], at[columns]), gate**2)
+            squared = np.minimum(cdist(self.places[rows], at[columns], "sqeuclidean"), gate**2)
             i, j = linear_sum_assignment(squared)
             near = squared[i, j] < gate**2
             owners[rows[i[near]]] = whose[columns[j[near]]]
@@ -104,8 +105,8 @@ class Claims:
 
     def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
         """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
-        near = _squared(self.places[chosen], places) < reach**2
-        return np.flatnonzero(chosen)[near.any(axis=1)]
+        near: Mask = cdist(self.places[chosen], places).min(axis=1, initial=np.inf) < reach
+        return np.flatnonzero(chosen)[near]
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:
@@ -114,9 +115,3 @@ def places_of(sensors: int | Indices, y: Floats) -> Floats:
     places[:, : y.shape[1]] = y
     places[:, 2] = 1e6 * np.asarray(sensors)
     return places
-
-
-def _squared(points: Floats, places: Floats) -> Floats:
-    """Squared distances (K, n) of points (K, 3) and places (n, 3)."""
-    away = points[:, None] - places
-    return np.asarray((away * away).sum(axis=2))

@@ -1,27 +1,24 @@
 """Why a pose that is sure by itself is in doubt: what was seen may not be the body.
 
-A body is known once more than three markers are met, which other things, or another body of the
-session, have in the same places, too; and stays so while it is followed.  What looks like it by
-chance does so for several frames, and what the track expects then tells nothing.
-
-Where features are missed, and detections about the body belong to none, its mirror image is a
-rival: reflected in the plane nearest to the features met, which it leaves where they are.  Where
-few are met, it is looked for everywhere, in the first frames.
+Other things, or another body of the session, may have three markers in the same places.  What
+looks like the body by chance does so for several frames: what the track expects then tells nothing.
+The mirror image of the body is a rival where features are missed beside detections that belong to
+none, reflected in the plane nearest to those met; of few in the first frames, wherever it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mixpose.body import Body, like_features, mirror_image, thickness, tolerance_of
-from mixpose.judgement import APART, ScoredPose, contradict, is_far_off
+from mixpose.judgement import APART, ScoredPose, Verdict, contradict, decide, is_far_off, is_sure
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
-from mixpose.tracking.proposers import candidates_of, met_features, starts_at
+from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
 
 TRIANGLE = "three markers are met, which other things may have alike"
@@ -29,8 +26,22 @@ ALONE = "one sensor of several meets the body, which none of its frames was sure
 MIRRORED = "it shows the body's mirror image"
 
 
-def doubt_about(data: Frame, best: ScoredPose, sensors: int, *, has_rivals: bool) -> str:
-    """Why a pose is in doubt, of a moment at which some sensors had a frame; empty if it is not."""
+def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
+    """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
+    verdict = decide(ranked, data.free, data.rules.acceptance)
+    best, has_rivals = verdict.best, verdict.status != "ok"
+    if best is None:
+        return verdict
+    rivals = [one for one, _ in verdict.kept if one is not best]
+    why = reason(data, best, rivals) if has_rivals else ""
+    # a sure pose that has rivals may have them for a reason that can be told
+    if not why and is_sure(best, data.free, data.rules.acceptance):
+        why = _doubt_about(data, best, has_rivals=has_rivals)
+    return verdict.doubted(why)
+
+
+def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
+    """Why a sure pose is in doubt; empty if it is not."""
     rules, track = data.rules, data.track
     if is_reflection(data, best):
         return MIRRORED
@@ -41,8 +52,8 @@ def doubt_about(data: Frame, best: ScoredPose, sensors: int, *, has_rivals: bool
         return ""
     if not is_known(data, best):
         return TRIANGLE
-    is_alone = sensors > 1 and np.count_nonzero(best.matches.met) == 1
-    return ALONE if is_alone and _is_from_doubt(data, best) else ""
+    is_alone = len(data.sensors) > 1 and np.count_nonzero(best.matches.met) == 1
+    return ALONE if is_alone and not track.believed and _is_from_doubt(data, best) else ""
 
 
 def is_known(data: Frame, judged: ScoredPose) -> bool:
@@ -71,18 +82,15 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
         # no rival meets less than a quarter of what the body meets; values grow as the square
         value, own = (one.finest.value(T[None])[0] for one in (there, data))
-        if value > own / 16:
-            start = Start(T, data.close)
-            if _evidence(there, start) > judged.log_evidence + ahead:
-                return True
+        start, least = Start(T, data.close), judged.log_evidence + ahead
+        if value > own / 16 and _evidence(there, start) > least:
+            return True
     if not _is_by_chance(data, judged):
         return False
-    # wherever it is found, and nothing known of either
-    track = Track(residuals=data.track.residuals)
-    # what explains more than this pose is met by the first guesses already
-    options = replace(data.options, search="live")
-    nothing = replace(data, predictions=(), beside=None, drawn=None)
-    alone = replace(nothing, track=track, searches=[], options=options)
+    # wherever it is found, and nothing known of either; the first guesses meet what explains more
+    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
+    nothing = replace(data, predictions=(), beside=None, drawn=None, together=None, searches=[])
+    alone = replace(nothing, track=track, options=live)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     least = own - rules.search.outdone
     starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
@@ -90,9 +98,9 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
 
 
 def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str:
-    """Why a pose might as well be one of another body, or another of its own; empty if not.
+    """Why all that a pose meets might as well be a part of other bodies, or another of its own.
 
-    All that is met is a part that both have.  `others` are the frames of the bodies in question.
+    `others` are the frames of the bodies in question; empty if it is none of theirs.
     """
     met = met_features(best)
     for other in others:
@@ -110,8 +118,6 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
 
 def _is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
-    if data.track.believed:
-        return False
     gained = data.prior(judged.T_world_object).log_density - data.anywhere.log_density
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
@@ -123,14 +129,12 @@ def _is_flat(body: Body) -> bool:
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     """Whether features may be met by chance: few, others missed or these far off, early on."""
-    rules, seen = data.rules, judged.matches
-    if judged.measurements - 6 > rules.look_alikes.by_chance:
+    rules, seen, track = data.rules, judged.matches, data.track
+    are_few = judged.measurements - 6 <= rules.look_alikes.by_chance
+    if not are_few or track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
-    if data.track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
-        return False
-    before, noise = data.track.residuals.total, rules.judgement.noise
-    off = is_far_off(seen, before, rules.acceptance, noise)
-    return off or bool((seen.missed > 0.5).any())
+    noise, is_missed = rules.judgement.noise, bool((seen.missed > 0.5).any())
+    return is_missed or is_far_off(seen, track.residuals.total, rules.acceptance, noise)
 
 
 def _evidence(data: Frame, start: Start) -> float:

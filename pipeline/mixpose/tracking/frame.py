@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import Prior, flat_prior, nearest_alike
+from mixpose.fit import EstimatorOptions, Fit, free_mask
+from mixpose.judgement import Prior, ScoredPose, flat_prior, nearest_alike
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -37,10 +37,13 @@ class Frame:
     frame: int
     time_s: float | None
     drawn: MatchedObjective | None = None  # `finest`, where it is at hand
+    # from the first prediction, where several bodies were fitted together
+    together: tuple[Fit, ScoredPose] | None = None
     # what searches of the frame cost, and where they go on in the next; the proposer adds to it
     searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
     still: Sequence[View] = ()  # where views are as of the common time: sensors as they stand
     beside: Branch | None = None  # where another body lets expect one that is not where it was
+    sensors: Sequence[str] = ()  # all that had a frame, also those that saw nothing
 
     @cached_property
     def free(self) -> Mask:

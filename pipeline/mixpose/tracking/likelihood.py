@@ -50,8 +50,6 @@ class MatchedLikelihood:
         self.frame = frame
         # whether each feature's detection is known, so that one may be left out
         self.knows_detections = frame.options.objective == "matched"
-        # from the first prediction, where several bodies were fitted together
-        self.together: tuple[Fit, ScoredPose] | None = None
         self._climbed: dict[frozenset[str], list[Fit]] = {}  # by sensors left out
 
     def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
@@ -59,8 +57,9 @@ class MatchedLikelihood:
         uncertainty, frame = start.uncertainty, self.frame.without(start.left_out)
         if uncertainty is None:
             return Fit(start.T_world_object, 0.0, True, 0)
-        if self.together and start.prediction is frame.predictions[0]:
-            return self.together[0]
+        is_first = any(start.prediction is one for one in frame.predictions[:1])
+        if self.frame.together and is_first:
+            return self.frame.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, start.T_world_object) if self.knows_detections else 0.0
@@ -86,8 +85,8 @@ class MatchedLikelihood:
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         frame, motion = self.frame, fit.motion
-        if self.together and fit is self.together[0]:
-            return self.together[1]
+        if frame.together and fit is frame.together[0]:
+            return frame.together[1]
         T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         if frame.is_timed:
             motion = motion or frame.expected(T).at(T)

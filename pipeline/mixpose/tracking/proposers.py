@@ -128,7 +128,7 @@ def candidates_of(frame: Frame) -> list[Candidate]:
         seed=frame.options.seed,
     )
     among_moving, spent = list[Candidate](), SearchReport()
-    moving = frame.track.clutter.without(frame.views, frame.rules.static)
+    moving = frame.track.clutter.without(frame.views, frame.rules.proposals.static)
     if any(view is not whole for view, whole in zip(moving, frame.views, strict=True)):
         budget = replace(budget, max_guesses=budget.max_guesses / 2)
         among_moving, spent, _ = search(moving, budget=budget)

@@ -9,28 +9,19 @@ from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.motion import MotionRules
-from mixpose.tracking.static_clutter import StaticRules
 
 
 @dataclass(frozen=True)
 class ProposalRules:
     """What the proposers of `mixpose.tracking.proposers` go by."""
 
-    drawn: int = constant(
-        512, "poses scored around a prediction: one lies within a third of the uncertainty in six"
-    )
+    drawn: int = constant(512, "poses scored: one is off by less than a third in all directions")
     kept: int = constant(5, "of these, starts that descend")
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
-    narrowing: float = constant(
-        3.0,
-        "how much surer, and at a narrower blur, drawn poses are than starts; searched: squared",
-    )
-    blurs: tuple[float, ...] = constant(
-        (0.5, 0.25), "σ_ε, from which fits go on where spots that are cut or merged bend the pose"
-    )
-    believed: int = constant(
-        3, "poses that are ok, in spite of the mirror image, after which it is no longer looked for"
-    )
+    narrowing: float = constant(3.0, "drawn poses are so much surer than starts; searched: squared")
+    blurs: tuple[float, ...] = constant((0.5, 0.25), "σ_ε, to go on from where cut spots pull")
+    static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
+    believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")
 
 
 @dataclass(frozen=True)
@@ -41,14 +32,9 @@ class LookAlikeRules:
         ("congruent", "tilted", "mirrored"), "features like others, other tilt, mirror image"
     )
     alike: float = constant(0.05, "of the smaller radius: how far partners may be apart")
-    fewer: float = constant(
-        1.5, "features fewer that a rival may meet: each is worth four of the log odds, or so"
-    )
+    fewer: float = constant(1.5, "features fewer that a rival may meet: each is e⁴ in odds, or so")
     flat: float = constant(0.15, "thickness by smaller width below which a body may be tilted")
-    by_chance: float = constant(
-        14.0,
-        "coordinates met beyond six up to which it may be by chance: 5 features, 2 cameras",
-    )
+    by_chance: float = constant(14.0, "coordinates beyond six met by chance: 5 points, 2 cameras")
 
 
 @dataclass(frozen=True)
@@ -71,7 +57,6 @@ class Rules:
     ranges: RangeRules = RangeRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()
-    static: StaticRules = StaticRules()
     search: SearchBudget = THOROUGH
     live: SearchBudget = LIVE
 
@@ -80,18 +65,8 @@ class Rules:
 class SceneRules:
     """How detections are shared out, and when bodies are in doubt for each other's sake."""
 
-    gate: float = constant(
-        6.0, "σ_ε around expected features: they are met within 2.2, predictions err by the rest"
-    )
-    rival: float = constant(
-        0.5, "share of its detections that another meets from which it is the one or the other"
-    )
-    touching: float = constant(
-        3.0, "σ_ε from a spot to another body's feature: images run together at twice their width"
-    )
-    pulled: float = constant(
-        0.1, "squared offset in σ_ε² from which such a spot is both's: 2.5 times that of blobs"
-    )
-    thorough: int = constant(
-        10, "frames, of which one is searched thoroughly for a body that is away, others not: 1/3 s"
-    )
+    gate: float = constant(6.0, "σ_ε around expected features: met within 2.2, the rest is motion")
+    rival: float = constant(0.5, "share of its detections from which another body is a rival")
+    touching: float = constant(3.0, "σ_ε between images that run together: twice a spot's width")
+    pulled: float = constant(0.1, "offset² in σ_ε² of a spot of two bodies: 2.5 times a blob's")
+    thorough: int = constant(10, "frames, of which one searches thoroughly for what is away: 1/3 s")

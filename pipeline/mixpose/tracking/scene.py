@@ -1,6 +1,4 @@
-"""Bodies that are tracked, from frame to frame; a scene of one is a scene.
-
-The poses of a moment are proposed, fitted and judged body by body, on what others leave.
+"""All bodies before the sensors, from frame to frame, and where in images they are looked for.
 
 Nothing in a frame tells identical bodies apart; only where they were before does.  The poses of a
 frame are given to them so that all together are most likely by what was predicted.  Where two of
@@ -8,128 +6,38 @@ them might as well have changed places, because they met or were lost together, 
 in that frame, with each other's pose among their hypotheses; afterwards they go on as assigned.
 Bodies that nothing was known of before get the poses that are left in the order of the world's
 x coordinate (then y, then z) of their origins.
+
+Images are looked at where tracks expect the bodies: what is met there convinces, or all is seen.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import KDTree
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, free_mask
-from mixpose.judgement import ScoredPose, Verdict
-from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Mask, label_of
-from mixpose.rigid import is_rigid
-from mixpose.threads import one_blas_thread
+from mixpose.constants import constant
+from mixpose.judgement import AcceptanceRules, ScoredPose, Verdict
+from mixpose.objective import View, project_body
+from mixpose.records import Estimate, Mask
+from mixpose.sensors import Sensor
 from mixpose.tracking.doubt import look_alike_of
-from mixpose.tracking.explain import Explanation, estimate_of, explain, followed
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.motion import per_kind
-from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
-from mixpose.tracking.rules import Rules, SceneRules
-from mixpose.tracking.sharing import Sharing
-from mixpose.tracking.track import Branch, Companion, Track, predict
+from mixpose.tracking.rules import SceneRules
+from mixpose.tracking.sharing import Explanation, Sharing
+from mixpose.tracking.track import Branch, Companion, Track
+from mixpose.tracking.tracker import Tracker, followed
 
+Box: TypeAlias = tuple[int, int, int, int]
+Tallies: TypeAlias = Mapping[str, tuple[int, int]]  # of features met, and in view
 # poses that a body may have instead of its own, with odds; its own, with those that it has none
 Rivals: TypeAlias = list[tuple[ScoredPose, float]]
-
-
-@dataclass(frozen=True)
-class Tracker:
-    """A body, and how its poses are estimated: what stays the same from frame to frame."""
-
-    body: Body
-    options: EstimatorOptions
-    samples: Floats  # (N, R, 3), of the body, for the objectives that integrate by sampling
-    start_uncertainty: Floats  # (6,)
-    T_start: Floats | None = None  # (4, 4)
-    rules: Rules = Rules()
-    proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
-    refinements: tuple[Refinement, ...] = REFINEMENTS
-    instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
-
-    @classmethod
-    def create(
-        cls,
-        body: Body,
-        options: EstimatorOptions,
-        T_start: Floats | None = None,
-        *,
-        rotation_deg: float | None = None,
-        distance: float | None = None,
-        rules: Rules = Rules(),
-        instance: int | None = None,
-    ) -> Self:
-        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
-        motion = rules.motion
-        start = per_kind(body, motion.start)
-        if distance is not None:
-            start[:3] = distance
-        if rotation_deg is not None:
-            start[3:] = np.radians(rotation_deg)
-        samples = body.sample(options.samples, seed=options.seed)
-        return cls(body, options, samples, start, T_start, rules, instance=instance)
-
-    @property
-    def free(self) -> Mask:
-        """Which of the six directions are estimated."""
-        return free_mask(self.options)
-
-    @property
-    def label(self) -> str:
-        """The body in one word."""
-        return label_of(self.body.name, self.instance)
-
-    def begin(self) -> Track:
-        """The track before the first frame."""
-        if self.T_start is None:
-            return Track()
-        return Track((Branch(self.T_start, 1.0, self.start_uncertainty),), known=True)
-
-    def advance(
-        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
-    ) -> tuple[Track, Estimate]:
-        """Estimate one frame, in a scene that has no other body; see `Scene.advance`."""
-        (after,), (estimate,) = self._alone.advance((track,), frame, time_s, views)
-        return after, estimate
-
-    @cached_property
-    def _alone(self) -> Scene:
-        return Scene((self,))
-
-    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
-        """Where the track expects the body in a frame."""
-        return predict(track, self.body, frame, time_s, self.rules.motion)
-
-    def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
-        """A frame, and what is known before it; sensors that saw nothing are left out."""
-        seen = [view for view in views if not view.observation.is_empty]
-        predictions = self.predictions(track, frame, time_s)
-        views = track.delays.applied(seen, time_s, track.seconds_until(time_s))
-        data = Frame(
-            views=views,
-            body=self.body,
-            options=self.options,
-            samples=self.samples,
-            track=track,
-            predictions=predictions,
-            T_reference=predictions[0].T_world_object if predictions else self.T_start,
-            start_uncertainty=self.start_uncertainty,
-            rules=self.rules,
-            frame=frame,
-            time_s=time_s,
-        )
-        if not predictions or not data.is_timed:
-            return data
-        T = predictions[0].T_world_object
-        return data.in_motion(data.expected(T).at(T))
 
 
 @dataclass(frozen=True)
@@ -151,70 +59,48 @@ class Scene:
         `views` are all sensors with a frame; those that saw nothing are reported and left out.
         """
         if len(self.bodies) == 1:
-            data = self.bodies[0].data(tracks[0], frame, time_s, views)
-            found = {0: explain(Explanation(self.bodies[0], data, len(views)))}
-        else:
-            seen = [view for view in views if not view.observation.is_empty]
-            sharing = Sharing(self.bodies, tracks, frame, time_s, seen, len(views), self.rules)
-            found = sharing.explained()
+            track, estimate = self.bodies[0].advance(tracks[0], frame, time_s, views)
+            return (track,), [estimate]
+        found = Sharing(self.bodies, tracks, frame, time_s, views, self.rules).explained()
         finders, rivals = {k: k for k in found}, dict[int, Rivals]()
-        for group in self._identical:
+        for name in {one.body.name for one in self.bodies if one.instance is not None}:
+            group = [k for k, one in enumerate(self.bodies) if one.body.name == name]
             given, exchanged = identify(group, found)
             finders, rivals = finders | given, rivals | exchanged
         verdicts = {k: found[finders[k]].verdict for k in found}
         told = {k: _in_doubt(verdicts[k], rivals.get(k, [])) for k in found}
-        for k, why in self._look_alikes(told, found).items():
+        sure = [k for k, verdict in told.items() if verdict.status == "ok"]
+        for k in sure:
+            # another body that is not surely elsewhere, or its own markers where they repeat
+            # themselves: then it may be turned another way
+            own, best = self.bodies[k].body, told[k].best
+            away = [j for j, one in enumerate(self.bodies) if j not in sure and one.body is not own]
+            others = [found[j].frame for j in (k, *away)]
+            why = look_alike_of(found[k].frame, best, others) if best else ""
             verdicts[k] = told[k] = verdicts[k].doubted(why)
         after, estimates = [], []
         for k, tracked in enumerate(self.bodies):
-            shown = told[k].best or next(iter(found[finders[k]].ranked), None)
-            after.append(followed(found[k].frame, verdicts[k]))
-            estimate = estimate_of(found[k].frame, views, told[k], shown)
-            delays = after[k].delays.seconds
-            estimates.append(replace(estimate, instance=tracked.instance, delays=delays))
+            data, ranked = found[k].frame, found[finders[k]].ranked
+            after.append(followed(data, verdicts[k]))
+            estimates.append(tracked.estimate(data, after[k], told[k], ranked))
         return self._acquainted(after, estimates), estimates
-
-    @cached_property
-    def _identical(self) -> list[list[int]]:
-        """Numbers of the bodies that are identical, group by group."""
-        groups: dict[int, list[int]] = {}
-        for k, tracked in enumerate(self.bodies):
-            groups.setdefault(id(tracked.body), []).append(k)
-        return [group for group in groups.values() if len(group) > 1]
-
-    def _look_alikes(
-        self, told: Mapping[int, Verdict], found: Mapping[int, Explanation]
-    ) -> dict[int, str]:
-        """Why sure poses might as well be another body's that is not surely elsewhere."""
-        doubts = {}
-        sure = {k: verdict.best for k, verdict in told.items() if verdict.status == "ok"}
-        for k, best in sure.items() if len(self.bodies) > 1 else ():
-            # a body's own markers may repeat themselves: then it may be turned another way
-            others = [
-                found[j].frame
-                for j, other in enumerate(self.bodies)
-                if j == k or not (j in sure or other.body is self.bodies[k].body)
-            ]
-            if best is not None and (why := look_alike_of(found[k].frame, best, others)):
-                doubts[k] = why
-        return doubts
 
     def _acquainted(
         self, tracks: Sequence[Track], estimates: Sequence[Estimate]
     ) -> tuple[Track, ...]:
-        """The tracks, and where bodies are beside each other; identical ones may be exchanged."""
+        """The tracks, and where sure bodies are beside each other, but for exchangeable ones."""
         sure = {
-            tracked.label: one.T_world_object
-            for tracked, one in zip(self.bodies, estimates, strict=True)
-            if tracked.instance is None and one.status == "ok"
+            k: one.T_world_object
+            for k, one in enumerate(estimates)
+            if one.instance is None and one.status == "ok" and one.T_world_object is not None
         }
         after = list(tracks)
-        for k, tracked in enumerate(self.bodies):
-            T, known = sure.get(tracked.label), dict(tracks[k].companions)
-            for label, T_other in sure.items():
-                if T is not None and T_other is not None and label != tracked.label:
-                    known[label] = Companion.joined(known.get(label), T, T_other, tracked.body)
-                    after[k] = replace(tracks[k], companions=known)
+        for k, T in sure.items():
+            body, known = self.bodies[k].body, dict(tracks[k].companions)
+            for j in sure.keys() - {k}:
+                label = self.bodies[j].label
+                known[label] = Companion.joined(known.get(label), T, sure[j], body)
+            after[k] = replace(tracks[k], companions=known)
         return tuple(after)
 
 
@@ -265,29 +151,124 @@ def identify(
     return assigned, rivals
 
 
-def estimate_pose(
-    views: Sequence[View],
-    model: Body,
-    start: Floats | None = None,
-    options: EstimatorOptions | None = None,
-) -> Estimate:
-    """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
+@dataclass(frozen=True)
+class Expectation:
+    """A body in front of cameras, and how far around a prediction its features are looked for."""
 
-    Raises
-    ------
-    ValueError
-        If the start is no rigid motion, or a view's features are not of its sensor's dimension.
+    body: Body
+    cameras: Mapping[str, Sensor]  # by name; with two coordinates, in px
+    free: Mask  # (6,), directions that are estimated
+    reach: float = constant(
+        4.0, "standard deviations of the prediction, and of features that have a spread"
+    )
+    min_margin_px: float = constant(40.0, "around the predicted features: a spot and its ground")
+
+    @cached_property
+    def _feature_reach(self) -> float:
+        """How far a feature's image reaches: less than half way to that of its neighbour."""
+        points = self.body.nodes.points
+        apart = KDTree(points).query(points, k=2)[0][:, 1].min() if len(points) > 1 else np.inf
+        return float(apart / 2 + self.reach * self.body.spread)
+
+    def windows(self, predictions: Sequence[Branch]) -> dict[str, Box]:
+        """Box of pixels (u0, v0, u1, v1) in which each camera will have the body, ends exclusive.
+
+        There is none where the body is not in view, or has one feature: nothing tells how large.
+        """
+        if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
+            return {}
+        projection = project_body(tuple(self.cameras.values()), self.body)
+        at = projection.project(np.array([one.T_world_object for one in predictions]))
+        uncertainty = np.array([one.uncertainty for one in predictions])
+        by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self.free) ** 2)
+        scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
+        rims = np.maximum(scales * self._feature_reach, self.min_margin_px)
+        margins = self.reach * np.sqrt(by_pose) + rims[..., None, None]
+        seen = at.seen[..., None]
+        lower = np.where(seen, at.y - margins, np.inf).min(axis=(1, 2)).tolist()
+        upper = np.where(seen, at.y + margins, -np.inf).max(axis=(1, 2)).tolist()
+        return {
+            name: (math.floor(u0), math.floor(v0), math.ceil(u1) + 1, math.ceil(v1) + 1)
+            for name, (u0, v0), (u1, v1) in zip(self.cameras, lower, upper, strict=True)
+            if u0 <= u1
+        }
+
+
+def is_convincing(tallies: Tallies, cameras: Iterable[str], rules: AcceptanceRules) -> bool:
+    """Whether cameras met so much of the body that the next frame need not be seen whole."""
+    some = [tallies[name] for name in cameras if name in tallies]
+    agreeing = [(met, in_view) for met, in_view in some if met >= rules.agreeing * in_view > 0]
+    met, in_view = np.sum(agreeing if len(agreeing) > 1 else [*some, (0, 0)], axis=0)
+    return bool(met > rules.convincing * in_view)
+
+
+def are_as_good(tallies: Tallies, before: Tallies) -> bool:
+    """Whether no sensor misses more of the body than in the frame before."""
+    return all(
+        in_view - met <= before[name][1] - before[name][0]
+        for name, (met, in_view) in tallies.items()
+        if name in before
+    )
+
+
+def have_fewer(views: Sequence[View], before: Tallies) -> bool:
+    """Whether a camera has fewer detections than it met features in the frame before."""
+    seen = [(view.name, view.observation.points) for view in views if view.name in before]
+    return any(points is not None and len(points) < before[name][0] for name, points in seen)
+
+
+@dataclass(frozen=True)
+class WindowedScene:
+    """A scene that looks where its bodies are expected, and at all there is if that is too little.
+
+    Its cameras are those whose features in a part of the image are those of the whole image.
     """
-    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
-        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
-    for view in views:
-        found, allowed = view.observation.dimension, view.sensor.dimension
-        if found != allowed:
-            raise ValueError(
-                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
-            )
-    tracker = Tracker.create(model, options or EstimatorOptions(), start)
-    began = time.perf_counter()
-    with one_blas_thread():
-        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
-    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+    scene: Scene
+    cameras: Mapping[str, Sensor]  # by name
+
+    def advance(
+        self,
+        tracks: Sequence[Track],
+        frame: int,
+        time_s: float | None,
+        observe: Callable[[Mapping[str, Box]], list[View]],
+        images: Collection[str],
+    ) -> tuple[tuple[Track, ...], list[Estimate], list[View]]:
+        """As `Scene.advance`: around the predictions if that convinces, else of all there is.
+
+        `observe` makes views of boxes by camera, of `images` only; without a box they are whole.
+        """
+        boxes = self._windows(tracks, frame, time_s) if images and self._are_met(tracks) else {}
+        if windows := {name: box for name, box in boxes.items() if name in images}:
+            views = observe(windows)
+            if not any(have_fewer(views, track.tallies) for track in tracks):
+                after, estimates = self.scene.advance(tracks, frame, time_s, views)
+                pairs = zip(after, tracks, strict=True)
+                as_good = all(are_as_good(now.tallies, then.tallies) for now, then in pairs)
+                if as_good and self._are_met(after):
+                    return after, estimates, views
+        views = observe({})
+        return *self.scene.advance(tracks, frame, time_s, views), views
+
+    def _are_met(self, tracks: Sequence[Track]) -> bool:
+        """Whether the last frame was sure of all bodies, and met most of each."""
+        return all(
+            not (track.misses or track.doubted)
+            and is_convincing(track.tallies, self.cameras, tracked.rules.acceptance)
+            for tracked, track in zip(self.scene.bodies, tracks, strict=True)
+        )
+
+    @cached_property
+    def _expectations(self) -> list[Expectation]:
+        return [Expectation(one.body, self.cameras, one.free) for one in self.scene.bodies]
+
+    def _windows(self, tracks: Sequence[Track], frame: int, time_s: float | None) -> dict[str, Box]:
+        """In which part of each image the bodies are expected, one window around all of them."""
+        windows: dict[str, Box] = {}
+        for k, tracked in enumerate(self.scene.bodies):
+            predictions = tracked.predictions(tracks[k], frame, time_s)
+            for name, box in self._expectations[k].windows(predictions).items():
+                a, b, c, d = windows.get(name, box)
+                windows[name] = min(a, box[0]), min(b, box[1]), max(c, box[2]), max(d, box[3])
+        return windows

@@ -11,23 +11,35 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from mixpose.fit import fit_together
-from mixpose.judgement import judge_together, nearest_alike
+from mixpose.judgement import ScoredPose, Verdict, is_possible, judge_together, nearest_alike
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Mask
 from mixpose.tracking.claims import Claims, Met
-from mixpose.tracking.explain import Explanation, explain, judged_by
+from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Likelihood, MatchedLikelihood, Start, likelihood_of
+from mixpose.tracking.likelihood import MatchedLikelihood, Start
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
+from mixpose.tracking.tracker import Tracker, are_convincing, judged_again
 
-if TYPE_CHECKING:
-    from mixpose.tracking.scene import Tracker
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What one body makes of what is left of a frame for it."""
+
+    frame: Frame
+    left: Mask  # (D,), see `Claims.left`
+    ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """The decision about the frame, and why it is in doubt."""
+        return decided(self.frame, self.ranked)
 
 
 @dataclass
@@ -38,8 +50,7 @@ class Sharing:
     tracks: Sequence[Track]
     frame: int
     time_s: float | None
-    views: Sequence[View]  # that saw anything
-    sensors: int  # that had a frame
+    views: Sequence[View]  # of all sensors that had a frame
     rules: SceneRules
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
@@ -52,7 +63,7 @@ class Sharing:
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._leave_merged()
-        self._judge_again(self.found)
+        self._judge_again()
         self._beside_others(away)
         return self.found
 
@@ -66,7 +77,8 @@ class Sharing:
         some, claims = list(places), self._nobody.expected(places, self.rules.gate)
         for _ in range(3):  # neighbours' neighbours are settled by then
             self.found |= self._at_once(some, claims, places)
-            self.claimed = [k for k, one in self.found.items() if one.convinces]
+            found = self.found.items()
+            self.claimed = [k for k, one in found if are_convincing(one.frame, one.ranked)]
             claims = self._claims(self.claimed)
             changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
             some = [k for k in changed if self._are_near(k, changed[k], self._features(k))]
@@ -80,24 +92,20 @@ class Sharing:
 
         Those that nothing of the others' is near to see all that is there, and climb together.
         """
-        begun = {k: self._begun(k, claims.left(k)) for k in some}
-        alike = [
-            k
-            for k, one in begun.items()
-            if len(some) > 1
-            and len(one.frame.views) == len(self.views)
-            and not self._are_near(k, ~one.left, places[k])
-        ]
-        if alike and self._shared is not None:
-            climbed = climbed_together([begun[k].frame for k in alike], self._shared)
-            for k, one in zip(alike, climbed, strict=True):
-                begun[k] = replace(begun[k], frame=one.frame, likelihood=one)
-        return {k: explain(one, quickly=True) for k, one in begun.items()}
+        left = {k: claims.left(k) for k in some}
+        frames = {k: self._frame(k, left[k]) for k in some}
+        if len(some) > 1 and self._shared:
+            whole = len(self._shared.totals)
+            alike = {k: one for k, one in frames.items() if len(one.views) == whole}
+            alike = {k: alike[k] for k in alike if not self._are_near(k, ~left[k], places[k])}
+            frames |= climbed_together(alike, self._shared)
+        ranked = {k: self.bodies[k].explain(one, quickly=True) for k, one in frames.items()}
+        return {k: Explanation(frames[k], left[k], ranked[k]) for k in some}
 
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
         self._look(waiting)
-        while possible := [k for k in waiting if self.found[k].is_possible]:
+        while possible := [k for k in waiting if self._is_possible(k)]:
             winner = self._most_evident(possible)
             self.claimed.append(winner)
             waiting = [k for k in waiting if k != winner]
@@ -109,30 +117,24 @@ class Sharing:
         """By all proposers, on what is left; identical bodies that are forgotten look as one."""
         claims, twins = self._claims(self.claimed), dict[int, Explanation]()
         for k in some:
-            body = self.bodies[k].body
-            is_twin = self._is_forgotten(k) and sum(one.body is body for one in self.bodies) > 1
-            if not is_twin:
-                self.found[k] = self._everywhere(k, claims.left(k), self.tracks[k])
+            body, track, left = self.bodies[k].body, self.tracks[k], claims.left(k)
+            if self.bodies[k].instance is None or not self._is_forgotten(k):
+                self.found[k] = self._everywhere(k, left, track)
                 continue
             if id(body) not in twins:
-                anywhere = replace(self.tracks[k], branches=())
-                twins[id(body)] = self._everywhere(k, claims.left(k), anywhere)
+                twins[id(body)] = self._everywhere(k, left, replace(track, branches=()))
             one = twins[id(body)]
-            own = self._begun(k, one.left, beside=one.frame.beside, searches=one.frame.searches)
-            self.found[k] = replace(one, tracked=self.bodies[k], frame=own.frame)
+            own = self._frame(k, left, beside=one.frame.beside, searches=one.frame.searches)
+            self.found[k] = replace(one, frame=own)
 
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
-        """A body by all proposers, after those that were asked already where the same is left."""
-        before, beside = self.found.get(k), self._companion(k)
-        if before and beside is before.frame.beside and np.array_equal(before.left, left):
-            return explain(before)
-        begun = self._begun(k, left, track, beside=beside)
+        """A body by all proposers; one that is away is not searched for thoroughly each time."""
+        data = self._frame(k, left, track, beside=self._companion(k))
         # bodies that are there are not held up
         is_away = track.misses > self.bodies[k].rules.motion.coasting and self.claimed
         if is_away and track.misses % self.rules.thorough:
-            options = replace(begun.frame.options, search="live")
-            begun = replace(begun, frame=replace(begun.frame, options=options))
-        return explain(begun)
+            data = replace(data, options=replace(data.options, search="live"))
+        return Explanation(data, left, self.bodies[k].explain(data))
 
     def _most_evident(self, possible: Sequence[int]) -> int:
         """The body that is believed next: with it, all that compete explain most."""
@@ -158,7 +160,7 @@ class Sharing:
         return kept + max([0.0, *(one.log_evidence for one in rest)])
 
     def _leave_merged(self) -> None:
-        """Take from bodies what they meet loosely beside another's feature, and fit them again."""
+        """Take from bodies what they meet loosely beside another's feature: it is both's."""
         claims = self._claims(self.claimed)
         places = {k: self._features(k) for k in self.claimed}
         for k in self.claimed:
@@ -167,17 +169,13 @@ class Sharing:
             others = np.concatenate([places[k][:0], *(places[j] for j in places if j != k)])
             near = claims.near(loose & (claims.owners == k), others, self.rules.touching)
             self.merged += near.tolist()
-        if self.merged:
-            self._judge_again(self.claimed, fitted=True)
 
-    def _judge_again(self, some: Iterable[int], *, fitted: bool = False) -> None:
-        """Judge poses for which other detections are left by now, and fit them to these."""
+    def _judge_again(self) -> None:
+        """Judge poses for which other detections are left by now; without merged ones, fit them."""
         claims = self._claims(self.claimed)
-        for k in some:
-            left = claims.left(k)
-            if not np.array_equal(left, self.found[k].left):
-                again = self._again(k, left, fitted=fitted)
-                self.found[k] = again if again.ranked or not fitted else self.found[k]
+        for k, one in self.found.items():
+            if not np.array_equal(left := claims.left(k), one.left):
+                self.found[k] = self._again(k, left, fitted=bool(self.merged))
 
     def _beside_others(self, some: Iterable[int]) -> None:
         """Bodies that are not sure, by what was found beside them since they looked."""
@@ -202,15 +200,15 @@ class Sharing:
         self, k: int, left: Mask, beside: Branch | None = None, *, fitted: bool = False
     ) -> Explanation:
         """The poses of a body by what is left for it by now, and fitted to that."""
-        before = self.found[k].frame
-        begun = self._begun(k, left, beside=beside or before.beside, searches=before.searches)
-        return judged_by(begun, self.found[k].ranked, fitted=fitted)
+        ranked, before = self.found[k].ranked, self.found[k].frame
+        beside = beside or before.beside
+        data = self._frame(k, left, beside=beside, searches=before.searches)
+        return Explanation(data, left, judged_again(data, ranked, fitted=fitted))
 
-    def _begun(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Explanation:
+    def _frame(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Frame:
         """What is left of the frame for a body, and what is known before it."""
         track, views = track or self.tracks[k], self._nobody.part(left)
-        data = self.bodies[k].data(track, self.frame, self.time_s, views)
-        return Explanation(self.bodies[k], replace(data, **known), self.sensors, left)
+        return replace(self.bodies[k].data(track, self.frame, self.time_s, views), **known)
 
     @cached_property
     def _nobody(self) -> Claims:
@@ -232,9 +230,15 @@ class Sharing:
 
     @cached_property
     def _shared(self) -> SharedDensities | None:
-        """The densities of all that is seen; None where a sensor has no single detections."""
-        are_single = all(view.observation.points is not None for view in self.views)
-        return SharedDensities.drawn(self.views) if are_single else None
+        """The densities of all that is seen; None of nothing, or without single detections."""
+        seen = [view for view in self.views if not view.observation.is_empty]
+        are_single = all(view.observation.points is not None for view in seen)
+        return SharedDensities.drawn(seen) if seen and are_single else None
+
+    def _is_possible(self, k: int) -> bool:
+        """Whether the best pose of a body is worth telling."""
+        data, best = self.found[k].frame, self.found[k].ranked[:1]
+        return any(is_possible(one, data.free, data.rules.acceptance) for one in best)
 
     def _is_forgotten(self, k: int) -> bool:
         """Whether where the body was says nothing any more: no velocity is believed then."""
@@ -255,43 +259,34 @@ def _width(expected: Branch) -> float:
     return float(np.log(expected.uncertainty).sum())
 
 
-def climbed_together(frames: Sequence[Frame], shared: SharedDensities) -> list[Likelihood]:
-    """Likelihoods of several bodies, with what is climbed from their first predictions, and judged.
+def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
+    """The frames of several bodies with what is climbed from their first predictions, and judged.
 
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
-    likelihoods, some = list[Likelihood](), list[MatchedLikelihood]()
-    for one in frames:
-        data = one
+    begun, some = dict(frames), []
+    for k, one in frames.items():
         if not one.is_timed:
             drawn = matched_objective(one.views, one.body, one.sigmas, shared=shared)
-            data = replace(one, drawn=drawn)
-        likelihood = likelihood_of(data)
-        likelihoods.append(likelihood)
-        if (
-            isinstance(likelihood, MatchedLikelihood)
-            and likelihood.knows_detections
-            and can_be_together(one.body)
-            and not one.is_timed
-        ):
-            some.append(likelihood)
+            begun[k] = replace(one, drawn=drawn)
+            if one.options.objective == "matched" and can_be_together(one.body):
+                some.append(k)
     if len(some) < 2:
-        return likelihoods
-    objectives = [one.frame.finest for one in some]
-    starts = [one.frame.predictions[0].T_world_object for one in some]
-    free, rules = some[0].frame.free, some[0].frame.rules
-    fits, cases = [], []
-    for it, end in zip(some, fit_together(objectives, starts, free, rules.fit), strict=True):
-        if end is None:
-            continue
-        it.frame = data = replace(it.frame, drawn=end[0])
-        first = data.predictions[0]
-        fit = it.fit(Start(first.T_world_object, first.uncertainty, first), end[1])
-        fits.append((it, fit))
-        T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
-        seen = (fit.matches, fit.noise) if T is fit.T_world_object else (None, None)
-        cases.append((data.finest, T, data.track.residuals, data.prior(T), *seen))
+        return begun
+    objectives = [begun[k].finest for k in some]
+    starts = [begun[k].predictions[0].T_world_object for k in some]
+    free, rules = begun[some[0]].free, begun[some[0]].rules
+    fits, cases = {}, []
+    for k, end in zip(some, fit_together(objectives, starts, free, rules.fit), strict=True):
+        if end is not None:
+            data = begun[k] = replace(begun[k], drawn=end[0])
+            first = data.predictions[0]
+            start = Start(first.T_world_object, first.uncertainty)
+            fit = fits[k] = MatchedLikelihood(data).fit(start, end[1])
+            T = nearest_alike(fit.T_world_object, data.body, data.T_reference)
+            seen = (fit.matches, fit.noise) if T is fit.T_world_object else (None, None)
+            cases.append((data.finest, T, data.track.residuals, data.prior(T), *seen))
     judged = judge_together(cases, free, rules.judgement) if cases else []
-    for (it, fit), pose in zip(fits, judged, strict=True):
-        it.together = fit, pose
-    return likelihoods
+    for (k, fit), pose in zip(fits.items(), judged, strict=True):
+        begun[k] = replace(begun[k], together=(fit, pose))
+    return begun

@@ -11,19 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.constants import constant
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import Floats, Indices
-
-
-@dataclass(frozen=True)
-class StaticRules:
-    """When a detection counts as static."""
-
-    frames: int = constant(
-        10, "without the body in which a detection must be there: a moving one is for one or two"
-    )
 
 
 @dataclass(frozen=True)
@@ -32,7 +22,7 @@ class StaticClutter:
 
     places: Mapping[str, tuple[Floats, Indices]] = field(default_factory=dict)
 
-    def learnt(self, views: Sequence[View], rules: StaticRules) -> StaticClutter:
+    def learnt(self, views: Sequence[View], frames: int) -> StaticClutter:
         """After one more frame without the body; what was seen as often as not is forgotten."""
         places = dict(self.places)
         for view in views:
@@ -42,20 +32,20 @@ class StaticClutter:
             old, count = places.get(view.name, (points[:0], np.zeros(0, dtype=np.intp)))
             nearest = _nearest(old, view.observation)
             is_met = np.isin(np.arange(len(old)), nearest)
-            count = np.minimum(count + np.where(is_met, 1, -1), 2 * rules.frames)
+            count = np.minimum(count + np.where(is_met, 1, -1), 2 * frames)
             new = points[nearest == len(old)]
             joined = np.concatenate([old[count > 0], new])
             places[view.name] = joined, np.append(count[count > 0], np.ones(len(new), np.intp))
         return StaticClutter(places)
 
-    def without(self, views: Sequence[View], rules: StaticRules) -> list[View]:
-        """The views without static detections."""
+    def without(self, views: Sequence[View], frames: int) -> list[View]:
+        """The views without detections that were there in so many frames more than not."""
         moving = list(views)
         for k, view in enumerate(views):
             if view.name not in self.places:
                 continue
             places, counts = self.places[view.name]
-            static = places[counts >= rules.frames]
+            static = places[counts >= frames]
             moves = _nearest(static, view.observation) == len(static)
             if not moves.all():
                 moving[k] = replace(view, observation=view.observation.only(moves))

@@ -1,0 +1,271 @@
+"""A tracked body: poses are proposed, fitted, judged, decided about and followed, by frame."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Self
+
+import numpy as np
+from scipy.special import expit
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions, Fit, free_mask
+from mixpose.judgement import APART, ScoredPose, Verdict, convinces, insert
+from mixpose.matching import Matches
+from mixpose.objective import View
+from mixpose.records import Estimate, Floats, Hypothesis, Mask, Offsets, SensorReport, label_of
+from mixpose.rigid import is_rigid
+from mixpose.threads import one_blas_thread
+from mixpose.tracking.doubt import decided, is_known
+from mixpose.tracking.frame import Frame, follow
+from mixpose.tracking.in_motion import delays_after
+from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.motion import per_kind
+from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
+from mixpose.tracking.rules import Rules
+from mixpose.tracking.track import Branch, Track, predict
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """A body, and how its poses are estimated: what stays the same from frame to frame."""
+
+    body: Body
+    options: EstimatorOptions
+    samples: Floats  # (N, R, 3), of the body, for the objectives that integrate by sampling
+    start_uncertainty: Floats  # (6,)
+    T_start: Floats | None = None  # (4, 4)
+    rules: Rules = Rules()
+    proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
+    refinements: tuple[Refinement, ...] = REFINEMENTS
+    instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
+
+    @classmethod
+    def create(
+        cls,
+        body: Body,
+        options: EstimatorOptions,
+        T_start: Floats | None = None,
+        *,
+        rotation_deg: float | None = None,
+        distance: float | None = None,
+        rules: Rules = Rules(),
+        instance: int | None = None,
+    ) -> Self:
+        """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
+        start = per_kind(body, rules.motion.start)
+        if distance is not None:
+            start[:3] = distance
+        if rotation_deg is not None:
+            start[3:] = np.radians(rotation_deg)
+        samples = body.sample(options.samples, seed=options.seed)
+        return cls(body, options, samples, start, T_start, rules, instance=instance)
+
+    @property
+    def free(self) -> Mask:
+        """Which of the six directions are estimated."""
+        return free_mask(self.options)
+
+    @property
+    def label(self) -> str:
+        """The body in one word."""
+        return label_of(self.body.name, self.instance)
+
+    def begin(self) -> Track:
+        """The track before the first frame."""
+        if self.T_start is None:
+            return Track()
+        return Track((Branch(self.T_start, 1.0, self.start_uncertainty),), known=True)
+
+    def advance(
+        self, track: Track, frame: int, time_s: float | None, views: Sequence[View]
+    ) -> tuple[Track, Estimate]:
+        """Estimate one frame: the track for the next, and the estimate without its latency.
+
+        `views` are all sensors with a frame; those that saw nothing are reported and left out.
+        """
+        data = self.data(track, frame, time_s, views)
+        ranked = self.explain(data)
+        verdict = decided(data, ranked)
+        after = followed(data, verdict)
+        return after, self.estimate(data, after, verdict, ranked)
+
+    def predictions(self, track: Track, frame: int, time_s: float | None) -> list[Branch]:
+        """Where the track expects the body in a frame."""
+        return predict(track, self.body, frame, time_s, self.rules.motion)
+
+    def data(self, track: Track, frame: int, time_s: float | None, views: Sequence[View]) -> Frame:
+        """A frame, and what is known before it; sensors that saw nothing are left out."""
+        seen = [view for view in views if not view.observation.is_empty]
+        predictions = self.predictions(track, frame, time_s)
+        data = Frame(
+            views=track.delays.applied(seen, time_s, track.seconds_until(time_s)),
+            body=self.body,
+            options=self.options,
+            samples=self.samples,
+            track=track,
+            predictions=predictions,
+            T_reference=predictions[0].T_world_object if predictions else self.T_start,
+            start_uncertainty=self.start_uncertainty,
+            rules=self.rules,
+            frame=frame,
+            time_s=time_s,
+            sensors=[view.name for view in views],
+        )
+        if not predictions or not data.is_timed:
+            return data
+        T = predictions[0].T_world_object
+        return data.in_motion(data.expected(T).at(T))
+
+    def explain(self, data: Frame, *, quickly: bool = False) -> list[ScoredPose]:
+        """Propose, fit and judge poses: distinct ones, the most evident first.
+
+        `quickly` stops where the body is not convincing where it is expected.
+        """
+        likelihood, ranked, fits = likelihood_of(data), list[ScoredPose](), list[Fit]()
+
+        def consider(start: Start, proposer: str) -> ScoredPose | None:
+            fit = likelihood.fit(start)
+            if start.T_moved is None and any(fit is one for one in fits):
+                return None  # judged before, and by the same prior
+            fits.append(fit)
+            judged = replace(likelihood.judge(fit, start), proposer=proposer, blurs=fit.blurs)
+            insert(ranked, judged, data.body, data.free, data.rules.acceptance)
+            return judged
+
+        for propose in self.proposers if data.views else ():
+            for start in propose(data, ranked):
+                judged = consider(start, propose.__name__)
+                if judged is None:
+                    continue
+                for refine in self.refinements:
+                    for better in refine(data, likelihood, judged):
+                        consider(better, refine.__name__)
+            if quickly and not are_convincing(data, ranked):
+                break
+            quickly = False
+        return ranked
+
+    def estimate(
+        self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
+    ) -> Estimate:
+        """The estimate of a frame, with reports of the first pose, believed or not."""
+        body, best = self.body, verdict.best
+        shown = best or next(iter(ranked), None)
+        reports = dict.fromkeys(data.sensors, SensorReport(False))
+        reports |= shown.sensors if shown else {}
+        used = shown.used if shown and len(body.nodes.points) == len(body) else None
+        if used:
+            off = (used.sigmas[:, None] * np.sqrt(used.squared)).tolist()
+            for name, row, k, in_view in zip(used.names, off, used.shares > 0, used.weights > 0):
+                residuals = {body.labels[i]: row[i] if k[i] else None for i in in_view.nonzero()[0]}
+                reports[name] = replace(reports[name], residuals=residuals)
+        rivals = verdict.kept if verdict.status == "ambiguous" else ()
+        return Estimate(
+            frame=data.frame,
+            time_s=data.time_s,
+            object=body.name,
+            status=verdict.status,
+            T_world_object=best.T_world_object if best else None,
+            covariance=best.covariance if best else None,
+            score=shown.score if shown else 0.0,
+            sensors=reports,
+            hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
+            instance=self.instance,
+            proposer=best.proposer if best else "",
+            blurs=best.blurs if best else (),
+            guesses=data.searches[-1][0] if data.searches else None,
+            delays=after.delays.seconds,
+            doubt=verdict.doubt,
+            measured=partial(_offsets, used) if used else dict,
+        )
+
+
+def estimate_pose(
+    views: Sequence[View],
+    model: Body,
+    start: Floats | None = None,
+    options: EstimatorOptions | None = None,
+) -> Estimate:
+    """Estimate one pose, as of frame 0, near a start (4, 4) or anywhere.
+
+    Raises ValueError for a start that is no rigid motion, and for features of a view that have not
+    the dimension of its sensor.
+    """
+    if start is not None and not (np.shape(start) == (4, 4) and is_rigid(np.asarray(start))):
+        raise ValueError("start: not a rotation and a translation as one 4x4 matrix")
+    for view in views:
+        found, allowed = view.observation.dimension, view.sensor.dimension
+        if found != allowed:
+            raise ValueError(
+                f"view {view.name!r}: features of {found} coordinates; its sensor has {allowed}"
+            )
+    tracker = Tracker.create(model, options or EstimatorOptions(), start)
+    began = time.perf_counter()
+    with one_blas_thread():
+        _, estimate = tracker.advance(tracker.begin(), 0, None, views)
+    return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
+
+
+def are_convincing(data: Frame, ranked: Sequence[ScoredPose]) -> bool:
+    """Whether the best pose, near its prediction, needs no other to compare with."""
+    return any(convinces(best, data.free, data.rules.acceptance) for best in ranked[:1])
+
+
+def judged_again(
+    data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
+) -> list[ScoredPose]:
+    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first."""
+    likelihood, ranked = likelihood_of(data), list[ScoredPose]()
+    for one in poses if data.views else ():
+        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
+        fit = likelihood.fit(start)
+        judged, blurs = likelihood.judge(fit, start), fit.blurs or one.blurs
+        judged = replace(judged, proposer=one.proposer, blurs=blurs)
+        insert(ranked, judged, data.body, data.free, data.rules.acceptance)
+    return ranked
+
+
+def followed(data: Frame, verdict: Verdict) -> Track:
+    """The track after a frame."""
+    track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
+    if best is None:
+        clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
+        state = data.searches[-1][1] if data.searches else Track.search
+        return replace(track.missed(state, clutter), doubted=True)
+    found = []
+    for one, weight in verdict.kept:
+        # what may be mere clutter counts as little in the next frame
+        belief = weight * float(expit(one.log_evidence))
+        momentary = np.diagonal(one.covariance - one.persistent)
+        deviation = np.sqrt(momentary) if data.is_timed else None
+        spread = one.spread if data.options.fuse else None
+        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
+    used = best.used
+    met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
+    agreeing = (met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)).sum() > 1
+    # sensors whose delays are not known contradict each other until they are
+    late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
+    return replace(
+        follow(data, found),
+        residuals=best.noise if is_ok else track.residuals,
+        tallies=dict(zip(used.names, zip(met.tolist(), in_view.tolist()))),
+        delays=delays_after(data, best) if is_ok or late else track.delays,
+        agreed=track.agreed or bool(agreeing),
+        known=is_known(data, best),
+        believed=track.believed + is_ok,
+        doubted=not is_ok,
+    )
+
+
+def _offsets(used: Matches) -> dict[str, Offsets]:
+    """By how much each sensor met the features of a body whose features are points."""
+    offsets = {}
+    for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
+        i = np.flatnonzero(used.weights[k])
+        y, by_shift = used.offsets[k, i, :m], used.J[k, i, :m, :3]
+        offsets[name] = Offsets(i, used.shares[k, i] > 0, sigma * y, sigma * by_shift)
+    return offsets
