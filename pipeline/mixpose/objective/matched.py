@@ -53,7 +53,8 @@ def overlaps(
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
-    pairs = all_pairs(n) if n * n <= DRAWING.few_pairs else _close_pairs(y, variances)
+    is_few = n * n <= DRAWING.few_pairs
+    pairs = all_pairs(n) if is_few else close_pairs(y.reshape(-1, n, 2), variances.repeat(len(y[0])))
     i, j = pairs.T
     away = y[:, :, i] - y[:, :, j]
     squared = away * away
@@ -66,13 +67,6 @@ def overlaps(
     bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
     norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
     return norm, pairs[near], bells, away[:, :, near]
-
-
-def _close_pairs(y: Floats, variances: Floats) -> Indices:
-    """Pairs of features that may overlap at any of the poses."""
-    L, H = y.shape[:2]
-    each = [close_pairs(y[k, h], float(variances[k, 0])) for k in range(L) for h in range(H)]
-    return np.unique(np.concatenate(each), axis=0)
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
