@@ -14,7 +14,7 @@ from mixpose.density import Density, Observation, Window, render
 from mixpose.objective import (
     OBJECTIVES,
     IndependentObjective,
-    Objective,
+    MatchedObjective,
     ObjectiveName,
     PaperObjective,
     View,
@@ -65,7 +65,9 @@ def test_pose_jacobian_agrees_with_central_differences(
         np.testing.assert_allclose(J[..., k], (forward - backward) / (2 * step), atol=1e-4)
 
 
-def on_fine_grids(name: ObjectiveName, views: list[View], body: Body, sigma: float) -> Objective:
+def on_fine_grids(
+    name: ObjectiveName, views: list[View], body: Body, sigma: float
+) -> MatchedObjective | PaperObjective:
     """An objective whose densities are so fine that interpolation errs by less than 0.1 %."""
     if name == "matched":
         sigmas = [sigma] * len(views)

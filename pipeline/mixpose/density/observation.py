@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -202,9 +203,9 @@ def matched_atlas(
     return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)
 
 
-def peak(variance: float, dimension: int) -> float:
-    """Value of an isotropic Gaussian density at its centre."""
-    return float((2 * np.pi * variance) ** (-dimension / 2))
+def peak(variance: Any, dimension: Any) -> Any:
+    """Value of an isotropic Gaussian density at its centre; of arrays, values of all."""
+    return (2 * np.pi * variance) ** (-dimension / 2)
 
 
 def close_pairs(places: Floats, variances: Floats) -> Indices:

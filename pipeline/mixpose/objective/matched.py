@@ -1,12 +1,10 @@
 """The matched objective: from predicted features and drawn densities to one number.
 
-For sensor l let g be the observed density and h_β the predicted one, a mixture of the projected
-features with the observation's own blur σ.  The share of g that h_β explains once its amplitude
-is solved for (variable projection) is S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩), and the objective
-is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred once more by σ: an
-image, drawn once and looked up with `cv2.remap`.
-
-With c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
+For sensor l let g be the observed density and h the predicted one, a mixture of the projected
+features p_i(β) with the observation's own blur σ.  The share of g that h explains once its
+amplitude is solved for (variable projection) is S_l = ⟨g, h⟩² / (⟨g, g⟩ ⟨h, h⟩), and the objective
+is Σ_l ω_l S_l.  Let C be g blurred once more by σ, an image that `cv2.remap` looks up.  With
+c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
 amplitude a = c / n that fits h to g best,
 
     S = c a,     ∇S = 2 a (∇c − a ∇n / 2).
@@ -28,8 +26,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.density import DRAWING, Atlas, all_pairs, close_pairs, matched_atlas, peak
-from mixpose.objective.base import View
-from mixpose.objective.projection import BodyProjection, Match, project_body
+from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Indices
 
@@ -38,10 +35,7 @@ STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
 def value_error(steps_per_sigma: float) -> float:
-    """Relative error of values, squares of what is looked up.
-
-    Of a height, looking it up errs by √3/216 n⁻³ of the third derivative along each of two axes.
-    """
+    """Relative error of values, squares of heights: √3/216 n⁻³ of two third derivatives each."""
     return 4 * 0.011 / steps_per_sigma**3
 
 
@@ -53,8 +47,10 @@ def overlaps(
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
-    is_few = n * n <= DRAWING.few_pairs
-    pairs = all_pairs(n) if is_few else close_pairs(y.reshape(-1, n, 2), variances.repeat(len(y[0])))
+    if n * n <= DRAWING.few_pairs:
+        pairs = all_pairs(n)
+    else:
+        pairs = close_pairs(y.reshape(-1, n, 2), variances.repeat(y.shape[1]))
     i, j = pairs.T
     away = y[:, :, i] - y[:, :, j]
     squared = away * away
@@ -185,19 +181,13 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
-@dataclass(frozen=True, eq=False)
 class SharedDensities:
-    """C of all sensors at σ_ε, drawn once for several bodies."""
+    """C of all sensors at σ_ε, drawn once for several bodies, of views of detections, none empty."""
 
-    atlas: Atlas
-    totals: tuple[float, ...]  # weight of all that was drawn, per sensor
-
-    @classmethod
-    def drawn(cls, views: Sequence[View]) -> SharedDensities:
-        """Draw views of detections, none of which is empty."""
+    def __init__(self, views: Sequence[View]) -> None:
         seen = [view.observation for view in views]
-        atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
-        return cls(atlas, tuple(one.weight for one in seen))
+        self.atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
+        self.totals = [one.weight for one in seen]  # of all that was drawn, per sensor
 
 
 def matched_objective(
@@ -220,9 +210,9 @@ def matched_objective(
         at_last = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
         steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
     projection = project_body(tuple([view.sensor for view in views]), body)
-    energies = np.array([o.energy(sigma) for o, sigma in pairs])
-    variances = np.array([2 * sigma * sigma for sigma in sigmas])
-    tops = np.array([peak(*one) for one in zip(variances.tolist(), projection.dimensions.tolist())])
+    energies = np.array([[o.energy(sigma)] for o, sigma in pairs])
+    variances = np.array([[2 * sigma * sigma] for sigma in sigmas])
+    tops = peak(variances, projection.dimensions[:, None])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
@@ -230,11 +220,9 @@ def matched_objective(
         atlas = matched_atlas(observations, sigmas, steps_per_sigma)
     else:
         atlas = shared.atlas
-        parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
+        parts = [[o.weight / total] for o, total in zip(observations, shared.totals, strict=True)]
         energies = energies * np.square(parts)
-    energies, weights = energies[:, None], weights[:, None]
-    rest = variances[:, None], tops[:, None], energies, weights
-    return MatchedObjective(tuple(views), projection, atlas, *rest)
+    return MatchedObjective(tuple(views), projection, atlas, variances, tops, energies, weights)
 
 
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:

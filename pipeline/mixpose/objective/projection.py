@@ -13,16 +13,33 @@ distance.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.density import Observation
 from mixpose.records import Floats, Indices, Mask
 from mixpose.sensors import OUTSIDE, Sensor, facing, side_by_side
 
 _NOTHING = np.array([])
+
+
+@dataclass(frozen=True)
+class View:
+    """One sensor with what it observed; times in seconds."""
+
+    name: str
+    sensor: Sensor
+    observation: Observation
+    delay: float = 0.0  # by which the sensor's frame was taken later than the common time
+    readout: float = 0.0  # from the first row to the last; the time is that of the middle row
+    unsure: float | None = None  # deviation of a delay that is estimated; None where it is told
+    estimated: float = 0.0  # of the delay, what was estimated
+    # where its calibration is not exact: the sensor as it stands still, and as it might be
+    doubts: tuple[Sensor, ...] = ()
 
 
 class Match(NamedTuple):

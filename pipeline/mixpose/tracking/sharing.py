@@ -234,7 +234,7 @@ class Sharing:
     def _shared(self) -> SharedDensities | None:
         """The densities of all that is seen; None where a sensor has no single detections."""
         are_single = all(view.observation.points is not None for view in self.views)
-        return SharedDensities.drawn(self.views) if are_single else None
+        return SharedDensities(self.views) if are_single else None
 
     def _is_forgotten(self, k: int) -> bool:
         """Whether where the body was says nothing any more: no velocity is believed then."""
