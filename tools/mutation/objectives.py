@@ -46,8 +46,8 @@ _KERNEL = (
     Mutant(
         "objective-curvature-of-half-the-pairs",
         "objective/matched.py",
-        "return half, gram + cross + cross.swapaxes(2, 3)",
-        "return half, gram + cross",
+        "gram += cross + cross.swapaxes(2, 3)",
+        "gram += cross",
         "steps are too long or too short where features overlap",
     ),
     Mutant(

@@ -1,9 +1,9 @@
 """Densities of all sensors as images, drawn where they are looked up.
 
-A density is nearly empty, so small tiles of it are drawn.  All tiles of all sensors lie in one
-array (an atlas), which `cv2.remap` looks up at once, values and gradients together.  Few places, as
-those of a pose that a fit begins from, have tiles of their own, in which they stay while it moves a
-little.  For many the plane of every sensor is divided into pages, tiles that are found by a table.
+A density is nearly empty, so small tiles of it are drawn, of all sensors into one array (an atlas)
+that `cv2.remap` looks up at once, values and gradients together.  Few places, as those of a pose
+that a fit begins from, have tiles of their own, in which they stay while it moves a little.  For
+many the plane of every sensor is divided into pages, tiles that are found by a table.
 
 Cells hold coefficients of quadratic B-splines, so that what is looked up bends smoothly from cell
 to cell.  At a place d cells beside the nearest one, such a spline is the mean of four bilinear
@@ -152,28 +152,21 @@ class Atlas:
     ) -> tuple[Singles, Indices]:
         """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
 
-        And their numbers (P,), row by row.  Those of a column are drawn at once, for tiles that
-        about as many detections reach.  Columns are short, so that places are rounded to 6e-5 cells.
+        And their numbers (P,), row by row.  Those of a column are drawn at once.  Columns are
+        short, so that places are rounded to 6e-5 cells.
         """
-        count, side = len(middles), self._side
-        rank = np.arange(count)
-        if count > _TOGETHER:
-            order = np.argsort(np.bincount(of, minlength=count), kind="stable")
-            rank[order] = np.arange(count)
-            by_rank = np.argsort(rank[of], kind="stable")
-            of, which = rank[of][by_rank], which[by_rank]
-            sensors, middles = sensors[order], middles[order]
-        columns = max(-(-count // _TOGETHER), 1)
-        room = np.empty((min(count, _TOGETHER), side, columns, 3 * side), dtype=np.float32)
-        ends = of.searchsorted(_TOGETHER * np.arange(columns + 1)).tolist()
-        for k, (a, b) in enumerate(zip(ends, ends[1:])):
-            some = slice(k * _TOGETHER, (k + 1) * _TOGETHER)
-            tiles = room[: len(middles[some]), :, k]
+        count, side, most = len(middles), self._side, _TOGETHER
+        numbers, columns = np.arange(count), max(-(-count // most), 1)
+        room = np.empty((min(count, most), side, columns, 3 * side), dtype=np.float32)
+        for k in range(columns):
+            some = slice(k * most, min((k + 1) * most, count))
+            a, b = of.searchsorted([some.start, some.stop]).tolist()
+            tiles = room[: some.stop - some.start, :, k]
             self._draw(tiles, sensors[some], middles[some], of[a:b] - some.start, which[a:b])
-            for i, sensor in enumerate(sensors[some].tolist()):
-                if sensor in self._grids:
-                    tiles[i] = self._of_grid(sensor, middles[some][i])
-        return room, rank % _TOGETHER * columns + rank // _TOGETHER
+            for i in numbers[some].tolist():
+                if sensors[i] in self._grids:
+                    tiles[i - some.start] = self._of_grid(int(sensors[i]), middles[i])
+        return room, numbers % most * columns + numbers // most
 
     def _draw(
         self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
@@ -334,9 +327,7 @@ class Pages:
             most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
             room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
             room[:rows] = self._room
-            shifts = np.empty((most * columns, 2))
-            shifts[: len(self._shifts)] = self._shifts
-            self._room, self._shifts = room, shifts
+            self._room, self._shifts = room, np.resize(self._shifts, (most * columns, 2))
         self._room[numbers // columns, :, numbers % columns] = pages
         self._shifts[numbers] = _middles_of(numbers, columns, side) - middles
         return numbers

@@ -233,5 +233,5 @@ def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     pairs = close_pairs(points[None], np.array([variance]))
     away = points[pairs[:, 0]] - points[pairs[:, 1]]
     bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
-    cross = float(np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells))
-    return (float(weights @ weights) + 2 * cross) * peak(variance, points.shape[1])
+    cross = np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells)
+    return float((weights @ weights + 2 * cross) * peak(variance, points.shape[1]))

@@ -9,12 +9,12 @@ amplitude a = c / n that fits h to g best,
 
     S = c a,     ∇S = 2 a (∇c − a ∇n / 2).
 
-Steps are taken by curvatures that are never negative.  Where predicted features lie apart it is
-that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has
-∇C = C (y_i − p_i) / v, so that the step is that of least squares to the detections around the
-features, with weights C_i: it gets there at once from any distance, and a feature that meets none
-does not hold the others back.  Where features overlap their pulls are not their own, and the
-curvature is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
+Curvatures are never negative.  Where predicted features lie apart it is that of mean-shift,
+2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has ∇C = C (y_i − p_i) / v, so
+that the step is that of least squares to the detections around the features, with weights C_i: it
+gets there at once from any distance, and a feature that meets none does not hold the others back.
+Where features overlap it is Gauss-Newton's of the residual g − a h,
+2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
 
 from __future__ import annotations
@@ -81,29 +81,26 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     gradient = (strength[..., None] * rest).sum(axis=0)
     drawn = (strength / variances)[..., None] * C
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
-    if len(match.pairs):
-        near = np.flatnonzero(match.bells.any(axis=(0, 2)))
-        some = match.of(near)
-        half, gram = _pair_terms(some, variances, tops)
-        level = (strength * amplitude)[:, near, None]
-        gradient[near] -= (level * half).sum(axis=0)
-        outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
-        curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
-    return Quadratic(value, gradient, curvature)
-
-
-def _pair_terms(match: Match, variances: Floats, tops: Floats) -> tuple[Floats, Floats]:
-    """⟨h, ∂h⟩ (L, H, 6) and ⟨∂h, ∂hᵀ⟩ (L, H, 6, 6)."""
-    v, (i, j) = variances[..., None], match.pairs.T
-    own = match.J * match.weights[..., None, None]
-    gram = _gram(own, own) * (tops / variances)[..., None, None]
-    J_i, J_j = match.J[:, :, i], match.J[:, :, j]
-    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", match.away, each) for each in (J_i, J_j))
-    scaled = match.bells / v
+    if not len(match.pairs):
+        return Quadratic(value, gradient, curvature)
+    near = np.flatnonzero(match.bells.any(axis=(0, 2)))
+    some = match.of(near)
+    i, j = some.pairs.T
+    J_i, J_j = some.J[:, :, i], some.J[:, :, j]
+    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", some.away, each) for each in (J_i, J_j))
+    scaled = some.bells / variances[..., None]
+    # ⟨h, ∂h⟩ (L, h, 6) and ⟨∂h, ∂hᵀ⟩ (L, h, 6, 6): of each feature with itself, and of pairs
     half = -(scaled[:, :, None] @ (along_i - along_j))[:, :, 0]
+    own = some.J * some.weights[..., None, None]
+    gram = _gram(own, own) * (tops / variances)[..., None, None]
     cross = _gram(scaled[..., None, None] * J_i, J_j)
-    cross -= ((scaled / v)[..., None] * along_i).swapaxes(2, 3) @ along_j
-    return half, gram + cross + cross.swapaxes(2, 3)
+    cross -= ((scaled / variances[..., None])[..., None] * along_i).swapaxes(2, 3) @ along_j
+    gram += cross + cross.swapaxes(2, 3)
+    level = (strength * amplitude)[:, near, None]
+    gradient[near] -= (level * half).sum(axis=0)
+    outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
+    curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
+    return Quadratic(value, gradient, curvature)
 
 
 def _gram(A: Floats, B: Floats) -> Floats:
@@ -182,7 +179,7 @@ class MatchedObjective:
 
 
 class SharedDensities:
-    """C of all sensors at σ_ε, drawn once for several bodies, of views of detections, none empty."""
+    """C of all sensors at σ_ε, drawn once for several bodies; of views that are not empty."""
 
     def __init__(self, views: Sequence[View]) -> None:
         seen = [view.observation for view in views]
@@ -228,8 +225,8 @@ def matched_objective(
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
     """The objectives of several bodies, of bare points, on the same densities and blurs.
 
-    For a handful of features NumPy spends its time on calls, not on numbers: the poses that one
-    body is evaluated at in a batch may as well be those of several bodies, one of each.
+    For a handful of features NumPy spends its time on calls, not on numbers: a batch of poses may
+    as well be those of several bodies, one of each.
     """
     bodies = [one.projection.body for one in objectives]
     projection = project_body(objectives[0].projection.sensors, *bodies)

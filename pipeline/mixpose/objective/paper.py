@@ -187,7 +187,7 @@ class _AffineMaps:
     def _indices(self, rows: Floats) -> Singles:
         c, count = self._samples.shape
         single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
-        return single.dot(self._samples).reshape(len(rows), -1, count)
+        return np.asarray(single.dot(self._samples).reshape(len(rows), -1, count))
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:

@@ -170,11 +170,10 @@ class _Climb:
         if min(chosen) == count:
             self.states, self._here, self.steps, self.gains = tried, there, steps, gains
             return left
-        if max(chosen) >= count:
-            self.states = np.concatenate([self.states, tried])[chosen]
-            pairs = zip(self._here, there, strict=True)
-            both = [None if b is None else np.concatenate([a, b]) for a, b in pairs]
-            self._here = Quadratic._make(both).of(chosen)
+        self.states = np.concatenate([self.states, tried])[chosen]
+        pairs = zip(self._here, there, strict=True)
+        both = [None if b is None else np.concatenate([a, b]) for a, b in pairs]
+        self._here = Quadratic._make(both).of(chosen)
         self.steps, self.gains = _steps(self._here, self._free, self._damping, options)
         return left
 
