@@ -380,4 +380,5 @@ def test_where_nothing_is_drawn_the_density_is_zero() -> None:
 
 def test_pages_of_many_sensors_lie_in_an_array_that_can_be_looked_up() -> None:
     # fifteen cameras whose detections are far apart; cv2.remap takes less than 32767 a side
-    assert max(Pages(np.zeros(2), (500, 500), 24, 15).values.shape) < 32767
+    far_apart = np.array([[0.0, 0.0], [11_900.0, 11_900.0]])
+    assert max(Pages(far_apart, [], TILE, 17.0, 15).values.shape) < 32767

@@ -64,8 +64,8 @@ _ATLAS = (
     Mutant(
         "density-pages-begin-anywhere",
         "density/atlas.py",
-        "origin = page * np.floor((lower - (reach + page + 0.5)) / page)",
-        "origin = lower - (reach + page + 0.5)",
+        "_origin = page * np.floor((lower - (reach + page + 0.5)) / page)",
+        "_origin = lower - (reach + page + 0.5)",
         "the last digits of a pose change with detections that have no part in it",
     ),
     Mutant(
@@ -137,8 +137,8 @@ _BLUR = (
     Mutant(
         "density-overlap-ends-early",
         "density/observation.py",
-        "np.sqrt(2 * DRAWING.negligible * variance)",
-        "2.0 * np.sqrt(variance)",
+        "np.sqrt(2 * DRAWING.negligible * variances)",
+        "2.0 * np.sqrt(variances)",
         "bodies of many features have too little energy where features lie close",
     ),
 )

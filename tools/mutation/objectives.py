@@ -105,8 +105,8 @@ _MATCHED = (
     Mutant(
         "objective-norm-as-narrow-as-a-feature",
         "objective/matched.py",
-        "2 * sigma * sigma for sigma in sigmas",
-        "sigma * sigma for sigma in sigmas",
+        "[[2 * sigma * sigma] for sigma in sigmas]",
+        "[[sigma * sigma] for sigma in sigmas]",
         "observed and predicted densities are not of one width",
     ),
     Mutant(

@@ -49,10 +49,6 @@ class Atlas:
     sensor units, of n = `steps_per_sigma` cells each, and normalised.
     """
 
-    values: Singles  # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
-    per_unit: Floats  # (L, 1, 1, 2) cells per sensor unit; 0 for the missing coordinate of ranges
-    tile: int  # cells along the part of a tile that is looked up
-
     _sides = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
     _quarters = np.full(4, 0.25, dtype=np.float32)
 
@@ -61,20 +57,25 @@ class Atlas:
     ) -> None:
         dimensions = tuple([pattern.dimension for pattern in patterns])
         self._scale = scale = _Scale.of(dimensions, tuple(sigmas), steps_per_sigma)
+        # (L, 1, 1, 2) cells per sensor unit; 0 for the missing coordinate of ranges
         self.per_unit = scale.per_unit
-        self.values = np.zeros((0, 0, 3), dtype=np.float32)
+        # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
+        self.values: Singles = np.zeros((0, 0, 3), dtype=np.float32)
         self._grids: dict[int, tuple[GridPattern, float, float]] = {}
+        self._corners: dict[int, Floats] = {}  # (2, 2) of grids, in cells
         q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], np.zeros(len(patterns), dtype=np.intp)
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
                 small, left = reduced(pattern, scale.widths[k])
                 self._grids[k] = small, left, mass(small)
+                self._corners[k] = np.array(small.extent) * scale.per_unit[k, 0, 0]
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
             share.append(pattern.weights / pattern.weights.sum())
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)
+        # cells along the part of a tile that is looked up
         self.tile = max(math.ceil(steps_per_sigma), DRAWING.tile)
         # places (L, H, n, 2) in cells, shifts from there to the array of their tiles, and that
         self._own: tuple[Floats, Floats, Singles] = np.zeros(0), np.zeros(0), self.values
@@ -119,13 +120,8 @@ class Atlas:
     @cached_property
     def pages(self) -> Pages:
         """For many places, on planes that hold all that is seen."""
-        corners = [self._corners(k) for k in self._grids]
-        return Pages.of(self._q, corners, self.tile, self._scale.reach, len(self.per_unit))
-
-    def _corners(self, sensor: int) -> Floats:
-        """Corners (2, 2) of a grid, in cells."""
-        extent = np.array(self._grids[sensor][0].extent)
-        return np.asarray(extent * self.per_unit[sensor, 0, 0])
+        corners, L = list(self._corners.values()), len(self.per_unit)
+        return Pages(self._q, corners, self.tile, self._scale.reach, L)
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
@@ -202,8 +198,7 @@ class Atlas:
         of, which = self._near(sensors, middles)
         is_filled = np.zeros(len(sensors), dtype=np.bool_)
         is_filled[of] = True
-        for k in self._grids:
-            lower, upper = self._corners(k)
+        for k, (lower, upper) in self._corners.items():
             inside = (middles > lower - self._reach) & (middles < upper + self._reach)
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
@@ -252,25 +247,9 @@ class _Scale(NamedTuple):
 class Pages:
     """The planes of L sensors, divided into pages that are drawn when they are looked up."""
 
-    def __init__(self, origin: Floats, shape: tuple[int, int], page: int, sensors: int) -> None:
-        self.page = page  # cells along a page
-        self._origin, self._shape = origin, np.array(shape)  # in cells; pages along u and v
-        self._count = shape[0] * shape[1]
-        # (L * count,) number of each page, plane after plane and row by row; 0 where there is
-        # nothing, negative where nothing was looked up yet
-        self.table = np.full(sensors * self._count, -1, dtype=np.int32)
-        self._first = self._count * np.arange(sensors)[:, None, None]
-        side = page + _RIM
-        columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
-        self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
-        self._drawn = 1
-        # from a place in the plane to one in the array, by page; from nothing out of the array
-        self._shifts = np.full((columns, 2), FAR)
-
-    @classmethod
-    def of(
-        cls, q: Floats, corners: Sequence[Floats], page: int, reach: float, sensors: int
-    ) -> Pages:
+    def __init__(
+        self, q: Floats, corners: Sequence[Floats], page: int, reach: float, sensors: int
+    ) -> None:
         """For detections (D, 2), corners (2, 2) of grids, in cells; with a rim of empty pages."""
         grids = np.concatenate([np.zeros((0, 2)), *corners])
         places = q if len(q) else grids
@@ -281,10 +260,21 @@ class Pages:
         if corners:
             lower, upper = np.minimum(lower, grids.min(0)), np.maximum(upper, grids.max(0))
             page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.held), 1.0))
+        self.page = page  # cells along a page
         # half a cell is left, lest rounding puts a place on a page of the rim
-        origin = page * np.floor((lower - (reach + page + 0.5)) / page)
-        columns, rows = ((upper - lower + 2 * reach) / page).tolist()
-        return cls(origin, (int(columns) + 5, int(rows) + 5), page, sensors)
+        self._origin = page * np.floor((lower - (reach + page + 0.5)) / page)
+        self._shape = ((upper - lower + 2 * reach) / page).astype(np.intp) + 5  # along u and v
+        self._count = int(self._shape.prod())
+        # (L * count,) number of each page, plane after plane and row by row; 0 where there is
+        # nothing, negative where nothing was looked up yet
+        self.table = np.full(sensors * self._count, -1, dtype=np.int32)
+        self._first = self._count * np.arange(sensors)[:, None, None]
+        side = page + _RIM
+        columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
+        self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
+        self._drawn = 1
+        # from a place in the plane to one in the array, by page; from nothing out of the array
+        self._shifts = np.full((columns, 2), FAR)
 
     @property
     def values(self) -> Singles:

@@ -28,28 +28,22 @@ class DrawingRules:
         "what the best centres of blobs err by",
     )
     fine_steps: float = constant(
-        48.0,
-        "the same for grey values, which have no detection noise, at σ_ε: 2e-7 standard deviations",
+        48.0, "the same at σ_ε for grey values, which have no detection noise: places are 2e-7 off"
     )
     reach: float = constant(
         4.25,
-        "standard deviations around a detection that an atlas draws: features farther apart draw "
-        "each other by less than 1e-3 σ_ε",
+        "from a detection to where it is drawn: what is farther draws it by less than 1e-3 σ_ε",
     )
-    paper_reach: float = constant(4.0, "standard deviations from samples to the end of a window")
-    cut: float = constant(5.0, "standard deviations at which sums end: the tail holds 6e-7")
-    negligible: float = constant(
-        16.0, "exponent at which two features do not overlap: 1e-7, as single precision rounds"
-    )
+    paper_reach: float = constant(4.0, "from predicted samples to the end of their window")
+    cut: float = constant(5.0, "at which sums end: the tail holds 6e-7")
+    negligible: float = constant(16.0, "exponent at which two features do not overlap: 1e-7")
     tile: int = constant(
         24,
         "cells along the part of a tile that is looked up, at least: half of its six standard "
         "deviations is as far as a fit moves; larger ones are drawn for little use",
     )
     own_tiles: int = constant(
-        1200,
-        "places that have tiles of their own: with 600 features in two cameras a fit takes two "
-        "thirds of what it takes on pages",
+        1200, "places that have tiles of their own: fits take two thirds of the time on pages"
     )
     window_cells: int = constant(1_500_000, "of a dense window; a larger one gets coarser")
     side: int = constant(32000, "of an array and of maps: cv2.remap takes less than 32767")

@@ -114,9 +114,8 @@ class PaperObjective:
     @cached_property
     def _maps(self) -> _AffineMaps | None:
         """Where no sensor has perspective."""
-        if not all(isinstance(term.sensor, AffineSensor) for term in self.terms):
-            return None
-        return _AffineMaps(self.terms, self.points, self.offsets)
+        is_affine = all(isinstance(term.sensor, AffineSensor) for term in self.terms)
+        return _AffineMaps(self.terms, self.points, self.offsets) if is_affine else None
 
 
 class IndependentObjective(PaperObjective):
