@@ -123,8 +123,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-damps-less-after-failure",
         "optimise/ascent.py",
-        "max(10 * self._damping[k], options.held_back)",
-        "max(0.1 * self._damping[k], options.held_back)",
+        "max(10 * self._damping[k], 100 * options.damping)",
+        "max(0.1 * self._damping[k], 100 * options.damping)",
         "a step that led astray is tried again for ever",
     ),
     Mutant(

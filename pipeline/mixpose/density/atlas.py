@@ -130,18 +130,12 @@ class Atlas:
             near = inside[..., 0] & inside[..., 1] & (self._sensor == sensors[:, None])
             of, which = np.nonzero(near)
             return of, which
-        tiles, reach = cKDTree(self._apart(middles, sensors)), self._reach
-        pairs = tiles.sparse_distance_matrix(self._tree, reach, np.inf, output_type="ndarray")
+        apart = 2 * self._reach  # along a third coordinate: no sensor reaches another
+        tiles = cKDTree(np.column_stack([middles, apart * sensors]))
+        tree = cKDTree(np.column_stack([self._q, apart * self._sensor]))
+        pairs = tiles.sparse_distance_matrix(tree, self._reach, np.inf, output_type="ndarray")
         order = np.lexsort((pairs["j"], pairs["i"]))
         return pairs["i"][order], pairs["j"][order]
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self._apart(self._q, self._sensor))
-
-    def _apart(self, places: Floats, sensors: Indices) -> Floats:
-        """Places (P, 2) in cells and a third coordinate, by which no sensor reaches another."""
-        return np.column_stack([places, 2 * self._reach * sensors])
 
     def _drawn(
         self, sensors: Indices, middles: Floats, of: Indices, which: Indices

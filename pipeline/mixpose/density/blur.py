@@ -23,9 +23,7 @@ class DrawingRules:
     """Lengths are in standard deviations of a feature, and in cells of an array."""
 
     steps_per_sigma: float = constant(
-        4.0,
-        "cells per standard deviation: places are 4e-4 standard deviations off at most, a part of "
-        "what the best centres of blobs err by",
+        4.0, "cells per standard deviation: places are 4e-4 off, less than centres of blobs err by"
     )
     fine_steps: float = constant(
         48.0, "the same at σ_ε for grey values, which have no detection noise: places are 2e-7 off"
@@ -61,14 +59,9 @@ class DrawingRules:
         """Extent of features over the narrowest blur that the pages of a plane hold."""
         return math.sqrt(2 * self.held) * self.tile / self.steps_per_sigma
 
-    @property
-    def far(self) -> float:
-        """An index outside any array, of which cv2.remap can still tell 32 parts as integers."""
-        return -32.0 * self.side
-
 
 DRAWING = DrawingRules()
-FAR = DRAWING.far
+FAR = -32.0 * DRAWING.side  # outside any array, and cv2.remap can tell 32 parts of it as integers
 
 
 def blurred(

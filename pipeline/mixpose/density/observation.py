@@ -183,12 +183,11 @@ class Observation:
         return self._energy(self.sigma)
 
     def _energy(self, sigma: float) -> float:
-        pattern = self.pattern
         if self.is_empty:
             return 0.0
-        if isinstance(pattern, PointPattern):
-            weights = pattern.weights / pattern.weights.sum()
-            return self_overlap(pattern.points, weights, 2 * sigma**2)
+        if self.points is not None:
+            weights = self._amounts / self.weight
+            return self_overlap(self.points, weights, 2 * sigma**2)
         lower, upper = self.extent
         g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)

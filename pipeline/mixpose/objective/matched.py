@@ -223,11 +223,7 @@ def matched_objective(
 
 
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
-    """The objectives of several bodies, of bare points, on the same densities and blurs.
-
-    For a handful of features NumPy spends its time on calls, not on numbers: a batch of poses may
-    as well be those of several bodies, one of each.
-    """
+    """The objectives of several bodies, of bare points, on the same densities and blurs."""
     bodies = [one.projection.body for one in objectives]
     projection = project_body(objectives[0].projection.sensors, *bodies)
     energies = np.concatenate([one.energies for one in objectives], axis=1)

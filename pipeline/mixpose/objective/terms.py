@@ -1,8 +1,8 @@
-"""Terms about grey values and profiles: what is known of a pose before, and unlike brightness.
+"""Terms beside the matched objective: what is known of a pose before, and unlike brightness.
 
 With one amplitude for all features, two that overlap pull each other aside where the one is
-brighter.  Here each feature i of a sensor has an amplitude of its own, α_i, about their mean.  With
-b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
+brighter.  Here each feature i of a sensor has its amplitude α_i.  With b_i = ⟨g, h_i⟩ = w_i C(p_i)
+and B_ij = ⟨h_i, h_j⟩,
 
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 

@@ -75,7 +75,6 @@ class NewtonOptions:
     least_curvature: float = constant(
         0.3, "of the curvature: where a Hessian is flatter, its step would lead too far"
     )
-    held_back: float = constant(1e-2, "damping after a step that led astray, at least")
 
 
 class Ascent(NamedTuple):
@@ -162,7 +161,7 @@ class _Climb:
             if is_better or options.unchecked:
                 self._before[k], self._damping[k], chosen[k] = gain, damping[row], count + row
             else:
-                self._damping[k] = max(10 * self._damping[k], options.held_back)
+                self._damping[k] = max(10 * self._damping[k], 100 * options.damping)
             if self._damping[k] <= 1 / _NO_DAMPING:
                 left.append(k)
             else:
