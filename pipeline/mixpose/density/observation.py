@@ -185,9 +185,9 @@ class Observation:
     def _energy(self, sigma: float) -> float:
         if self.is_empty:
             return 0.0
-        if self.points is not None:
-            weights = self._amounts / self.weight
-            return self_overlap(self.points, weights, 2 * sigma**2)
+        if isinstance(self.pattern, PointPattern):
+            weights = self.pattern.weights / self.weight
+            return self_overlap(self.pattern.points, weights, 2 * sigma**2)
         lower, upper = self.extent
         g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
