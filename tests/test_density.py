@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 
 from mixpose.density import (
-    DRAWING,
     Density,
     Observation,
     Window,
     matched_atlas,
+    remap,
     render,
     self_overlap,
 )
-from mixpose.density.grid import remap
 from mixpose.records import GridPattern, Pattern, PointPattern
 
 
@@ -79,7 +78,7 @@ def test_blur_widens_a_feature_to_sigma_even_on_a_reduced_grid() -> None:
     assert np.sqrt(variance) == pytest.approx(np.sqrt(20.0**2 + own), rel=2e-3)
 
 
-@pytest.mark.parametrize("channels", DRAWING.exact_channels)
+@pytest.mark.parametrize("channels", [1, 3, 4])
 def test_remap_samples_float32_to_float_rounding(channels: int) -> None:
     # Before OpenCV 5 coordinates were rounded to 1/32 px: the objective was a staircase.
     # With 2 or more than 4 channels OpenCV 5.0 still does, by up to 0.02 here.
@@ -108,10 +107,10 @@ def test_coordinates_a_thousandth_of_a_step_apart_are_told_apart() -> None:
 def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Pattern) -> None:
     observation = Observation(pattern, 2.0)
     density = observation.density(2.0, observation.extent, gradient=True)
-    assert density.values.shape[2] in DRAWING.exact_channels
+    assert density.values.shape[2] == 3
     y = np.array([observation.extent[0]])
     assert density.sample(y).shape == (1, 1 + density.dimension)
-    assert matched_atlas([observation], [2.0], 4.0).values.shape[2] in DRAWING.exact_channels
+    assert matched_atlas([observation], [2.0], 4.0).values.shape[2] == 3
 
 
 def test_more_samples_than_one_map_side_can_hold() -> None:

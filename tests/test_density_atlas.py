@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.density import DRAWING, Atlas
-from mixpose.density.pages import Pages, Plane
+from mixpose.density.atlas import Pages
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA
 from mixpose.records import GridPattern, Pattern, PointPattern
 
@@ -380,5 +380,5 @@ def test_where_nothing_is_drawn_the_density_is_zero() -> None:
 
 def test_pages_of_many_sensors_lie_in_an_array_that_can_be_looked_up() -> None:
     # fifteen cameras whose detections are far apart; cv2.remap takes less than 32767 a side
-    plane = Plane(np.zeros(2), (500, 500), 24)
-    assert max(Pages(plane, 15).values.shape) < 32767
+    far_apart = np.array([[0.0, 0.0], [11_900.0, 11_900.0]])
+    assert max(Pages(far_apart, [], TILE, 17.0, 15).values.shape) < 32767

@@ -65,7 +65,7 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Spy:
         found.drawn.append(atlas)
         return atlas
 
-    monkeypatch.setattr("mixpose.density.grid.cv2.remap", recorded)
+    monkeypatch.setattr("mixpose.density.atlas.cv2.remap", recorded)
     monkeypatch.setattr(Atlas, "look_up", looked_up)
     monkeypatch.setattr(observation, "Atlas", drawn)
     return found

@@ -14,7 +14,7 @@ from mixpose.density import Density, Observation, Window, render
 from mixpose.objective import (
     OBJECTIVES,
     IndependentObjective,
-    Objective,
+    MatchedObjective,
     ObjectiveName,
     PaperObjective,
     View,
@@ -65,7 +65,9 @@ def test_pose_jacobian_agrees_with_central_differences(
         np.testing.assert_allclose(J[..., k], (forward - backward) / (2 * step), atol=1e-4)
 
 
-def on_fine_grids(name: ObjectiveName, views: list[View], body: Body, sigma: float) -> Objective:
+def on_fine_grids(
+    name: ObjectiveName, views: list[View], body: Body, sigma: float
+) -> MatchedObjective | PaperObjective:
     """An objective whose densities are so fine that interpolation errs by less than 0.1 %."""
     if name == "matched":
         sigmas = [sigma] * len(views)
@@ -157,7 +159,7 @@ def test_the_papers_objectives_are_formula_4_and_its_separate_sums_written_down(
         View(str(k), camera, Observation(PointPattern(y, np.ones(len(y))), sigma))
         for k, (camera, y) in enumerate(zip(cameras, seen))
     ]
-    terms = on_fine_grids("paper", views, soft_paper_body, sigma).terms  # type: ignore[attr-defined]
+    terms = on_fine_grids("paper", views, soft_paper_body, sigma).terms  # type: ignore[union-attr]
     poses = perturb(TRUTH, np.concatenate([np.zeros((1, 6)), random_twists(4, 8.0, 0.05)]))
     expected = np.array([formula_4(cameras, seen, samples, T, sigma) for T in poses])
     # bilinear values on 16 grid points per σ are up to 1/16²/8 of the curvature low: 0.1 %

@@ -293,7 +293,7 @@ def test_bodies_evaluated_at_once_are_what_each_is_alone() -> None:
     bodies = [body("tool", TOOL), body("other", OTHER[:4])]  # of unlike numbers of markers
     poses = [at(-80.0), at(90.0, 30.0)]
     views = views_of(bodies, poses, 3)
-    shared = SharedDensities.drawn(views)
+    shared = SharedDensities(views)
     each = [matched_objective(views, one, [1.5, 1.5], shared=shared) for one in bodies]
     near = [T @ at(0.4, -0.3) for T in poses]
     joint = together(each)

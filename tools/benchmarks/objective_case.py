@@ -19,8 +19,7 @@ from paper.systems import SCENARIOS, draw, pose, systems
 from benchmarks.literal import Camera, LiteralObjective
 from benchmarks.timing import PROCESSOR, Task, medians, show
 from mixpose.density import DRAWING
-from mixpose.objective import View
-from mixpose.objective.base import region_of_interest
+from mixpose.objective import View, region_of_interest
 from mixpose.objective.paper import PaperObjective, SampledTerm, sampled_terms
 from mixpose.rigid import transform
 from mixpose.sensors import ParallelBeam

@@ -123,8 +123,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-damps-less-after-failure",
         "optimise/ascent.py",
-        "max(10 * self._damping[k], options.held_back)",
-        "max(0.1 * self._damping[k], options.held_back)",
+        "max(10 * self._damping[k], 100 * options.damping)",
+        "max(0.1 * self._damping[k], 100 * options.damping)",
         "a step that led astray is tried again for ever",
     ),
     Mutant(
@@ -137,7 +137,7 @@ _OPTIMISE = (
     Mutant(
         "optimise-any-hessian",
         "optimise/ascent.py",
-        "len(one) > 0 and dpotrf(one)[1] == 0 for one",
+        "dpotrf(one)[1] == 0 for one",
         "True for one",
         "where the Hessian is not definite the step leads to a saddle or a minimum",
     ),
@@ -158,7 +158,7 @@ _OPTIMISE = (
     Mutant(
         "optimise-flat-directions-are-singular",
         "optimise/ascent.py",
-        "_TINY + max(diagonal.tolist(), default=0.0) * 1e-12 * damping",
+        "_TINY + max(diagonal.tolist()) * 1e-12 * damping",
         "0.0",
         "a direction without curvature ends the run with an error",
     ),

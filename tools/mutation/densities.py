@@ -63,9 +63,9 @@ _ATLAS = (
     ),
     Mutant(
         "density-pages-begin-anywhere",
-        "density/pages.py",
-        "origin = page * np.floor((lower - (reach + page + 0.5)) / page)",
-        "origin = lower - (reach + page + 0.5)",
+        "density/atlas.py",
+        "_origin = page * np.floor((lower - (reach + page + 0.5)) / page)",
+        "_origin = lower - (reach + page + 0.5)",
         "the last digits of a pose change with detections that have no part in it",
     ),
     Mutant(
@@ -80,28 +80,28 @@ _ATLAS = (
 _BLUR = (
     Mutant(
         "density-noise-cancels-itself",
-        "density/grid.py",
+        "density/blur.py",
         "absolute = float(np.abs(pattern.values).sum(dtype=np.float64))",
         "absolute = float(pattern.values.sum(dtype=np.float64))",
         "a profile whose noise sums to about zero is normalised by about zero",
     ),
     Mutant(
         "density-blocks-blur-once-more",
-        "density/grid.py",
+        "density/blur.py",
         "left = np.sqrt(max(sigma**2 - (step**2 - pattern.step**2) / 6, 0.0))",
         "left = sigma",
         "wide blurs of grey values are wider than said",
     ),
     Mutant(
         "density-blocks-half-a-pixel-aside",
-        "density/grid.py",
+        "density/blur.py",
         "(factor - 1) / 2 * pattern.step",
         "factor / 2 * pattern.step",
         "coarse blurs of grey values are half a pixel aside",
     ),
     Mutant(
         "density-slope-of-a-blur-turned-round",
-        "density/grid.py",
+        "density/blur.py",
         "values * away * np.float32(-1.0 / sigma)",
         "values * away * np.float32(1.0 / sigma)",
         "gradients of grey values have the wrong sign",
@@ -137,8 +137,8 @@ _BLUR = (
     Mutant(
         "density-overlap-ends-early",
         "density/observation.py",
-        "np.sqrt(2 * DRAWING.negligible * variance)",
-        "2.0 * np.sqrt(variance)",
+        "np.sqrt(2 * DRAWING.negligible * variances)",
+        "2.0 * np.sqrt(variances)",
         "bodies of many features have too little energy where features lie close",
     ),
 )

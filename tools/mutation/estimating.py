@@ -81,7 +81,7 @@ _NARROW = (
 _PROBABLE = (
     Mutant(
         "objective-prior-ignored",
-        "objective/base.py",
+        "objective/terms.py",
         "np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)",
         "np.zeros(6)",
         "what is known of the start does not count",
@@ -89,7 +89,7 @@ _PROBABLE = (
     ),
     Mutant(
         "objective-prior-repels",
-        "objective/base.py",
+        "objective/terms.py",
         "Quadratic(0.5 * (away * pull).sum(axis=1), pull, C, C)",
         "Quadratic(0.5 * (away * pull).sum(axis=1), -pull, C, C)",
         "the gradient of the prior has the wrong sign",
@@ -105,7 +105,7 @@ _PROBABLE = (
     ),
     Mutant(
         "objective-prior-points-too-close",
-        "objective/base.py",
+        "objective/terms.py",
         "steps = np.sqrt(count) * np.diag(",
         "steps = np.diag(",
         "other maxima are sought within less than the prior allows",

@@ -46,8 +46,8 @@ _KERNEL = (
     Mutant(
         "objective-curvature-of-half-the-pairs",
         "objective/matched.py",
-        "return half, gram + cross + cross.swapaxes(2, 3)",
-        "return half, gram + cross",
+        "gram += cross + cross.swapaxes(2, 3)",
+        "gram += cross",
         "steps are too long or too short where features overlap",
     ),
     Mutant(
@@ -105,8 +105,8 @@ _MATCHED = (
     Mutant(
         "objective-norm-as-narrow-as-a-feature",
         "objective/matched.py",
-        "2 * sigma * sigma for sigma in sigmas",
-        "sigma * sigma for sigma in sigmas",
+        "[[2 * sigma * sigma] for sigma in sigmas]",
+        "[[sigma * sigma] for sigma in sigmas]",
         "observed and predicted densities are not of one width",
     ),
     Mutant(

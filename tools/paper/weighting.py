@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mixpose.density.grid import Density
+from mixpose.density import Density
 
 
 def weighted(density: Density, w: NDArray[np.float32]) -> Density:

@@ -1,9 +1,9 @@
 """Densities of all sensors as images, drawn where they are looked up.
 
-A density is nearly empty, so small tiles of it are drawn.  All tiles of all sensors lie in one
-array (an atlas), which `cv2.remap` looks up at once, values and gradients together.  Few places, as
-those of a pose that a fit begins from, have tiles of their own, in which they stay while it moves a
-little.  For many the plane of every sensor is divided into pages, tiles that are found by a table.
+A density is nearly empty, so small tiles of it are drawn, of all sensors into one array (an atlas)
+that `cv2.remap` looks up at once, values and gradients together.  Few places, as those of a pose
+that a fit begins from, have tiles of their own, in which they stay while it moves a little.  For
+many the plane of every sensor is divided into pages, tiles that are found by a table.
 
 Cells hold coefficients of quadratic B-splines, so that what is looked up bends smoothly from cell
 to cell.  At a place d cells beside the nearest one, such a spline is the mean of four bilinear
@@ -16,19 +16,30 @@ from sensor coordinates 0, so that a density is the same whatever is seen beside
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from mixpose.density.grid import blurred, mass, reduced, remap
-from mixpose.density.pages import RIM, Pages, Plane, middles_of
-from mixpose.density.rules import DRAWING
+from mixpose.density.blur import DRAWING, FAR, blurred, mass, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
+_RIM = 3  # cells along a tile beside those looked up, which a spline reaches: one before, two after
 # tiles that are drawn at once: they have room for as many detections each
 _TOGETHER = math.isqrt(DRAWING.few_pairs)
+
+
+def remap(values: Singles, u: Singles, v: Singles) -> Any:
+    """Sample an array bilinearly at indices (...) along columns and rows: (..., C); 0 outside."""
+    if u.ndim == 2 and u.size and max(u.shape) <= DRAWING.side:
+        return cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    count, channels, width = u.size, values.shape[2:], min(max(u.size, 1), DRAWING.side)
+    padding = -count % width if count else 1
+    maps = [np.pad(one.ravel(), (0, padding)).reshape(-1, width) for one in (u, v)]
+    return remap(values, *maps).reshape(-1, *channels)[:count].reshape(*u.shape, *channels)
 
 
 class Atlas:
@@ -38,12 +49,7 @@ class Atlas:
     sensor units, of n = `steps_per_sigma` cells each, and normalised.
     """
 
-    values: Singles  # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
-    per_unit: Floats  # (L, 1, 1, 2) cells per sensor unit; 0 for the missing coordinate of ranges
-    tile: int  # cells along the part of a tile that is looked up
-
     _sides = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]], dtype=np.float64)[..., None]
-    _apart = 4e9  # cells between rows of one sensor and the next, where they are sorted
     _quarters = np.full(4, 0.25, dtype=np.float32)
 
     def __init__(
@@ -51,26 +57,31 @@ class Atlas:
     ) -> None:
         dimensions = tuple([pattern.dimension for pattern in patterns])
         self._scale = scale = _Scale.of(dimensions, tuple(sigmas), steps_per_sigma)
+        # (L, 1, 1, 2) cells per sensor unit; 0 for the missing coordinate of ranges
         self.per_unit = scale.per_unit
-        self.values = np.zeros((0, 0, 3), dtype=np.float32)
+        # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
+        self.values: Singles = np.zeros((0, 0, 3), dtype=np.float32)
         self._grids: dict[int, tuple[GridPattern, float, float]] = {}
+        self._corners: dict[int, Floats] = {}  # (2, 2) of grids, in cells
         q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], np.zeros(len(patterns), dtype=np.intp)
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
                 small, left = reduced(pattern, scale.widths[k])
                 self._grids[k] = small, left, mass(small)
+                self._corners[k] = np.array(small.extent) * scale.per_unit[k, 0, 0]
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
             share.append(pattern.weights / pattern.weights.sum())
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)
+        # cells along the part of a tile that is looked up
         self.tile = max(math.ceil(steps_per_sigma), DRAWING.tile)
         # places (L, H, n, 2) in cells, shifts from there to the array of their tiles, and that
         self._own: tuple[Floats, Floats, Singles] = np.zeros(0), np.zeros(0), self.values
         if self._grids:  # the larger the plane, the larger its pages
-            self.tile = self.pages.plane.page
-        self._side, self._reach = self.tile + RIM, 0.5 * self.tile + scale.reach
+            self.tile = self.pages.page
+        self._side, self._reach = self.tile + _RIM, 0.5 * self.tile + scale.reach
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
@@ -95,75 +106,57 @@ class Atlas:
         around, shifts, values = self._own
         is_left = around.shape != index.shape
         if is_left or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
-            middles, side = np.rint(index), self._side
-            flat = middles.reshape(-1, 2)
-            sensors = np.arange(len(index)).repeat(len(flat) // len(index))
-            groups = self._groups(len(flat), *self._near(sensors, flat))
-            # columns of so few tiles that places in the array are rounded to 6e-5 cells
-            shape = min(len(flat), _TOGETHER), side, len(groups), 3 * side
-            room, numbers = np.empty(shape, dtype=np.float32), np.empty(len(flat), dtype=np.intp)
-            for k, (some, *pairs) in enumerate(groups):
-                self._draw(room[: len(some), :, k], sensors[some], flat[some], *pairs)
-                numbers[some] = np.arange(len(some)) * len(groups) + k
-            shifts = (middles_of(numbers, len(groups), side) - flat).reshape(index.shape)
-            values = room.reshape(-1, len(groups) * side, 3)
-            self._own = middles, shifts, values
+            around = np.rint(index)
+            middles = around.reshape(-1, 2)
+            sensors = np.arange(len(index)).repeat(len(middles) // len(index))
+            room, numbers = self._drawn(sensors, middles, *self._near(sensors, middles))
+            columns, side = room.shape[2], self._side
+            shifts = (_middles_of(numbers, columns, side) - middles).reshape(index.shape)
+            values = room.reshape(-1, columns * side, 3)
+            self._own = around, shifts, values
         index += shifts
         self.values = values
 
     @cached_property
     def pages(self) -> Pages:
         """For many places, on planes that hold all that is seen."""
-        corners = [self._corners(k) for k in self._grids]
-        plane = Plane.of(self._q, corners, self.tile, self._scale.reach)
-        return Pages(plane, len(self.per_unit))
-
-    def _corners(self, sensor: int) -> Floats:
-        """Corners (2, 2) of a grid, in cells."""
-        extent = np.array(self._grids[sensor][0].extent)
-        return np.asarray(extent * self.per_unit[sensor, 0, 0])
+        corners, L = list(self._corners.values()), len(self.per_unit)
+        return Pages(self._q, corners, self.tile, self._scale.reach, L)
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
         if len(sensors) * len(self._q) <= DRAWING.few_pairs:
-            away = np.abs(self._q - middles[:, None])
-            inside = away < self._reach
+            inside = np.abs(self._q - middles[:, None]) < self._reach
             near = inside[..., 0] & inside[..., 1] & (self._sensor == sensors[:, None])
             of, which = np.nonzero(near)
             return of, which
-        (order, keys), margin = self._sorted, self._reach + 1.0
-        rows = middles[:, 1] + self._apart * sensors
-        first, counts = keys.searchsorted(rows - margin), keys.searchsorted(rows + margin)
-        counts -= first
-        of = np.arange(len(rows)).repeat(counts)
-        which = order[np.arange(len(of)) + (first - np.cumsum(counts) + counts).repeat(counts)]
-        near = np.flatnonzero((np.abs(self._q[which] - middles[of]) < self._reach).all(axis=1))
-        return of[near], which[near]
+        apart = 2 * self._reach  # along a third coordinate: no sensor reaches another
+        tiles = cKDTree(np.column_stack([middles, apart * sensors]))
+        tree = cKDTree(np.column_stack([self._q, apart * self._sensor]))
+        pairs = tiles.sparse_distance_matrix(tree, self._reach, np.inf, output_type="ndarray")
+        order = np.lexsort((pairs["j"], pairs["i"]))
+        return pairs["i"][order], pairs["j"][order]
 
-    @cached_property
-    def _sorted(self) -> tuple[Indices, Floats]:
-        """Detections (D,) by sensor and row, and numbers that are sorted alike."""
-        farthest = self._apart / 4
-        keys = np.clip(self._q[:, 1], -farthest, farthest) + self._apart * self._sensor
-        order = np.argsort(keys)
-        return order, keys[order]
+    def _drawn(
+        self, sensors: Indices, middles: Floats, of: Indices, which: Indices
+    ) -> tuple[Singles, Indices]:
+        """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
 
-    def _groups(
-        self, count: int, of: Indices, which: Indices
-    ) -> list[tuple[Indices, Indices, Indices]]:
-        """Tiles that about as many detections reach, with the pairs of both, as of `_near`."""
-        if count <= _TOGETHER:
-            return [(np.arange(count), of, which)]
-        order = np.argsort(np.bincount(of, minlength=count), kind="stable")
-        rank = np.argsort(order)[of]
-        by_rank = np.argsort(rank, kind="stable")
-        rank, which = rank[by_rank], which[by_rank]
-        firsts = range(0, count, _TOGETHER)
-        ends = rank.searchsorted([*firsts, count]).tolist()
-        return [
-            (order[k : k + _TOGETHER], rank[a:b] - k, which[a:b])
-            for k, a, b in zip(firsts, ends, ends[1:])
-        ]
+        And their numbers (P,), row by row.  Those of a column are drawn at once.  Columns are
+        short, so that places are rounded to 6e-5 cells.
+        """
+        count, side, most = len(middles), self._side, _TOGETHER
+        numbers, columns = np.arange(count), max(-(-count // most), 1)
+        room = np.empty((min(count, most), side, columns, 3 * side), dtype=np.float32)
+        for k in range(columns):
+            some = slice(k * most, min((k + 1) * most, count))
+            a, b = of.searchsorted([some.start, some.stop]).tolist()
+            tiles = room[: some.stop - some.start, :, k]
+            self._draw(tiles, sensors[some], middles[some], of[a:b] - some.start, which[a:b])
+            for i in numbers[some].tolist():
+                if sensors[i] in self._grids:
+                    tiles[i - some.start] = self._of_grid(int(sensors[i]), middles[i])
+        return room, numbers % most * columns + numbers // most
 
     def _draw(
         self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
@@ -199,21 +192,13 @@ class Atlas:
         of, which = self._near(sensors, middles)
         is_filled = np.zeros(len(sensors), dtype=np.bool_)
         is_filled[of] = True
-        for k in self._grids:
-            lower, upper = self._corners(k)
+        for k, (lower, upper) in self._corners.items():
             inside = (middles > lower - self._reach) & (middles < upper + self._reach)
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
-        sensors, middles = sensors[filled], middles[filled]
-        tiles = np.empty((len(filled), self._side, 3 * self._side), dtype=np.float32)
-        for some, *pairs in self._groups(len(filled), np.searchsorted(filled, of), which):
-            drawn = np.empty((len(some), *tiles.shape[1:]), dtype=np.float32)
-            self._draw(drawn, sensors[some], middles[some], *pairs)
-            tiles[some] = drawn
-        for i, k in enumerate(sensors.tolist()):
-            if k in self._grids:
-                tiles[i] = self._of_grid(k, middles[i])
-        return filled, tiles
+        of = np.searchsorted(filled, of)
+        room, numbers = self._drawn(sensors[filled], middles[filled], of, which)
+        return filled, room[numbers // room.shape[2], :, numbers % room.shape[2]]
 
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
         """A tile (side, 3 side) of grey values or a profile."""
@@ -249,5 +234,94 @@ class _Scale(NamedTuple):
         units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
         is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
         per_unit = np.array(across)[:, None, None]
-        reach = DRAWING.reach * n + RIM - 1
+        reach = DRAWING.reach * n + _RIM - 1
         return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)
+
+
+class Pages:
+    """The planes of L sensors, divided into pages that are drawn when they are looked up."""
+
+    def __init__(
+        self, q: Floats, corners: Sequence[Floats], page: int, reach: float, sensors: int
+    ) -> None:
+        """For detections (D, 2), corners (2, 2) of grids, in cells; with a rim of empty pages."""
+        grids = np.concatenate([np.zeros((0, 2)), *corners])
+        places = q if len(q) else grids
+        lower, upper = places.min(axis=0), places.max(axis=0)
+        if len(q) and _count(lower, upper, page) > DRAWING.held:
+            middle, half = np.median(q, axis=0), page * math.sqrt(DRAWING.held) / 2.5
+            lower, upper = np.maximum(lower, middle - half), np.minimum(upper, middle + half)
+        if corners:
+            lower, upper = np.minimum(lower, grids.min(0)), np.maximum(upper, grids.max(0))
+            page = math.ceil(page * max(math.sqrt(_count(lower, upper, page) / DRAWING.held), 1.0))
+        self.page = page  # cells along a page
+        # half a cell is left, lest rounding puts a place on a page of the rim
+        self._origin = page * np.floor((lower - (reach + page + 0.5)) / page)
+        self._shape = ((upper - lower + 2 * reach) / page).astype(np.intp) + 5  # along u and v
+        self._count = int(self._shape.prod())
+        # (L * count,) number of each page, plane after plane and row by row; 0 where there is
+        # nothing, negative where nothing was looked up yet
+        self.table = np.full(sensors * self._count, -1, dtype=np.int32)
+        self._first = self._count * np.arange(sensors)[:, None, None]
+        side = page + _RIM
+        columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
+        self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
+        self._drawn = 1
+        # from a place in the plane to one in the array, by page; from nothing out of the array
+        self._shifts = np.full((columns, 2), FAR)
+
+    @property
+    def values(self) -> Singles:
+        """The array (rows, columns, 3) that pages lie in."""
+        rows, side, columns, _ = self._room.shape
+        return self._room.reshape(rows * side, columns * side, 3)
+
+    def find(
+        self, index: Floats, draw: Callable[[Indices, Floats], tuple[Indices, Singles]]
+    ) -> None:
+        """Turn places (L, H, n, 2) in cells into those in `values`, in place.
+
+        Of pages, by sensors (P,) and middles (P, 2), `draw` gives those with something, and that.
+        """
+        page, width = self.page, self._shape[0]
+        index -= self._origin
+        np.maximum(index, 0.0, out=index)
+        np.minimum(index, self._shape * page - 1e-3, out=index)
+        squares = (index * (1.0 / page)).astype(np.intp) @ np.array([1, width]) + self._first
+        number = self.table[squares]
+        if number.min(initial=0) < 0:
+            pending, at_once = np.unique(squares[number < 0]), DRAWING.held // page**2
+            for first in range(0, len(pending), at_once):
+                some = pending[first : first + at_once]
+                sensors, place = np.divmod(some, self._count)
+                middles = page * (np.stack([place % width, place // width], axis=1) + 0.5)
+                filled, pages = draw(sensors, self._origin + middles)
+                self.table[some] = 0
+                self.table[some[filled]] = self._kept(pages, middles[filled])
+            number = self.table[squares]
+        index += self._shifts[number]
+
+    def _kept(self, pages: Singles, middles: Floats) -> Indices:
+        """Numbers of pages (F, side, 3 side) around places (F, 2) that are put into the array."""
+        rows, side, columns, _ = self._room.shape
+        numbers = np.arange(self._drawn, self._drawn + len(pages))
+        self._drawn += len(pages)
+        if self._drawn > rows * columns:
+            # so large that allocators keep it; memory that is not written to is free
+            most = min(4 * -(-self._drawn // columns), DRAWING.side // side)
+            room = np.empty((most, *self._room.shape[1:]), dtype=np.float32)
+            room[:rows] = self._room
+            self._room, self._shifts = room, np.resize(self._shifts, (most * columns, 2))
+        self._room[numbers // columns, :, numbers % columns] = pages
+        self._shifts[numbers] = _middles_of(numbers, columns, side) - middles
+        return numbers
+
+
+def _middles_of(numbers: Indices, columns: int, side: int) -> Floats:
+    """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
+    return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
+
+
+def _count(lower: Floats, upper: Floats, page: int) -> float:
+    """Pages of a box in cells, about."""
+    return float(((upper - lower) / page + 5).prod())

@@ -10,14 +10,77 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.density.atlas import Atlas
-from mixpose.density.grid import Density, Window, is_empty, odd_factor, render
-from mixpose.density.rules import DRAWING
-from mixpose.records import Floats, Indices, Mask, Pattern, PointPattern, Singles
+from mixpose.density.atlas import Atlas, remap
+from mixpose.density.blur import DRAWING, FAR, blurred, is_empty, mass, odd_factor, reduced
+from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, PointPattern, Singles
+
+
+@dataclass(frozen=True)
+class Window:
+    """A grid in sensor coordinates."""
+
+    origin: Floats  # (m,) sensor coordinates of the first grid point
+    shape: tuple[int, int]  # rows and columns; one row for ranges
+    step: float  # sensor units between grid points
+
+    @classmethod
+    def around(cls, lower: Floats, upper: Floats, step: float) -> Window:
+        """The smallest grid that covers the box from `lower` to `upper`, both (m,)."""
+        count = np.maximum(np.ceil((upper - lower) / step - 1e-9).astype(int) + 1, 2)
+        rows = int(count[1]) if len(count) == 2 else 1
+        return cls(np.asarray(lower, dtype=np.float64), (rows, int(count[0])), float(step))
+
+    def axis(self, k: int) -> Floats:
+        """Sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
+        return np.asarray(self.origin[k] + self.step * np.arange(self.shape[1 - k]))
+
+
+@dataclass(frozen=True)
+class Density:
+    """A probability density over sensor coordinates, sampled on a window; 0 outside."""
+
+    # (H, W) in 1/unit^m, or (H, W, 3) with its gradient; for ranges the last channel is empty
+    values: Singles
+    window: Window  # index = (y - origin) / step
+    sigma: float  # standard deviation, in sensor units, that one exact feature has in it
+
+    @property
+    def dimension(self) -> int:
+        """m, the number of sensor coordinates."""
+        return len(self.window.origin)
+
+    def sample(self, y: Floats) -> Singles:
+        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
+
+        Without the last axis for a single channel.
+        """
+        m = self.dimension
+        index = (y.reshape(-1, m) - self.window.origin) / self.window.step
+        index = np.clip(np.nan_to_num(index, copy=False, nan=FAR), FAR, -FAR)
+        u = index[None, :, 0].astype(np.float32)
+        v = index[None, :, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
+        looked_up = remap(self.values, u, v).reshape(*y.shape[:-1], *self.values.shape[2:])
+        return np.asarray(looked_up if self.values.ndim == 2 else looked_up[..., : 1 + m])
+
+
+def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
+    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it as a whole, on a window."""
+    left, total = sigma, np.inf if is_empty(pattern) else mass(pattern)
+    if isinstance(pattern, GridPattern):
+        pattern, left = reduced(pattern, sigma)
+    u, v = window.axis(0), window.axis(pattern.dimension - 1)
+    layers = blurred(pattern, left, u, v, total, gradient=gradient)
+    if not gradient:
+        return Density(layers[0], window, sigma)
+    # three channels: of two cv2.remap of OpenCV 5 knows places to 1/32 of a cell only
+    layers += [np.zeros(window.shape, dtype=np.float32)] * (3 - len(layers))
+    return Density(np.asarray(cv2.merge(layers), dtype=np.float32), window, sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +111,11 @@ class Observation:
         part = PointPattern(self.pattern.points[chosen], self.pattern.weights[chosen])
         return replace(self, pattern=part)
 
-    @property
+    @cached_property
     def cell(self) -> float | None:
         """Size of a cell whose value carries noise of its own; None for detections."""
-        if isinstance(self.pattern, PointPattern):
-            return None
-        return float(self.pattern.step**self.dimension)
+        pattern = self.pattern
+        return None if isinstance(pattern, PointPattern) else float(pattern.step**self.dimension)
 
     @property
     def cells(self) -> int:
@@ -82,22 +144,30 @@ class Observation:
 
     def around(self, y: Floats, reach: float) -> Observation:
         """Detections within a reach, in σ_ε, of places (n, m), if there are any."""
-        pattern = self.pattern
-        if not isinstance(pattern, PointPattern) or not len(y):
+        if self.points is None or not len(y):
             return self
-        distances, _ = cKDTree(y).query(pattern.points, distance_upper_bound=reach * self.sigma)
+        distances, _ = cKDTree(y).query(self.points, distance_upper_bound=reach * self.sigma)
         near = np.isfinite(distances)
-        if not near.any() or near.all():
-            return self
-        return replace(self, pattern=PointPattern(pattern.points[near], pattern.weights[near]))
+        return self.only(near) if near.any() else self
 
     def density(
         self, sigma: float, within: tuple[Floats, Floats], *, gradient: bool = False
     ) -> Density:
-        """Make g with features of standard deviation sigma, on a window over the box `within`."""
-        window = self._window(sigma, within)
-        rendered = render(self.pattern, self.blur(sigma), window, gradient=gradient)
-        return replace(rendered, sigma=sigma)
+        """Make g with features of standard deviation sigma, on a window over the box `within`.
+
+        Fine enough for the blur, and within the budget of cells.
+        """
+        (near, far), margin = self.extent, DRAWING.cut * sigma
+        lower = np.maximum(within[0], near - margin)
+        upper = np.maximum(np.minimum(within[1], far + margin), lower)
+        affordable = float(np.prod(upper - lower) / DRAWING.window_cells) ** (1 / self.dimension)
+        step, grid = max(sigma / DRAWING.steps_per_sigma, affordable), self.pattern
+        if isinstance(grid, GridPattern):  # grid points at the centres of blocks of pixels
+            factor = odd_factor(step / grid.step)
+            begin = np.floor((lower - grid.origin) / grid.step) + (factor - 1) / 2
+            lower, step = grid.origin + begin * grid.step, factor * grid.step
+        window = Window.around(lower, upper, step)
+        return replace(render(grid, self.blur(sigma), window, gradient=gradient), sigma=sigma)
 
     def blur(self, sigma: float, *, matched: bool = False) -> float:
         """Blur of the pattern that gives features a standard deviation, once or for C."""
@@ -113,31 +183,15 @@ class Observation:
         return self._energy(self.sigma)
 
     def _energy(self, sigma: float) -> float:
-        pattern = self.pattern
         if self.is_empty:
             return 0.0
-        if isinstance(pattern, PointPattern):
-            weights = pattern.weights / pattern.weights.sum()
-            return self_overlap(pattern.points, weights, 2 * sigma**2)
+        if isinstance(self.pattern, PointPattern):
+            weights = self.pattern.weights / self.weight
+            return self_overlap(self.pattern.points, weights, 2 * sigma**2)
         lower, upper = self.extent
         g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
-
-    def _window(self, feature_sigma: float, within: tuple[Floats, Floats]) -> Window:
-        """A window over the box, fine enough for the blur and within the budget of cells."""
-        (near, far), margin = self.extent, DRAWING.cut * feature_sigma
-        lower = np.maximum(within[0], near - margin)
-        upper = np.maximum(np.minimum(within[1], far + margin), lower)
-        affordable = float(np.prod(upper - lower) / DRAWING.window_cells) ** (1 / self.dimension)
-        step = max(feature_sigma / DRAWING.steps_per_sigma, affordable)
-        if isinstance(self.pattern, PointPattern):
-            return Window.around(lower, upper, step)
-        grid = self.pattern
-        factor = odd_factor(step / grid.step)
-        # grid points at the centres of blocks of pixels
-        begin = np.floor((lower - grid.origin) / grid.step) + (factor - 1) / 2
-        return Window.around(grid.origin + begin * grid.step, upper, factor * grid.step)
 
 
 def matched_atlas(
@@ -148,17 +202,21 @@ def matched_atlas(
     return Atlas([observation.pattern for observation in observations], blurs, steps_per_sigma)
 
 
-def peak(variance: float, dimension: int) -> float:
-    """Value of an isotropic Gaussian density at its centre."""
-    return float((2 * np.pi * variance) ** (-dimension / 2))
+def peak(variance: Any, dimension: Any) -> Any:
+    """Value of an isotropic Gaussian density at its centre; of arrays, values of all."""
+    return (2 * np.pi * variance) ** (-dimension / 2)
 
 
-def close_pairs(points: Floats, variance: float) -> Indices:
-    """Pairs i < j of points (n, m) that overlap at the given variance, or all of few: (P, 2)."""
-    if len(points) ** 2 <= DRAWING.few_pairs:
-        return all_pairs(len(points))
-    reach = np.sqrt(2 * DRAWING.negligible * variance)
-    return np.asarray(cKDTree(points).query_pairs(reach, output_type="ndarray"), dtype=np.intp)
+def close_pairs(places: Floats, variances: Floats) -> Indices:
+    """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m) at least.
+
+    At the variance of each; of few points, all pairs.
+    """
+    if places.shape[1] ** 2 <= DRAWING.few_pairs:
+        return all_pairs(places.shape[1])
+    reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
+    each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
+    return np.unique(np.concatenate(each), axis=0).astype(np.intp)
 
 
 @lru_cache
@@ -171,8 +229,8 @@ def all_pairs(count: int) -> Indices:
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
-    pairs = close_pairs(points, variance)
+    pairs = close_pairs(points[None], np.array([variance]))
     away = points[pairs[:, 0]] - points[pairs[:, 1]]
     bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
-    cross = float(np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells))
-    return (float(weights @ weights) + 2 * cross) * peak(variance, points.shape[1])
+    cross = np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells)
+    return float((weights @ weights + 2 * cross) * peak(variance, points.shape[1]))

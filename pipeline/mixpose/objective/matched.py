@@ -1,22 +1,20 @@
 """The matched objective: from predicted features and drawn densities to one number.
 
-For sensor l let g be the observed density and h_β the predicted one, a mixture of the projected
-features with the observation's own blur σ.  The share of g that h_β explains once its amplitude
-is solved for (variable projection) is S_l(β) = ⟨g, h_β⟩² / (⟨g, g⟩ ⟨h_β, h_β⟩), and the objective
-is Σ_l ω_l S_l.  For point features ⟨g, h_β⟩ = Σ_i C(p_i), where C is g blurred once more by σ: an
-image, drawn once and looked up with `cv2.remap`.
-
-With c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
+For sensor l let g be the observed density and h the predicted one, a mixture of the projected
+features p_i(β) with the observation's own blur σ.  The share of g that h explains once its
+amplitude is solved for (variable projection) is S_l = ⟨g, h⟩² / (⟨g, g⟩ ⟨h, h⟩), and the objective
+is Σ_l ω_l S_l.  Let C be g blurred once more by σ, an image that `cv2.remap` looks up.  With
+c = ⟨g, h⟩ = Σ_i w_i C(p_i), n = ⟨h, h⟩ = Σ_ij w_i w_j N(p_i − p_j; 0, v), v = 2σ², and the
 amplitude a = c / n that fits h to g best,
 
     S = c a,     ∇S = 2 a (∇c − a ∇n / 2).
 
-Steps are taken by curvatures that are never negative.  Where predicted features lie apart it is
-that of mean-shift, 2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has
-∇C = C (y_i − p_i) / v, so that the step is that of least squares to the detections around the
-features, with weights C_i: it gets there at once from any distance, and a feature that meets none
-does not hold the others back.  Where features overlap their pulls are not their own, and the
-curvature is Gauss-Newton's of the residual g − a h, 2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
+Curvatures are never negative.  Where predicted features lie apart it is that of mean-shift,
+2 a Σ_i w_i C_i J_iᵀ J_i / v.  A Gaussian around a detection at y_i has ∇C = C (y_i − p_i) / v, so
+that the step is that of least squares to the detections around the features, with weights C_i: it
+gets there at once from any distance, and a feature that meets none does not hold the others back.
+Where features overlap it is Gauss-Newton's of the residual g − a h,
+2 a² (⟨∂h, ∂hᵀ⟩ − ⟨h, ∂h⟩⟨h, ∂hᵀ⟩ / n).
 """
 
 from __future__ import annotations
@@ -28,8 +26,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.density import DRAWING, Atlas, all_pairs, close_pairs, matched_atlas, peak
-from mixpose.objective.base import View
-from mixpose.objective.projection import BodyProjection, Match, project_body
+from mixpose.objective.projection import BodyProjection, Match, View, project_body
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Indices
 
@@ -38,10 +35,7 @@ STEPS_PER_SIGMA, FINE_STEPS = DRAWING.steps_per_sigma, DRAWING.fine_steps
 
 
 def value_error(steps_per_sigma: float) -> float:
-    """Relative error of values, squares of what is looked up.
-
-    Of a height, looking it up errs by √3/216 n⁻³ of the third derivative along each of two axes.
-    """
+    """Relative error of values, squares of heights: √3/216 n⁻³ of two third derivatives each."""
     return 4 * 0.011 / steps_per_sigma**3
 
 
@@ -53,7 +47,10 @@ def overlaps(
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
     norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
-    pairs = all_pairs(n) if n * n <= DRAWING.few_pairs else _close_pairs(y, variances)
+    if n * n <= DRAWING.few_pairs:
+        pairs = all_pairs(n)
+    else:
+        pairs = close_pairs(y.reshape(-1, n, 2), variances.repeat(y.shape[1]))
     i, j = pairs.T
     away = y[:, :, i] - y[:, :, j]
     squared = away * away
@@ -66,13 +63,6 @@ def overlaps(
     bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
     norm = np.maximum(norm + 2 * bells.sum(axis=2), _NONE)
     return norm, pairs[near], bells, away[:, :, near]
-
-
-def _close_pairs(y: Floats, variances: Floats) -> Indices:
-    """Pairs of features that may overlap at any of the poses."""
-    L, H = y.shape[:2]
-    each = [close_pairs(y[k, h], float(variances[k, 0])) for k in range(L) for h in range(H)]
-    return np.unique(np.concatenate(each), axis=0)
 
 
 def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Quadratic:
@@ -91,29 +81,26 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     gradient = (strength[..., None] * rest).sum(axis=0)
     drawn = (strength / variances)[..., None] * C
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
-    if len(match.pairs):
-        near = np.flatnonzero(match.bells.any(axis=(0, 2)))
-        some = match.of(near)
-        half, gram = _pair_terms(some, variances, tops)
-        level = (strength * amplitude)[:, near, None]
-        gradient[near] -= (level * half).sum(axis=0)
-        outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
-        curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
-    return Quadratic(value, gradient, curvature)
-
-
-def _pair_terms(match: Match, variances: Floats, tops: Floats) -> tuple[Floats, Floats]:
-    """⟨h, ∂h⟩ (L, H, 6) and ⟨∂h, ∂hᵀ⟩ (L, H, 6, 6)."""
-    v, (i, j) = variances[..., None], match.pairs.T
-    own = match.J * match.weights[..., None, None]
-    gram = _gram(own, own) * (tops / variances)[..., None, None]
-    J_i, J_j = match.J[:, :, i], match.J[:, :, j]
-    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", match.away, each) for each in (J_i, J_j))
-    scaled = match.bells / v
+    if not len(match.pairs):
+        return Quadratic(value, gradient, curvature)
+    near = np.flatnonzero(match.bells.any(axis=(0, 2)))
+    some = match.of(near)
+    i, j = some.pairs.T
+    J_i, J_j = some.J[:, :, i], some.J[:, :, j]
+    along_i, along_j = (np.einsum("lhpm,lhpmk->lhpk", some.away, each) for each in (J_i, J_j))
+    scaled = some.bells / variances[..., None]
+    # ⟨h, ∂h⟩ (L, h, 6) and ⟨∂h, ∂hᵀ⟩ (L, h, 6, 6): of each feature with itself, and of pairs
     half = -(scaled[:, :, None] @ (along_i - along_j))[:, :, 0]
+    own = some.J * some.weights[..., None, None]
+    gram = _gram(own, own) * (tops / variances)[..., None, None]
     cross = _gram(scaled[..., None, None] * J_i, J_j)
-    cross -= ((scaled / v)[..., None] * along_i).swapaxes(2, 3) @ along_j
-    return half, gram + cross + cross.swapaxes(2, 3)
+    cross -= ((scaled / variances[..., None])[..., None] * along_i).swapaxes(2, 3) @ along_j
+    gram += cross + cross.swapaxes(2, 3)
+    level = (strength * amplitude)[:, near, None]
+    gradient[near] -= (level * half).sum(axis=0)
+    outer = half[..., :, None] * half[..., None, :] / some.norm[..., None, None]
+    curvature[near] = (level[..., None] * (gram - outer)).sum(axis=0)
+    return Quadratic(value, gradient, curvature)
 
 
 def _gram(A: Floats, B: Floats) -> Floats:
@@ -191,19 +178,13 @@ class MatchedObjective:
         return [poses[k : k + rows] for k in range(0, len(poses), rows)]
 
 
-@dataclass(frozen=True, eq=False)
 class SharedDensities:
-    """C of all sensors at σ_ε, drawn once for several bodies."""
+    """C of all sensors at σ_ε, drawn once for several bodies; of views that are not empty."""
 
-    atlas: Atlas
-    totals: tuple[float, ...]  # weight of all that was drawn, per sensor
-
-    @classmethod
-    def drawn(cls, views: Sequence[View]) -> SharedDensities:
-        """Draw views of detections, none of which is empty."""
+    def __init__(self, views: Sequence[View]) -> None:
         seen = [view.observation for view in views]
-        atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
-        return cls(atlas, tuple(one.weight for one in seen))
+        self.atlas = matched_atlas(seen, [one.sigma for one in seen], STEPS_PER_SIGMA)
+        self.totals = [one.weight for one in seen]  # of all that was drawn, per sensor
 
 
 def matched_objective(
@@ -226,9 +207,9 @@ def matched_objective(
         at_last = all(o.cell is not None and sigma <= o.sigma for o, sigma in pairs)
         steps_per_sigma = FINE_STEPS if at_last else STEPS_PER_SIGMA
     projection = project_body(tuple([view.sensor for view in views]), body)
-    energies = np.array([o.energy(sigma) for o, sigma in pairs])
-    variances = np.array([2 * sigma * sigma for sigma in sigmas])
-    tops = np.array([peak(*one) for one in zip(variances.tolist(), projection.dimensions.tolist())])
+    energies = np.array([[o.energy(sigma)] for o, sigma in pairs])
+    variances = np.array([[2 * sigma * sigma] for sigma in sigmas])
+    tops = peak(variances, projection.dimensions[:, None])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
     weights = tops / energies / len(body)
@@ -236,19 +217,13 @@ def matched_objective(
         atlas = matched_atlas(observations, sigmas, steps_per_sigma)
     else:
         atlas = shared.atlas
-        parts = [o.weight / total for o, total in zip(observations, shared.totals, strict=True)]
+        parts = [[o.weight / total] for o, total in zip(observations, shared.totals, strict=True)]
         energies = energies * np.square(parts)
-    energies, weights = energies[:, None], weights[:, None]
-    rest = variances[:, None], tops[:, None], energies, weights
-    return MatchedObjective(tuple(views), projection, atlas, *rest)
+    return MatchedObjective(tuple(views), projection, atlas, variances, tops, energies, weights)
 
 
 def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
-    """The objectives of several bodies, of bare points, on the same densities and blurs.
-
-    For a handful of features NumPy spends its time on calls, not on numbers: the poses that one
-    body is evaluated at in a batch may as well be those of several bodies, one of each.
-    """
+    """The objectives of several bodies, of bare points, on the same densities and blurs."""
     bodies = [one.projection.body for one in objectives]
     projection = project_body(objectives[0].projection.sensors, *bodies)
     energies = np.concatenate([one.energies for one in objectives], axis=1)

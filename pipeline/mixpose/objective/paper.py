@@ -18,9 +18,8 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.density import DRAWING, FAR, Density, remap
-from mixpose.objective.base import Objective, View, region_of_interest
-from mixpose.objective.matched import matched_objective
-from mixpose.objective.projection import pose_jacobian
+from mixpose.objective.matched import MatchedObjective, matched_objective
+from mixpose.objective.projection import View, pose_jacobian
 from mixpose.optimise import Quadratic
 from mixpose.records import Floats, Singles
 from mixpose.rigid import transform
@@ -38,8 +37,11 @@ class SampledTerm:
     density: Density
 
 
-class _SampledObjective:
-    """Of samples z_ir (N, R, 3), displaced in the world by offsets (R, 3), as by gravity."""
+class PaperObjective:
+    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)): all sensors see the same Z.
+
+    Of samples z_ir (N, R, 3), displaced in the world by offsets (R, 3), as by gravity.
+    """
 
     def __init__(
         self, terms: Sequence[SampledTerm], samples: Floats, world_offsets: Floats | None = None
@@ -57,42 +59,6 @@ class _SampledObjective:
         poses, at_once = T_world_object.reshape(-1, 4, 4), max(1, DRAWING.held // len(self.points))
         values = [self._values(poses[k : k + at_once]) for k in range(0, len(poses), at_once)]
         return np.concatenate(values or [np.zeros(0)]).reshape(T_world_object.shape[:-2])
-
-    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
-        """What is multiplied over sensors, (k, S) or (k, 1) each, of densities (k, S)."""
-        return densities
-
-    def _values(self, poses: Floats) -> Floats:
-        """Values (k,) at poses (k, 4, 4)."""
-        product, *others = self._parts(self._densities(poses))
-        for part in others:
-            product *= part
-        return _means(product)
-
-    @cached_property
-    def _alone(self) -> list[Density]:
-        """The densities without gradients, which values do not need."""
-        drawn = [term.density for term in self.terms]
-        first = [np.ascontiguousarray(np.atleast_3d(one.values)[..., 0]) for one in drawn]
-        return [replace(one, values=values) for one, values in zip(drawn, first, strict=True)]
-
-    @cached_property
-    def _maps(self) -> _AffineMaps | None:
-        """Where no sensor has perspective."""
-        if not all(isinstance(term.sensor, AffineSensor) for term in self.terms):
-            return None
-        return _AffineMaps(self.terms, self.points, self.offsets)
-
-    def _densities(self, poses: Floats) -> list[Singles]:
-        """g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
-        if self._maps is not None:
-            maps = self._maps.at(poses).swapaxes(0, 1)
-            pairs = zip(self._alone, maps[::2], maps[1::2], strict=True)
-            return [remap(g.values, u, v) for g, u, v in pairs]
-        with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            points = transform(poses, self.points) + self.offsets
-            places = [term.sensor.project(points)[0] for term in self.terms]
-            return [g.sample(y) for g, y in zip(self._alone, places, strict=True)]
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Values, gradients and mean-shift curvatures at poses (H, 4, 4)."""
@@ -117,12 +83,42 @@ class _SampledObjective:
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
         return float((others * g[:, 0]).mean()), gradient, curvature
 
+    def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
+        """What is multiplied over sensors, (k, S) or (k, 1) each, of densities (k, S)."""
+        return densities
 
-class PaperObjective(_SampledObjective):
-    """Formula (4), (1/NR) Σ_i Σ_r Π_l g_l(p(z_ir; β, γ_l)): all sensors see the same Z."""
+    def _values(self, poses: Floats) -> Floats:
+        """Values (k,) at poses (k, 4, 4)."""
+        product, *others = self._parts(self._densities(poses))
+        for part in others:
+            product *= part
+        return _means(product)
+
+    def _densities(self, poses: Floats) -> list[Singles]:
+        """g_l of samples (k, S), per sensor, at poses (k, 4, 4)."""
+        if self._maps is not None:
+            maps = self._maps.at(poses).swapaxes(0, 1)
+            return [remap(g.values, *maps[2 * k : 2 * k + 2]) for k, g in enumerate(self._alone)]
+        with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
+            points = transform(poses, self.points) + self.offsets
+            places = [term.sensor.project(points)[0] for term in self.terms]
+            return [g.sample(y) for g, y in zip(self._alone, places, strict=True)]
+
+    @cached_property
+    def _alone(self) -> list[Density]:
+        """The densities without gradients, which values do not need."""
+        drawn = [term.density for term in self.terms]
+        first = [np.ascontiguousarray(np.atleast_3d(one.values)[..., 0]) for one in drawn]
+        return [replace(one, values=values) for one, values in zip(drawn, first, strict=True)]
+
+    @cached_property
+    def _maps(self) -> _AffineMaps | None:
+        """Where no sensor has perspective."""
+        is_affine = all(isinstance(term.sensor, AffineSensor) for term in self.terms)
+        return _AffineMaps(self.terms, self.points, self.offsets) if is_affine else None
 
 
-class IndependentObjective(_SampledObjective):
+class IndependentObjective(PaperObjective):
     """Π_l (1/NR) Σ_i Σ_r g_l(p(z_ir; β, γ_l)): sensors as if they saw different objects."""
 
     def _parts(self, densities: Sequence[Floats | Singles]) -> Sequence[Floats | Singles]:
@@ -131,6 +127,8 @@ class IndependentObjective(_SampledObjective):
 
 def _means(g: Floats | Singles) -> Floats:
     """Means (k,) over the samples (k, S) of k poses, summed in double precision."""
+    if len(g) == 1:  # in a third of the time
+        return np.array([cv2.sumElems(g)[0] / g.size])
     return np.asarray(cv2.reduce(g, 1, cv2.REDUCE_SUM, dtype=cv2.CV_64F).ravel() / g.shape[1])
 
 
@@ -178,14 +176,25 @@ class _AffineMaps:
 
         `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
         """
-        rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
+        rows = poses.reshape(-1, 16).dot(self._by_pose)
+        if cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+            return self._indices(rows)
+        lower, upper = self._limits
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
-            maps = single.dot(self._samples).reshape(len(rows), -1, count)
-            if not cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
-                lower, upper = self._limits
-                maps[~((maps >= lower) & (maps <= upper))] = FAR
-        return np.asarray(maps)
+            maps = self._indices(rows)
+            maps[~((maps >= lower) & (maps <= upper))] = FAR
+        return maps
+
+    def _indices(self, rows: Floats) -> Singles:
+        c, count = self._samples.shape
+        single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
+        return np.asarray(single.dot(self._samples).reshape(len(rows), -1, count))
+
+
+def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
+    """Box (lower, upper) with a margin around visible points (n, m), within the sensor."""
+    lower, upper = y.min(axis=0) - margin, y.max(axis=0) + margin
+    return np.maximum(lower, sensor.lower), np.minimum(upper, sensor.upper)
 
 
 def sampled_terms(
@@ -214,7 +223,7 @@ def build_objective(
     samples: Floats,  # (N, R, 3) of the body; the matched objective does not use them
     sigmas: Sequence[float],  # of a feature at this level, per view, in sensor units
     near: Floats,  # (4, 4) pose around whose projection sampled densities are made
-) -> Objective:
+) -> MatchedObjective | PaperObjective:
     """Build an objective of the pose at one level of blur."""
     if name == "matched":
         return matched_objective(views, body, sigmas)

@@ -3,26 +3,42 @@
 Arrays have the sensors first, then the poses: places y (L, H, n, 2), Jacobians J (L, H, n, 2, 6).
 Sensors of one coordinate have 0 as their second.
 
-The image of a sphere or of an oblique disk is an ellipse, and with a lens nearly one, whose centre
-is not where the marker's own centre is seen.  What a sensor sees of a sphere is the disk within the
-circle at which lines of sight touch it.  So both are disks, of which the centroid of the image is
+The image of a sphere or of an oblique disk is nearly an ellipse, whose centre is not where the
+marker's own centre is seen.  What a sensor sees of a sphere is the disk within the circle at which
+lines of sight touch it.  So both are disks, of which the centroid of the image is
 ∫ y(x) |det ∂y| dx / ∫ |det ∂y| dx over the disk.  Four points at 1/√2 of the radius integrate
-polynomials of third degree; what is left is of the fourth order of the marker's size over its
-distance.
+polynomials of third degree; left is the fourth order of the marker's size over its distance.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.density import Observation
 from mixpose.records import Floats, Indices, Mask
 from mixpose.sensors import OUTSIDE, Sensor, facing, side_by_side
 
 _NOTHING = np.array([])
+
+
+@dataclass(frozen=True)
+class View:
+    """One sensor with what it observed; times in seconds."""
+
+    name: str
+    sensor: Sensor
+    observation: Observation
+    delay: float = 0.0  # by which the sensor's frame was taken later than the common time
+    readout: float = 0.0  # from the first row to the last; the time is that of the middle row
+    unsure: float | None = None  # deviation of a delay that is estimated; None where it is told
+    estimated: float = 0.0  # of the delay, what was estimated
+    # where its calibration is not exact: the sensor as it stands still, and as it might be
+    doubts: tuple[Sensor, ...] = ()
 
 
 class Match(NamedTuple):
@@ -61,13 +77,11 @@ class BodyProjection:
         self.sensors, self.bodies = sensors, bodies
         self.body = body = max(bodies, key=lambda body: len(body.nodes.points))
         self.dimensions = np.array([sensor.dimension for sensor in sensors])  # (L,)
-        self._points, self._weights = body.nodes.points, body.nodes.weights
-        if len(bodies) > 1:
-            shape = len(bodies), len(self._points)
-            self._points, self._weights = np.zeros((*shape, 3)), np.zeros(shape)
-            for points, weights, one in zip(self._points, self._weights, bodies):
-                nodes, n = one.nodes, len(one.nodes.points)
-                points[:], points[:n], weights[:n] = nodes.points[0], nodes.points, nodes.weights
+        shape = len(bodies), len(body.nodes.points)
+        self._points, self._weights = np.zeros((*shape, 3)), np.zeros(shape)
+        for points, weights, one in zip(self._points, self._weights, bodies):
+            nodes, n = one.nodes, len(one.nodes.points)
+            points[:], points[:n], weights[:n] = nodes.points[0], nodes.points, nodes.weights
         self._normals, self._radii = body.node_normals, body.node_radii
         self._batch = side_by_side(sensors)
 
@@ -95,7 +109,7 @@ class BodyProjection:
         normals = self._normals if self.body.shape == "disk" else None
         if normals is not None:
             turned = _across(normals)[:, None] @ poses[:, :3, :3].swapaxes(1, 2)
-            middle, axes = world, turned.reshape(2, count, 3)
+            middle, axes = world[None], turned.reshape(2, 1, count, 3)
         else:
             towards = np.array([sensor.towards(world) for sensor in self.sensors])
             squared = np.einsum("lni,lni->ln", towards, towards)[..., None]
@@ -104,11 +118,8 @@ class BodyProjection:
             radii = radii * np.sqrt(1 - share)
             axes = _across(towards / np.sqrt(squared))
         steps = np.sqrt(0.5) * radii * axes  # where the four points are
-        signs = np.array([1, -1, 1, -1]).reshape(4, *[1] * middle.ndim)
-        nodes = (middle + signs * steps[[0, 0, 1, 1]]).swapaxes(0, -3).reshape(-1, 4 * count, 3)
-        if normals is not None:
-            nodes, axes = nodes[0], axes[:, None]
-        y, J, seen = self._batch.linearise(nodes)
+        nodes = middle + np.concatenate([steps[:1], -steps[:1], steps[1:], -steps[1:]])
+        y, J, seen = self._batch.linearise(nodes.swapaxes(0, 1).reshape(-1, 4 * count, 3))
         y, J = y.reshape(L, 4, count, 2), J.reshape(L, 4, count, 2, 3)
         a, b = (np.einsum("lknij,lnj->lkni", J, axis) for axis in axes + np.zeros((1, L, 1, 1)))
         weights = np.abs(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -75,7 +75,6 @@ class NewtonOptions:
     least_curvature: float = constant(
         0.3, "of the curvature: where a Hessian is flatter, its step would lead too far"
     )
-    held_back: float = constant(1e-2, "damping after a step that led astray, at least")
 
 
 class Ascent(NamedTuple):
@@ -108,10 +107,8 @@ def ascend(
         if not going:
             break
         asked = everything if options.together else going
-        if len(asked) == len(everything):
-            tried = move(climb.states, climb.steps)
-        else:
-            tried = move(climb.states[asked], climb.steps[asked])
+        some = slice(None) if asked == everything else asked
+        tried = move(climb.states[some], climb.steps[some])
         going = climb.take(tried, term.linearise(tried), asked, going, iteration + 1)
     return climb.ended(move)
 
@@ -121,10 +118,9 @@ class _Climb:
 
     def __init__(self, states: Any, here: Quadratic, free: Mask, options: NewtonOptions) -> None:
         count = len(here.value)
-        self.states, self._here, self._options = states, here, options
-        self._free = None if free.all() else np.flatnonzero(free)
+        self.states, self._here, self._options, self._free = states, here, options, free
         self._damping = [options.damping] * count
-        self.steps, self.gains = _steps(here, self._free, self._damping, options)
+        self.steps, self.gains = _steps(here, free, self._damping, options)
         self._before = [0.0] * count  # gains of the steps before these
         self._converged = [False] * count
         self._iterations = [options.iterations] * count
@@ -165,7 +161,7 @@ class _Climb:
             if is_better or options.unchecked:
                 self._before[k], self._damping[k], chosen[k] = gain, damping[row], count + row
             else:
-                self._damping[k] = max(10 * self._damping[k], options.held_back)
+                self._damping[k] = max(10 * self._damping[k], 100 * options.damping)
             if self._damping[k] <= 1 / _NO_DAMPING:
                 left.append(k)
             else:
@@ -173,71 +169,54 @@ class _Climb:
         if min(chosen) == count:
             self.states, self._here, self.steps, self.gains = tried, there, steps, gains
             return left
-        if max(chosen) >= count:
-            self.states = np.concatenate([self.states, tried])[chosen]
-            pairs = zip(self._here, there, strict=True)
-            both = [None if b is None else np.concatenate([a, b]) for a, b in pairs]
-            self._here = Quadratic._make(both).of(chosen)
+        self.states = np.concatenate([self.states, tried])[chosen]
+        pairs = zip(self._here, there, strict=True)
+        both = [None if b is None else np.concatenate([a, b]) for a, b in pairs]
+        self._here = Quadratic._make(both).of(chosen)
         self.steps, self.gains = _steps(self._here, self._free, self._damping, options)
         return left
 
     def ended(self, move: Callable[[Any, Floats], Any]) -> Ascent:
         """Where all states are, once the last steps are taken."""
-        states, values = self.states, self._here.value
-        if any(self._is_taken):
-            taken = np.array(self._is_taken)
-            values = values + taken * self.gains
-            moved = move(states, self.steps)
-            rows = np.arange(len(taken)) + len(taken) * taken
-            states = moved if all(self._is_taken) else np.concatenate([states, moved])[rows]
+        taken = np.array(self._is_taken)
+        values = self._here.value + taken * self.gains
+        states = move(self.states, taken[:, None] * self.steps)
         ends = np.array(self._converged), np.array(self._iterations)
         return Ascent(states, values, *ends, self._here)
 
 
 def _steps(
-    here: Quadratic, free: Indices | None, damping: list[float], options: NewtonOptions
+    here: Quadratic, free: Mask, damping: list[float], options: NewtonOptions
 ) -> tuple[Floats, list[float]]:
     """Damped Newton steps (H, q), and the gains that the models expect of them."""
-    C, g, hessian = here.curvature, here.gradient, here.hessian
-    if free is not None:
-        C, g = C[:, free[:, None], free], g[:, free]
-        hessian = None if hessian is None else hessian[:, free[:, None], free]
-    if hessian is not None:
-        rest = hessian - options.least_curvature * C
-        definite = [len(one) > 0 and dpotrf(one)[1] == 0 for one in rest]
+    both = free & free[:, None]
+    C, g = here.curvature * both, here.gradient * free
+    if here.hessian is not None:
+        hessian = here.hessian * both
+        rest = hessian - options.least_curvature * C + np.diag(~free)
+        definite = [dpotrf(one)[1] == 0 for one in rest]
         C = np.where(np.array(definite)[:, None, None], hessian, C)
-    if len(g) == 1:
-        steps, gains = _step(C[0], g[0], damping[0])
-    else:
-        steps, gains = _many_steps(C, g, np.array(damping)[:, None])
-    if free is None:
-        return steps, gains
-    widened = np.zeros(here.gradient.shape)
-    widened[:, free] = steps
-    return widened, gains
+    return _many_steps(C, g, damping) if len(g) > 1 else _step(C[0], g[0], damping[0])
 
 
 def _step(C: Floats, g: Floats, damping: float) -> tuple[Floats, list[float]]:
     """The step (1, q) of one state, and its gain: a quarter of the time of `_many_steps`."""
     diagonal = C.diagonal()
     # a direction without curvature must not make the system singular
-    floor = _TINY + max(diagonal.tolist(), default=0.0) * 1e-12 * damping
+    floor = _TINY + max(diagonal.tolist()) * 1e-12 * damping
     A = C.copy()
     A.reshape(-1)[:: len(g) + 1] += (damping + 1e-12) * diagonal + floor
-    step = g
-    if len(g):
-        _, step, failure = dposv(A, g)
-        step = np.asarray(np.linalg.solve(A, g), np.float64) if failure else step
+    _, step, failure = dposv(A, g)
+    if failure:
+        step = np.linalg.solve(A, g)
     return step[None], [float(step @ (g - 0.5 * (C @ step)))]
 
 
-def _many_steps(C: Floats, g: Floats, damping: Floats) -> tuple[Floats, list[float]]:
+def _many_steps(C: Floats, g: Floats, damping: list[float]) -> tuple[Floats, list[float]]:
     """The steps (H, q) of H states, and their gains."""
-    diagonal = np.einsum("hqq->hq", C)
-    top = diagonal.max(axis=1, initial=0.0)
-    floor = top[:, None] * 1e-12 * damping + _TINY
-    A = C + ((damping + 1e-12) * diagonal + floor)[:, None] * np.eye(g.shape[1])
-    steps = np.linalg.solve(A, g[..., None])[..., 0]
-    steps[top <= 0] = 0.0
+    diagonal, share = np.einsum("hqq->hq", C), np.array(damping)[:, None]
+    top = diagonal.max(axis=1)[:, None]
+    A = C + ((share + 1e-12) * diagonal + top * 1e-12 * share + _TINY)[:, None] * np.eye(len(g[0]))
+    steps = np.where(top > 0, np.linalg.solve(A, g[..., None])[..., 0], 0.0)
     gains = (steps * (g - 0.5 * (C @ steps[..., None])[..., 0])).sum(axis=1)
     return steps, gains.tolist()

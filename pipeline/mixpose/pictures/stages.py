@@ -12,8 +12,7 @@ from mixpose.body import Body
 from mixpose.extraction.corners import CornerRules, saddle_strength
 from mixpose.extraction.laplacian import spot_strength
 from mixpose.extraction.threshold import above, feature_values, foreground
-from mixpose.objective import View
-from mixpose.objective.base import region_of_interest
+from mixpose.objective import View, region_of_interest
 from mixpose.pictures.canvas import (
     WHITE,
     Colour,

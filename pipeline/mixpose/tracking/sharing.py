@@ -233,7 +233,7 @@ class Sharing:
         """The densities of all that is seen; None of nothing, or without single detections."""
         seen = [view for view in self.views if not view.observation.is_empty]
         are_single = all(view.observation.points is not None for view in seen)
-        return SharedDensities.drawn(seen) if seen and are_single else None
+        return SharedDensities(seen) if seen and are_single else None
 
     def _is_possible(self, k: int) -> bool:
         """Whether the best pose of a body is worth telling."""

@@ -1,7 +1,4 @@
-"""Densities on grids: blur and normalisation, g = g0 * ε, and how to look values up.
-
-A density is float32 values plus the affine map from sensor coordinates to array indices,
-``index = (y - origin) / step``; a range profile is one row high.  Outside the array it is 0.
+"""Blur and normalisation of feature patterns, g = g0 * ε, and how finely densities are drawn.
 
 A Gaussian blur is separable.  At the crossings of columns u and rows v it is a product of three
 matrices: Gaussians along v, the pattern (diagonal for detections), Gaussians along u.  Nothing is
@@ -10,83 +7,61 @@ interpolated, and no filter is cut off but where a Gaussian has vanished.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import cv2
 import numpy as np
 
-from mixpose.density.rules import DRAWING
+from mixpose.constants import constant
 from mixpose.records import Floats, GridPattern, Pattern, PointPattern, Singles
 
-FAR = DRAWING.far
-
 
 @dataclass(frozen=True)
-class Window:
-    """A grid in sensor coordinates."""
+class DrawingRules:
+    """Lengths are in standard deviations of a feature, and in cells of an array."""
 
-    origin: Floats  # (m,) sensor coordinates of the first grid point
-    shape: tuple[int, int]  # rows and columns; one row for ranges
-    step: float  # sensor units between grid points
+    steps_per_sigma: float = constant(
+        4.0, "cells per standard deviation: places are 4e-4 off, less than centres of blobs err by"
+    )
+    fine_steps: float = constant(
+        48.0, "the same at σ_ε for grey values, which have no detection noise: places are 2e-7 off"
+    )
+    reach: float = constant(
+        4.25,
+        "from a detection to where it is drawn: what is farther draws it by less than 1e-3 σ_ε",
+    )
+    paper_reach: float = constant(4.0, "from predicted samples to the end of their window")
+    cut: float = constant(5.0, "at which sums end: the tail holds 6e-7")
+    negligible: float = constant(16.0, "exponent at which two features do not overlap: 1e-7")
+    tile: int = constant(
+        24,
+        "cells along the part of a tile that is looked up, at least: half of its six standard "
+        "deviations is as far as a fit moves; larger ones are drawn for little use",
+    )
+    own_tiles: int = constant(
+        1200, "places that have tiles of their own: fits take two thirds of the time on pages"
+    )
+    window_cells: int = constant(1_500_000, "of a dense window; a larger one gets coarser")
+    side: int = constant(32000, "of an array and of maps: cv2.remap takes less than 32767")
+    few_pairs: int = constant(
+        64**2, "of points, or of tiles and detections: all at once are faster than neighbours"
+    )
+    held: int = constant(
+        2**18,
+        "samples, pairs of features, cells of tiles that are drawn together, or pages of a plane "
+        "that are held at once; farther detections are left out, pages of grey values are larger",
+    )
 
-    @classmethod
-    def around(cls, lower: Floats, upper: Floats, step: float) -> Window:
-        """The smallest grid that covers the box from `lower` to `upper`, both (m,)."""
-        count = np.maximum(np.ceil((upper - lower) / step - 1e-9).astype(int) + 1, 2)
-        rows = int(count[1]) if len(count) == 2 else 1
-        return cls(np.asarray(lower, dtype=np.float64), (rows, int(count[0])), float(step))
-
-    def axis(self, k: int) -> Floats:
-        """Sensor coordinates of the grid along axis k (0 is u or the range, 1 is v)."""
-        return np.asarray(self.origin[k] + self.step * np.arange(self.shape[1 - k]))
-
-
-@dataclass(frozen=True)
-class Density:
-    """A probability density over sensor coordinates, sampled on a window."""
-
-    # (H, W) in 1/unit^m, or (H, W, 3) with its gradient; for ranges the last channel is empty
-    values: Singles
-    window: Window
-    sigma: float  # standard deviation, in sensor units, that one exact feature has in it
-
-    @property
-    def dimension(self) -> int:
-        """m, the number of sensor coordinates."""
-        return len(self.window.origin)
-
-    def sample(self, y: Floats) -> Singles:
-        """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
-
-        Without the last axis for a single channel.
-        """
-        m = self.dimension
-        index = (y.reshape(-1, m) - self.window.origin) / self.window.step
-        np.nan_to_num(index, copy=False, nan=FAR)
-        np.clip(index, FAR, -FAR, out=index)
-        u = index[None, :, 0].astype(np.float32)
-        v = index[None, :, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
-        looked_up = remap(self.values, u, v).reshape(*y.shape[:-1], *self.values.shape[2:])
-        return np.asarray(looked_up if self.values.ndim == 2 else looked_up[..., : 1 + m])
+    @cached_property
+    def widest(self) -> float:
+        """Extent of features over the narrowest blur that the pages of a plane hold."""
+        return math.sqrt(2 * self.held) * self.tile / self.steps_per_sigma
 
 
-def merge(layers: list[Singles]) -> Singles:
-    """Stack layers (H, W) as channels (H, W, C), padded to a number that is looked up exactly."""
-    while len(layers) > 1 and len(layers) not in DRAWING.exact_channels:
-        layers = [*layers, np.zeros_like(layers[0])]
-    merged = np.asarray(cv2.merge(layers), dtype=np.float32)
-    return merged.reshape(*layers[0].shape, len(layers))
-
-
-def remap(values: Singles, u: Singles, v: Singles) -> Any:
-    """Sample an array bilinearly at indices (...) along columns and rows: (..., C); 0 outside."""
-    if u.ndim == 2 and u.size and max(u.shape) <= DRAWING.side:
-        return cv2.remap(values, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    count, channels, width = u.size, values.shape[2:], min(max(u.size, 1), DRAWING.side)
-    padding = -count % width if count else 1
-    maps = [np.pad(one.ravel(), (0, padding)).reshape(-1, width) for one in (u, v)]
-    return remap(values, *maps).reshape(-1, *channels)[:count].reshape(*u.shape, *channels)
+DRAWING = DrawingRules()
+FAR = -32.0 * DRAWING.side  # outside any array, and cv2.remap can tell 32 parts of it as integers
 
 
 def blurred(
@@ -94,8 +69,8 @@ def blurred(
 ) -> list[Singles]:
     """The density (V, U) of a pattern, and where wanted its derivatives by u and v.
 
-    At columns u (U,) and rows v (V,), which ranges do not use.  Of a pattern that is not empty,
-    blurred by `sigma` in sensor units, positive for detections, and normalised by its mass `total`.
+    At columns u (U,) and rows v (V,), which ranges do not use; blurred by `sigma` in sensor units,
+    positive for detections, and normalised by the mass `total` of the pattern.
     """
     m = pattern.dimension
     if isinstance(pattern, PointPattern):
@@ -182,19 +157,6 @@ def odd_factor(ratio: float) -> int:
     """Largest odd whole number up to a ratio, at least 1: odd boxes have a central pixel."""
     whole = max(int(ratio + 1e-9), 1)
     return whole if whole % 2 else whole - 1
-
-
-def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = False) -> Density:
-    """Blur a pattern g0 by `sigma`, in sensor units, and normalise it as a whole, on a window."""
-    if is_empty(pattern):
-        shape = (*window.shape, 3) if gradient else window.shape
-        return Density(np.zeros(shape, dtype=np.float32), window, sigma)
-    left = sigma
-    if isinstance(pattern, GridPattern):
-        pattern, left = reduced(pattern, sigma)
-    u, v = window.axis(0), window.axis(pattern.dimension - 1)
-    layers = blurred(pattern, left, u, v, mass(pattern), gradient=gradient)
-    return Density(merge(layers) if gradient else layers[0], window, sigma)
 
 
 def is_empty(pattern: Pattern) -> bool:

@@ -1,8 +1,8 @@
-"""The log-likelihood of grey values and profiles whose features are not equally bright.
+"""Terms beside the matched objective: what is known of a pose before, and unlike brightness.
 
 With one amplitude for all features, two that overlap pull each other aside where the one is
-brighter.  Here each feature i of a sensor has an amplitude of its own, α_i, about their mean.  With
-b_i = ⟨g, h_i⟩ = w_i C(p_i) and B_ij = ⟨h_i, h_j⟩,
+brighter.  Here each feature i of a sensor has its amplitude α_i.  With b_i = ⟨g, h_i⟩ = w_i C(p_i)
+and B_ij = ⟨h_i, h_j⟩,
 
     Q = max_α 2 αᵀb − αᵀBα − λ |α − mean α|²,     α = (B + λP)⁻¹ b,
 
@@ -20,7 +20,32 @@ import numpy as np
 
 from mixpose.objective.matched import MatchedObjective
 from mixpose.optimise import Quadratic
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
+from mixpose.rigid import perturb, twist_between
+
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """Logarithm of a normal distribution of the pose, without its constant."""
+
+    T_world_object: Floats  # (4, 4) its mean
+    uncertainty: Floats  # (6,) standard deviations, lengths and radians; positive where free
+    free: Mask  # (6,) directions in which the pose may change
+
+    def linearise(self, poses: Floats) -> Quadratic:
+        """Second-order models at poses (H, 4, 4)."""
+        information = np.where(self.free, 1 / np.maximum(self.uncertainty, 1e-12) ** 2, 0.0)
+        away = twist_between(self.T_world_object, poses)
+        pull = -information * away
+        C = np.broadcast_to(np.diag(information), (len(poses), 6, 6))
+        return Quadratic(0.5 * (away * pull).sum(axis=1), pull, C, C)
+
+    def points(self) -> Floats:
+        """The mean, and √k standard deviations to either side along each of k directions."""
+        count = int(self.free.sum())
+        steps = np.sqrt(count) * np.diag(np.where(self.free, self.uncertainty, 0.0))[self.free]
+        twists = np.concatenate([np.zeros((1, 6)), np.stack([steps, -steps], 1).reshape(-1, 6)])
+        return perturb(self.T_world_object, twists)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +76,7 @@ class AmplitudesObjective:
             gram = gram.swapaxes(1, 2).reshape(n * m, n * m)
             cross = -((alpha * B / v)[..., None] * away).swapaxes(1, 2)
             mixed = cross.reshape(n * m, n).T @ J
-            solved = np.linalg.solve(inner, mixed)
-            curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ solved)
+            curvature += 2 * scale * (J.T @ gram @ J - mixed.T @ np.linalg.solve(inner, mixed))
         return value, gradient, curvature
 
     def unexplained(self, T_world_object: Floats) -> Floats:
@@ -77,5 +101,5 @@ class AmplitudesObjective:
             squares = max((self.spread * common) ** 2, 1e-300)
             strength = min(float(self.noise[k]) / squares, 1e18 * least) + least
             inner = B + strength * (np.eye(len(w)) - 1 / max(len(w), 1)) + least * np.eye(len(w))
-            alpha = np.linalg.solve(inner, C[:, 0])
-            yield alpha, B, inner, C, away, match.J[k, 0, seen, :m].reshape(-1, 6)
+            alpha, J = np.linalg.solve(inner, C[:, 0]), match.J[k, 0, seen, :m].reshape(-1, 6)
+            yield alpha, B, inner, C, away, J
