@@ -100,8 +100,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/refinements.py",
-        "return [] if at is judged else",
-        "return [] if at is not judged else",
+        "return [] if T is judged.T_world_object else",
+        "return [] if T is not judged.T_world_object else",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
     ),
