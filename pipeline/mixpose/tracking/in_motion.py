@@ -16,7 +16,7 @@ import numpy as np
 
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverses, nearest_alike
-from mixpose.matching import ErrorRules, Matches, associate, errors_seen
+from mixpose.matching import ErrorRules, Matches, associate, errors_seen, welsch
 from mixpose.objective import View
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
@@ -140,11 +140,11 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
     late = _seconds(views, matches.places, seen)
     if expected is not None:
         errors, known = frame.rules.judgement.noise.errors, frame.noise[:, chosen]
-        noise = errors_seen(matches, int(frame.free.sum()), known, errors).blurs
+        _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
         unsure = _unsure_by(matches.J, late, seen, views, expected)
         blurs = np.minimum(np.hypot(noise, errors.blur * unsure), 1.0)
-    pull = np.sqrt(matches.shares * np.exp(-0.25 * matches.squared / blurs[:, None] ** 2))
+    pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
     kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
     numbers = np.arange(len(views))[:, None, None]
     return Offsets(
