@@ -118,7 +118,7 @@ SWITCHES = (
     Switch("noise: no outdone", ruled("judgement.noise", known=NEVER)),
     Switch("noise: no typical", ruled("judgement.noise.errors", typical_degrees=1e-3)),
     Switch("noise: no offsets before they are seen", ruled("judgement.noise", lasting=0.0)),
-    Switch("noise: nothing lasts", ruled("judgement.noise.bias", deviation=0.0)),
+    Switch("noise: nothing lasts", ruled("judgement.noise", bias=0.0)),
     Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
     Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
     Switch("late sensors taken as in time", at_one_moment),

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.fit.options import FitRules
 from mixpose.objective import (
     AmplitudesObjective,
     BodyProjection,
@@ -44,6 +44,18 @@ from mixpose.sensors import Sensor
 NATS = 1e-6
 """Gains of log-likelihood that do not matter: 0.001 standard deviations; and shares of the energy:
 a part in a thousand of heights, which drawing may be off by."""
+
+
+@dataclass(frozen=True)
+class MisfitRules:
+    """When a body does not fit, or its features are not alike."""
+
+    believed: float = constant(
+        0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
+    )
+    unlike: float = constant(
+        0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
+    )
 
 
 @dataclass(frozen=True)
@@ -107,7 +119,7 @@ def believed(
     objective: MatchedObjective,
     T_world_object: Floats,
     prior: NormalPrior,
-    rules: FitRules = FitRules(),
+    rules: MisfitRules = MisfitRules(),
 ) -> tuple[Floats, bool]:
     """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
 
@@ -139,7 +151,7 @@ def with_amplitudes(
     objective: MatchedObjective,
     T_world_object: Floats,
     prior: NormalPrior,
-    rules: FitRules,
+    rules: MisfitRules,
     misfit: float = 1.0,
 ) -> tuple[Floats, Floats]:
     """The most probable pose near that of equally bright features, and the noise (L,) of cells."""
@@ -209,7 +221,10 @@ class SensorDensity:
 
 
 def misfit(
-    densities: Sequence[SensorDensity], points: Floats, unknowns: int, rules: FitRules = FitRules()
+    densities: Sequence[SensorDensity],
+    points: Floats,
+    unknowns: int,
+    rules: MisfitRules = MisfitRules(),
 ) -> float:
     """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
 

@@ -139,6 +139,7 @@ class Matches:
 _BY_SENSOR = ("names", "dimensions", "sigmas")
 _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SENSOR])
 
+
 @dataclass(frozen=True)
 class ErrorRules:
     """What is believed of the extraction's error before offsets are seen."""

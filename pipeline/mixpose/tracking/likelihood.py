@@ -56,7 +56,7 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
         uncertainty = start.uncertainty
         if uncertainty is None:
-            return Fit(start.T_world_object, 0.0, True, 0, matches=start.matches)
+            return Fit(start.T_world_object, matches=start.matches)
         frame, known = self.frame.without(start.left_out), self.frame.begun
         if known is not None and known.fit and start.prediction is frame.predictions[0]:
             return known.fit
