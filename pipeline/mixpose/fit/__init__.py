@@ -3,10 +3,10 @@
 from mixpose.fit.near import (
     EstimatorOptions as EstimatorOptions,
     Fit as Fit,
-    FitRules as FitRules,
     SearchName as SearchName,
     blur_schedule as blur_schedule,
     fit_near as fit_near,
     fit_together as fit_together,
     free_mask as free_mask,
 )
+from mixpose.fit.probable import FitRules as FitRules

@@ -17,8 +17,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.constants import constant
-from mixpose.fit.probable import MisfitRules, believed, has_likelihood
+from mixpose.fit.probable import FitRules, believed
 from mixpose.matching import (
     AssociationRules,
     ErrorRules,
@@ -75,29 +74,6 @@ def _mask(free: tuple[str, ...]) -> Mask:
     mask = np.array([name in free for name in TWIST_NAMES])
     mask.flags.writeable = False
     return mask
-
-
-@dataclass(frozen=True)
-class FitRules(MisfitRules):
-    """How a fit begins and ends, and when a body does not fit."""
-
-    ratio: float = constant(
-        1.8, "blur from level to level: below 2, a peak lies in the basin of the next level's"
-    )
-    widest: float = constant(
-        0.1, "of the observed extent: with wider blurs everything is one blob (design study)"
-    )
-    near: float = constant(
-        0.1,
-        "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
-        "on average; below, it descends through the blurs",
-    )
-    narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
-    moved: float = constant(
-        0.5,
-        "standard deviations by which narrower blurs have to move the pose: where all offsets are "
-        "normal they do so, too, as they are 5 % less efficient in six directions",
-    )
 
 
 @dataclass(frozen=True)
@@ -167,7 +143,7 @@ def fit_near(
     begun: Ascent | None = None,  # from the start, on that, where it is at hand
     climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
     blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
-    noise: Floats | None = None,  # (2, L) squares in σ_ε² and degrees of freedom before; None: 0
+    noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
     errors: ErrorRules = ErrorRules(),
     association: AssociationRules = AssociationRules(),
@@ -190,27 +166,22 @@ def fit_near(
     if options.objective != "matched":
         return Fit.of(descended(None, FINE), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
-    if has_likelihood(views):
+    if all(view.observation.cell is not None for view in views):  # whose noise is that of cells
         fit = Fit.of(descended(finest, FINE), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
         return replace(fit, T_world_object=T, freed=is_freed)
     level = [blur * sigma for sigma in sigmas]
     first = finest if blur == 1 else matched_objective(views, body, level)
-    if begun is None:
-        here = first.linearise(T_start[None])
-        is_near = blur != 1 or here.value[0] >= rules.near * len(views)
-        begun = ascend(first, T_start[None], perturb, free, SHARP, here) if is_near else None
-    ascent, known = begun or descended(first, SHARP), climbed if blur == 1 else None
-    for fit in known or ():
+    least = rules.near if blur == 1 else -np.inf
+    ascent = begun or _at_once(first, T_start, free, least) or descended(first, SHARP)
+    known = climbed if climbed is not None and blur == 1 else []
+    for fit in known:
         if fit.begins_at(ascent):
             return fit
-    before = np.zeros((2, len(views))) if noise is None else noise
-    rest = free, before, beside, errors, association, rules
-    fit = _to_the_noise(ascent, [*levels, level], blur, finest, *rest)
-    if known is not None:
-        known.append(fit)
-    return fit
+    rest = finest, free, noise, beside, errors, association, rules
+    known.append(_to_the_noise(ascent, [*levels, level], blur, *rest))
+    return known[-1]
 
 
 def fit_together(
@@ -221,8 +192,7 @@ def fit_together(
 ) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
 
-    Objectives come back with what is seen where the ascent ends; None for a body that has to
-    descend through the blurs.
+    They come back with what is seen at the end; None for a body that has to descend to σ_ε.
     """
     joint, states = together(objectives), np.array(starts)
     here = joint.linearise(states)
@@ -232,6 +202,15 @@ def fit_together(
         (objective, ends.of(slice(k, k + 1))) if is_near[k] else None
         for k, objective in enumerate(joint.seen(objectives, ends.states))
     ]
+
+
+def _at_once(
+    objective: MatchedObjective, T_start: Floats, free: Mask, least: float
+) -> Ascent | None:
+    """The ascent from a start whose value per sensor is not less than the least."""
+    here = objective.linearise(T_start[None])
+    is_near = here.value[0] >= least * len(objective.views)
+    return ascend(objective, T_start[None], perturb, free, SHARP, here) if is_near else None
 
 
 def _to_the_noise(
@@ -285,13 +264,12 @@ def _to_the_noise(
 
 
 def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:
-    """About how far narrower blurs (L,) move the pose, in squared standard deviations.
-
-    By iterated least squares, at the end of an ascent at wider ones.
-    """
+    """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])
-    for _ in range(2):  # 0.80 of the way, of 70 features 0.89; one step makes 0.62 and 0.77
+    for _ in range(
+        2
+    ):  # of least squares: 0.80 of the way, of 70 features 0.89; one step makes 0.62 and 0.77
         weights = matches.shares * welsch((offsets * offsets).sum(axis=2), narrower)
         rows = (weights / variances[:, None]).repeat(2)[:, None] * J
         information = rows.T @ J

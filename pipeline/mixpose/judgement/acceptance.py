@@ -25,50 +25,24 @@ APART = "two sensors contradict each other"
 class AcceptanceRules:
     """When a pose is believed."""
 
-    sure: float = constant(
-        7.0, "log odds against clutter from which a pose is ok: one in a thousand by chance"
-    )
-    possible: float = constant(
-        0.5, "log odds from which a pose is told: even, and a little more, as the best of many"
-    )
-    doubtful: float = constant(
-        -4.5, "the same of a pose that stands out: sure, less the share of two misses"
-    )
+    sure: float = constant(7.0, "log odds against clutter from which a pose is ok: 1 in 1000 errs")
+    possible: float = constant(0.5, "log odds to tell a pose: a little over even, as best of many")
+    doubtful: float = constant(-4.5, "log odds to tell one that stands out: sure less two misses")
     doubtful_coverage: float = constant(0.6, "share of the body that a pose must meet to stand out")
     # of frames of one camera with five features and five false detections
     spare: float = constant(
         4.0, "coordinates beyond six that it must meet: of two fewer chance makes enough, in 9 %"
     )
-    standing_out: float = constant(
-        1.5, "log odds against all other poses: 4 % without the body are told, 96 % with it"
-    )
-    enough: float = constant(
-        8.0, "features met by some sensor that are enough however many are missed: a shape"
-    )
-    rival: float = constant(
-        0.01, "belief from which another pose makes a frame ambiguous; a tenth makes a hypothesis"
-    )
-    widest_turn_deg: float = constant(
-        15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
-    )
-    convincing: float = constant(
-        0.75, "share of the body that must be met not to look elsewhere: after a slip less is met"
-    )
-    agreeing: float = constant(
-        0.5, "the same of a sensor that agrees, and of the features in view of a sure pose"
-    )
-    disagreeing: float = constant(
-        25.0, "variance over the others' of a sensor to leave out: five times their deviation"
-    )
-    same: float = constant(
-        0.02, "of the body's radius, and rad: poses nearer than this are one, unless both fit"
-    )
-    same_peak: float = constant(
-        3.0, "standard deviations of their distance within which uncertain poses are one"
-    )
-    same_peak_deg: float = constant(
-        5.0, "turn above which they are two all the same: another tilt of a small flat body"
-    )
+    standing_out: float = constant(1.5, "log odds against all others: told without the body in 4 %")
+    enough: float = constant(8.0, "features met that are enough however many are missed: a shape")
+    rival: float = constant(0.01, "belief from which a pose is a rival; from a tenth, a hypothesis")
+    widest_turn_deg: float = constant(15.0, "95 % bound on a turn that ranges may leave open")
+    convincing: float = constant(0.75, "share of the body to look nowhere else: a slip meets less")
+    agreeing: float = constant(0.5, "share that a sensor that agrees, and a sure pose, must meet")
+    disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
+    same: float = constant(0.02, "of the body's radius, and rad: nearer poses are one")
+    same_peak: float = constant(3.0, "deviations of their distance within which poses are one")
+    same_peak_deg: float = constant(5.0, "turn of two poses all the same: tilts of a flat body")
 
 
 @dataclass(frozen=True)

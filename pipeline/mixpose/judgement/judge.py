@@ -48,24 +48,12 @@ Case: TypeAlias = tuple[
 class DetectionModel:
     """How likely features are seen, and where a body may be."""
 
-    probability: float = constant(
-        0.75, "P_D that a feature in view is detected: one or two of eight are hidden as a rule"
-    )
-    log_unseen: float = constant(
-        -1.2, "for each feature that faces a sensor out of its view: ln 0.3, bodies are in view"
-    )
-    log_blind: float = constant(
-        -5.0, "at least, for all features that one sensor misses: in 1 of 150 it sees none"
-    )
-    by_count: bool = constant(
-        True, "whether features that fix a pose may pay for its freedom: cheaper by wide priors"
-    )
-    in_space: bool = constant(
-        True, "whether clutter may be a point in space that all cameras see: then it counts once"
-    )
-    room: float = constant(
-        10.0, "radii of the body: how far a position may be where nothing is known before"
-    )
+    probability: float = constant(0.75, "P_D of a feature in view: one or two of eight are hidden")
+    log_unseen: float = constant(-1.2, "per feature that faces a sensor out of its view: ln 0.3")
+    log_blind: float = constant(-5.0, "at least, for a sensor that misses all: 1 in 150 does")
+    by_count: bool = constant(True, "whether features that fix a pose may pay for its freedom")
+    in_space: bool = constant(True, "whether clutter may be a point in space, and counts once")
+    room: float = constant(10.0, "radii of the body: how far it may be where nothing is known")
 
     @property
     def log_missed(self) -> float:

@@ -40,22 +40,12 @@ class NoiseModel:
     """What is believed of detection noise before residuals are seen, and for how long."""
 
     errors: ErrorRules = ErrorRules()
-    by_chance: float = constant(
-        0.999, "frames whose residuals are larger than so many by chance stand on their own"
-    )
-    known: float = constant(
-        20.0, "degrees of freedom from which the noise of a recording is known to 16 %, √(1/2ν)"
-    )
+    by_chance: float = constant(0.999, "frames of residuals rarer than this stand on their own")
+    known: float = constant(20.0, "degrees of freedom that tell the noise to 16 %, √(1/2ν)")
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
-    confidence: float = constant(
-        0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
-    )
-    lasting: float = constant(
-        0.18, "of the noise: fields of a sensor before they are seen; half and twice do as well"
-    )
-    bias: float = constant(
-        0.25, "σ_ε: of fields that last, once some are seen: 0.4 px, a camera turned by 0.02°"
-    )
+    confidence: float = constant(0.95, "of the F distribution's ellipsoid; 0 enlarges nothing")
+    lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
+    bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
     bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:

@@ -25,18 +25,10 @@ from mixpose.sensors import by_calibration
 class AssociationRules:
     """When a feature counts as met."""
 
-    min_share: float = constant(
-        0.3, "of a feature's peak density: within 2.2 σ_ε; false features pass for true ones beyond"
-    )
-    min_region: float = constant(
-        20.0, "σ_ε over which features crowd at least: two alone make no infinite density"
-    )
-    crowded: bool = constant(
-        True, "whether clutter is as dense as detections around the body, where they are denser"
-    )
-    slip: float = constant(
-        0.25, "of the body's size, around it: where a slipped grid (steps of 1/8) has detections"
-    )
+    min_share: float = constant(0.3, "of a feature's peak: within 2.2 σ_ε; false ones pass beyond")
+    min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
+    crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
+    slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
     def reach_squared(self) -> float:
@@ -130,9 +122,8 @@ def _residuals(
 ) -> tuple[Floats, Floats]:
     """Shares and offsets by which a grid of values puts features (n, m) from their predictions.
 
-    Around a prediction that fits, C is the predicted mixture blurred alike, each feature with an
-    amplitude of its own about `amplitude`, or with that where they are not `unlike`.  What is left
-    of the gradient once all are taken off is the pull on this feature alone.
+    C is the predicted mixture blurred alike, each feature with an amplitude of its own where they
+    are `unlike`.  What is left of the gradient without all others is the pull on a feature.
     """
     n, top, away = len(y), peak(variance, y.shape[1]), y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
@@ -162,9 +153,8 @@ def _surroundings(
     detections: Floats,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Number of detections of L sensors, their density, those of no feature, and the finest blur.
-
-    All but the first go by the box of the features in view at places y (L, n, 2).
+    """Number of detections of L sensors, and around features in view at places y (L, n, 2), their
+    density, those of no feature, and the finest blur.
     """
     observations = [view.observation for view in objective.views]
     sigmas = np.array([one.sigma for one in observations])
@@ -172,8 +162,7 @@ def _surroundings(
     in_view = np.where(seen[..., None], y, np.nan)
     lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
     size, middle = upper - lower, (lower + upper) / 2
-    smallest = np.tile(rules.min_region * sigmas[:, None], 2)
-    smallest[is_flat, 1] = sigmas[is_flat]
+    smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     no_box = np.full_like(upper, np.nan)
     crowd = crowding(detections, lower, upper if rules.crowded else no_box, smallest) * sigmas**2
     count = np.count_nonzero(~np.isnan(detections[..., 0]), axis=1).astype(np.float64)
@@ -195,10 +184,8 @@ def _surroundings(
 
 
 def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | float) -> Floats:
-    """Detections (...,) per unit of coordinates, in all or in boxes where they are denser.
-
-    Of points (..., M, m), NaN where there are fewer, and boxes (..., m) around predicted features;
-    the side of a region counts as `smallest` at least.
+    """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,): of all, or
+    in boxes (..., m) where they are denser; a side counts as `smallest` at least.
     """
     number = np.count_nonzero(points[..., 0] == points[..., 0], axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)

@@ -144,25 +144,15 @@ _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SEN
 class ErrorRules:
     """What is believed of the extraction's error before offsets are seen."""
 
-    typical: float = constant(
-        0.2, "of σ_ε: centres of blobs err by 0.01-0.3 px where sigma is 1.5 px (recordings)"
-    )
+    typical: float = constant(0.2, "of σ_ε: centres of blobs err by 0.01-0.3 px, σ_ε is 1.5 px")
     typical_degrees: float = constant(
         4.0, "degrees of freedom that `typical` counts as, and all sensors for one: two features"
     )
     blur: float = constant(1.5, "of the noise: Welsch's loss is then 95 % as efficient as squares")
-    narrowest: float = constant(
-        0.05, "of σ_ε, blur of the last look: what centres of blobs err by at best (0.03 σ_ε)"
-    )
-    astray: float = constant(
-        0.1, "chance that an offset within `met` is no noise: a spot cut, merged or another's"
-    )
-    met: float = constant(
-        3.0, "σ_ε within which a detection may be a feature's: it pulls with a tenth beyond"
-    )
-    outlying: float = constant(
-        3.5, "standard deviations from which an offset is no noise: by chance 2 in 1000 are beyond"
-    )
+    narrowest: float = constant(0.05, "of σ_ε, the last blur: centres err by 0.03 σ_ε at best")
+    astray: float = constant(0.1, "chance that an offset within `met` is no noise: a cut spot")
+    met: float = constant(3.0, "σ_ε within which detections may be a feature's: pull 1/10")
+    outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 
     @property
     def reach(self) -> float:
