@@ -154,10 +154,8 @@ def fit_near(
     sigmas, levels = [view.observation.sigma for view in views], list[list[float]]()
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
-        states, coarse = T_start[None], replace(SHARP, iterations=10, tolerance=1e-3)
-        for level in blur_schedule(views, body, T_start, np.where(free, uncertainty, 0.0), rules)[
-            :-1
-        ]:
+        states, spread = T_start[None], np.where(free, uncertainty, 0.0)
+        for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
             levels.append(level)
             at = build_objective(options.objective, views, body, samples, level, states[0])
             states = ascend(at, states, perturb, free, coarse).states
