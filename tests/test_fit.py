@@ -26,7 +26,6 @@ def test_exact_detections_give_the_exact_pose(pinhole_cameras: list[PinholeCamer
         EstimatorOptions(),
         EIGHT.means[:, None],
     )
-    assert fit.converged
     twist = np.abs(twist_between(TRUTH, fit.T_world_object))
     bound = interpolation_bound(views, EIGHT, TRUTH, ALL_FREE)
     assert (twist < bound).all()

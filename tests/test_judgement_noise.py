@@ -140,7 +140,7 @@ def test_offsets_in_common_that_a_pose_takes_for_its_own_are_in_the_covariance()
 
 
 def test_an_offset_that_lasts_shows_in_many_frames_where_one_tells_little() -> None:
-    blind = replace(ALONE, bias=replace(ALONE.bias, deviation=0.0))
+    blind = replace(ALONE, bias=0.0)
     made = {name: np.array(shift) for name, shift in (("0", [0.8, -0.5]), ("1", [-0.6, 0.7]))}
     errors: dict[NoiseModel, list[float]] = {ALONE: [], blind: []}
     for model, found in errors.items():

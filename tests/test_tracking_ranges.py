@@ -149,7 +149,7 @@ def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:
         options = EstimatorOptions(free=("x", "y", "rz"))
         tracker = Tracker.create(body, options, np.eye(4), rules=rules)
         data = tracker.data(tracker.begin(), 0, None, views)
-        judged = likelihood_of(data).judge(Fit(np.eye(4), 0.0, True, 0), Start(np.eye(4)))
+        judged = likelihood_of(data).judge(Fit(np.eye(4)), Start(np.eye(4)))
         variances.append(np.diag(judged.covariance)[list(FREE)])
     assert np.sqrt(variances[0][2]) == pytest.approx(np.pi, rel=1e-6)
     # eight anchors all around: σ / √4 along each axis where all are detections of the tag

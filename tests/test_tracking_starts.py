@@ -292,7 +292,7 @@ def from_aside(T_sensor_world: Floats, angle: float) -> Floats:
 def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera]) -> None:
     views = bumped(pinhole_cameras)
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
-    fit = Fit(TRUTH, 0.0, True, 0)
+    fit = Fit(TRUTH)
 
     def lost(in_space: bool) -> float:
         detection = DetectionModel(in_space=in_space)

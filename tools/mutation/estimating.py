@@ -23,7 +23,7 @@ _NEAR = (
     ),
     Mutant(
         "fit-blurs-wider-than-the-picture",
-        "fit/options.py",
+        "fit/probable.py",
         "widest: float = constant(\n        0.1,",
         "widest: float = constant(\n        10.0,",
         "descents begin where everything is one blob",
@@ -38,8 +38,8 @@ _NEAR = (
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "if here.value[0] < least * len(objective.views):",
-        "if here.value[0] < 0.0:",
+        "here.value[0] >= least * len(objective.views)",
+        "here.value[0] >= 0.0",
         "a start some widths off is never corrected",
     ),
     Mutant(

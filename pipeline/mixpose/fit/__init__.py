@@ -1,16 +1,12 @@
 """Fit: a pose near a start, through narrowing blurs."""
 
-from __future__ import annotations
-
 from mixpose.fit.near import (
+    EstimatorOptions as EstimatorOptions,
     Fit as Fit,
+    SearchName as SearchName,
     blur_schedule as blur_schedule,
     fit_near as fit_near,
     fit_together as fit_together,
-)
-from mixpose.fit.options import (
-    EstimatorOptions as EstimatorOptions,
-    FitRules as FitRules,
-    SearchName as SearchName,
     free_mask as free_mask,
 )
+from mixpose.fit.probable import FitRules as FitRules

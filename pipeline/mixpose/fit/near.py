@@ -2,21 +2,22 @@
 
     draw C of every sensor at a blur → climb Σ_l ω_l S_l → narrow the blur → ... → σ_ε → ... → noise
 
-Observation and prediction are widened alike, so that no blur moves the optimum; wider ones only
-reach farther.  Where most features are near a detection at the start already, the fit begins at
-σ_ε.  Where all of them are met as closely as the detections' noise lets them, it ends there.
+Observation and prediction are widened alike: no blur moves the optimum, wider ones only reach
+farther.  Where most features are near a detection at the start already, the fit begins at σ_ε;
+where all are met as closely as the detections' noise lets them, it ends there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.fit.options import EstimatorOptions, FitRules, free_mask
-from mixpose.fit.probable import believed, has_likelihood
+from mixpose.fit.probable import FitRules, believed
 from mixpose.matching import (
     AssociationRules,
     ErrorRules,
@@ -25,10 +26,12 @@ from mixpose.matching import (
     associate,
     errors_seen,
     log_likelihood,
+    welsch,
 )
 from mixpose.objective import (
     MatchedObjective,
     NormalPrior,
+    ObjectiveName,
     View,
     build_objective,
     matched_objective,
@@ -38,13 +41,39 @@ from mixpose.objective import (
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import Floats, Mask
-from mixpose.rigid import perturb, twist_between
+from mixpose.rigid import TWIST_NAMES, perturb, twist_between
 from mixpose.sensors import Motion
 
-COARSE = NewtonOptions(iterations=10, tolerance=1e-3, value_error=value_error(STEPS_PER_SIGMA))
+SearchName: TypeAlias = Literal["thorough", "live"]
+
 # what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
-SHARP = replace(COARSE, iterations=40, tolerance=1e-6, remaining=5e-7)
-FINE = NewtonOptions(iterations=40, tolerance=1e-8, value_error=value_error(FINE_STEPS))
+SHARP = NewtonOptions(40, 1e-6, remaining=5e-7, value_error=value_error(STEPS_PER_SIGMA))
+FINE = NewtonOptions(40, 1e-8, value_error=value_error(FINE_STEPS))
+
+
+@dataclass(frozen=True)
+class EstimatorOptions:
+    """The keys of ``[estimator]`` in a session file."""
+
+    objective: ObjectiveName = "matched"
+    free: tuple[str, ...] = TWIST_NAMES  # world directions that are estimated
+    samples: int = 1000  # R per feature, where q is integrated by sampling
+    seed: int = 0
+    fuse: bool = True  # whether frames of single ranges take the pose before them as a prior
+    # how long a frame is searched where no prediction convinces; None: live for cameras and streams
+    search: SearchName | None = None
+
+
+def free_mask(options: EstimatorOptions) -> Mask:
+    """Which of the six directions are estimated, not to be written to."""
+    return _mask(tuple(options.free))
+
+
+@lru_cache(maxsize=64)
+def _mask(free: tuple[str, ...]) -> Mask:
+    mask = np.array([name in free for name in TWIST_NAMES])
+    mask.flags.writeable = False
+    return mask
 
 
 @dataclass(frozen=True)
@@ -52,9 +81,6 @@ class Fit:
     """Where an ascent ended."""
 
     T_world_object: Floats  # (4, 4)
-    value: float  # of the objective at that pose, at the finest blur
-    converged: bool
-    iterations: int  # evaluations at the finest blur
     blurs: tuple[Mapping[str, float], ...] = ()  # by view, of each objective that was climbed
     freed: bool = False  # whether the body did not fit, and the pose was fitted to freed features
     motion: Motion | None = None  # of the body, where sensors see it at moments of their own
@@ -63,12 +89,13 @@ class Fit:
     first: Ascent | None = None  # at σ_ε, from which it went on to narrower blurs
 
     @classmethod
-    def of(cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]]) -> Fit:
+    def of(
+        cls, ascent: Ascent, views: Sequence[View], levels: Sequence[Sequence[float]], **rest: Any
+    ) -> Fit:
         """Where an ascent through blurs of the views ended."""
         names = [view.name for view in views]
-        blurs = tuple(dict(zip(names, level)) for level in levels)
-        value, converged, iterations = ascent.values[0], ascent.converged[0], ascent.iterations[0]
-        return cls(ascent.states[0], float(value), bool(converged), int(iterations), blurs)
+        blurs = tuple([dict(zip(names, level)) for level in levels])
+        return cls(ascent.states[0], blurs, **rest)
 
     def begins_at(self, other: Ascent) -> bool:
         """Whether another ascent ended where this fit's first did, so that it leads to the same."""
@@ -116,29 +143,29 @@ def fit_near(
     begun: Ascent | None = None,  # from the start, on that, where it is at hand
     climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
     blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
-    noise: Floats | None = None,  # (2, L) squares in σ_ε² and degrees of freedom before; None: 0
+    noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
     errors: ErrorRules = ErrorRules(),
     association: AssociationRules = AssociationRules(),
     rules: FitRules = FitRules(),
 ) -> Fit:
     """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
-    free, sigmas = free_mask(options), [view.observation.sigma for view in views]
-    levels: list[list[float]] = []
+    free, coarse = free_mask(options), replace(SHARP, iterations=10, tolerance=1e-3)
+    sigmas, levels = [view.observation.sigma for view in views], list[list[float]]()
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
         states, spread = T_start[None], np.where(free, uncertainty, 0.0)
         for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
             levels.append(level)
             at = build_objective(options.objective, views, body, samples, level, states[0])
-            states = ascend(at, states, perturb, free, COARSE).states
+            states = ascend(at, states, perturb, free, coarse).states
         end = last or build_objective(options.objective, views, body, samples, sigmas, states[0])
         return ascend(end, states, perturb, free, newton)
 
     if options.objective != "matched":
         return Fit.of(descended(None, FINE), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
-    if has_likelihood(views):
+    if all(view.observation.cell is not None for view in views):  # whose noise is that of cells
         fit = Fit.of(descended(finest, FINE), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
@@ -164,18 +191,16 @@ def fit_together(
 ) -> list[tuple[MatchedObjective, Ascent] | None]:
     """Climb the objectives of several bodies at σ_ε at once, as `fit_near` begins.
 
-    Objectives come back with what is seen where the ascent ends; None for a body that has to
-    descend through the blurs.
+    They come back with what is seen at the end; None for a body that has to descend to σ_ε.
     """
     joint, states = together(objectives), np.array(starts)
     here = joint.linearise(states)
     ends = ascend(joint, states, perturb, free, replace(SHARP, together=True), here)
-    begun: list[tuple[MatchedObjective, Ascent] | None] = []
-    for k, objective in enumerate(joint.seen(objectives, ends.states)):
-        own = ends.of(slice(k, k + 1))
-        is_near = here.value[k] >= rules.near * len(objective.views)
-        begun.append((objective, own) if is_near else None)
-    return begun
+    is_near = here.value >= rules.near * np.array([len(one.views) for one in objectives])
+    return [
+        (objective, ends.of(slice(k, k + 1))) if is_near[k] else None
+        for k, objective in enumerate(joint.seen(objectives, ends.states))
+    ]
 
 
 def _at_once(
@@ -183,9 +208,8 @@ def _at_once(
 ) -> Ascent | None:
     """The ascent from a start whose value per sensor is not less than the least."""
     here = objective.linearise(T_start[None])
-    if here.value[0] < least * len(objective.views):
-        return None
-    return ascend(objective, T_start[None], perturb, free, SHARP, here)
+    is_near = here.value[0] >= least * len(objective.views)
+    return ascend(objective, T_start[None], perturb, free, SHARP, here) if is_near else None
 
 
 def _to_the_noise(
@@ -194,7 +218,7 @@ def _to_the_noise(
     blur: float,
     finest: MatchedObjective,
     free: Mask,
-    known: Floats | None,
+    known: Floats,
     beside: float,
     errors: ErrorRules,
     association: AssociationRules,
@@ -202,21 +226,19 @@ def _to_the_noise(
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
     sigmas = np.array([view.observation.sigma for view in finest.views])
-    blurs, count = np.full(len(sigmas), blur), int(free.sum())
-    before = np.zeros((2, len(sigmas))) if known is None else known
-    first, likeliest, best = ascent, -np.inf, None
+    blurs, count, first = np.full(len(sigmas), blur), int(free.sum()), ascent
+    likeliest, best = -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
-        fit = replace(Fit.of(ascent, finest.views, levels), matches=matches, first=first)
         if beside:
             least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
             wide = replace(matches, finest=least)
-        noise = errors_seen(wide, count, before, errors)
-        if not beside:
-            fit = replace(fit, noise=noise)
+        seen = _, variances, narrow, before = errors_seen(wide, count, known, errors)
+        noise = None if beside else seen
+        fit = Fit.of(ascent, finest.views, levels, matches=matches, noise=noise, first=first)
         # offsets of a bent pose hide how small the noise is
-        variances = np.minimum(noise.variances, (noise.before / errors.blur) ** 2)
-        end = np.minimum(np.minimum(noise.blurs, noise.before), blurs)
+        variances = np.minimum(variances, (before / errors.blur) ** 2)
+        end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
@@ -225,7 +247,7 @@ def _to_the_noise(
             alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
             if is_end or (alike and _moved(matches, free, end, variances) < rules.moved**2):
                 return fit
-        likelihood = log_likelihood(noise.blurs, matches, count, errors)
+        likelihood = log_likelihood(narrow, matches, count, errors)
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit
         if is_end:
@@ -241,15 +263,13 @@ def _to_the_noise(
 
 
 def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:
-    """About how far narrower blurs (L,) move the pose, in squared standard deviations.
-
-    By iterated least squares, at the end of an ascent at wider ones.
-    """
+    """About how far narrower blurs (L,) move the pose, in squared standard deviations."""
     J = matches.J[..., free].reshape(matches.offsets.size, -1)
     offsets, twist = matches.offsets, np.zeros(J.shape[1])
-    for _ in range(2):  # 0.80 of the way, of 70 features 0.89; one step makes 0.62 and 0.77
-        squared = (offsets * offsets).sum(axis=2)
-        weights = matches.shares * np.exp(-0.25 * squared / narrower[:, None] ** 2)
+    for _ in range(
+        2
+    ):  # of least squares: 0.80 of the way, of 70 features 0.89; one step makes 0.62 and 0.77
+        weights = matches.shares * welsch((offsets * offsets).sum(axis=2), narrower)
         rows = (weights / variances[:, None]).repeat(2)[:, None] * J
         information = rows.T @ J
         twist += np.linalg.lstsq(information, rows.T @ offsets.ravel())[0]

@@ -2,15 +2,12 @@
 
 Under white noise half of the energy ⟨g, h⟩² / ⟨h, h⟩ that a pose explains, over the noise of a
 cell, is the log-likelihood with the amplitude at its best; the Gaussian prior of the start comes on
-top.  Under heavy noise the sum has several maxima: they are sought from the maximum of the
-objective, and from the points of the cubature rule of third degree, which has mean and covariance
-of the prior.
+top.  Maxima are sought from that of the objective, and under heavy noise from the points of the
+cubature rule of third degree, which has mean and covariance of the prior.
 
-In the matched objective a feature r away from its prediction pulls with r exp(−r²/4σ²): of a
-deformed body only features that fit count.  There places, the peaks of a density, go to features so
-that the sum of squares S is least, the pose is fitted to them, and so on.  An assignment is as
-probable as S^(−ν/2), if the misfits of ν redundant coordinates are normal with one unknown
-variance; see *A body that does not fit* in `docs/method.md`.
+To features of a deformed body go places, the peaks of a density, so that the sum of squares S is
+least; the pose is fitted to them, and so on.  An assignment is as probable as S^(−ν/2), if misfits
+of ν redundant coordinates are normal; see *A body that does not fit* in `docs/method.md`.
 """
 
 from __future__ import annotations
@@ -25,14 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
+from mixpose.constants import constant
 from mixpose.density import peak
-from mixpose.fit.options import FitRules
 from mixpose.objective import (
     AmplitudesObjective,
     BodyProjection,
     MatchedObjective,
     NormalPrior,
-    View,
     matched_objective,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
@@ -41,9 +37,38 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
 
+# gains of log-likelihood that do not matter, 0.001 standard deviations; and shares of the energy:
+# a part in a thousand of heights, which drawing may be off by
 NATS = 1e-6
-"""Gains of log-likelihood that do not matter: 0.001 standard deviations; and shares of the energy:
-a part in a thousand of heights, which drawing may be off by."""
+
+
+@dataclass(frozen=True)
+class FitRules:
+    """How a fit begins and ends, and when a body does not fit."""
+
+    ratio: float = constant(
+        1.8, "blur from level to level: below 2, a peak lies in the basin of the next level's"
+    )
+    widest: float = constant(
+        0.1, "of the observed extent: with wider blurs everything is one blob (design study)"
+    )
+    near: float = constant(
+        0.1,
+        "value per sensor from which the fit begins at σ_ε: features have a third of their peak "
+        "on average; below, it descends through the blurs",
+    )
+    narrower: float = constant(0.8, "of a blur: the next is drawn where it is narrower by as much")
+    moved: float = constant(
+        0.5,
+        "standard deviations by which narrower blurs have to move the pose: where all offsets are "
+        "normal they do so, too, as they are 5 % less efficient in six directions",
+    )
+    believed: float = constant(
+        0.99, "probability of χ² up to which a misfit is taken for noise: one frame in a hundred"
+    )
+    unlike: float = constant(
+        0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
+    )
 
 
 @dataclass(frozen=True)
@@ -56,28 +81,18 @@ class Likelihood:
 
     @property
     def is_alone(self) -> bool:
-        """Whether no other pose can be as likely: it explains more than half of each density.
-
-        Shares that orthogonal predictions explain sum to 1 at the most (Bessel's inequality).
-        """
+        """Whether no other pose can be as likely, as shares sum to 1 at the most (Bessel)."""
         return bool(self.shares.min() > 0.5)
-
-
-def has_likelihood(views: Sequence[View]) -> bool:
-    """Whether all sensors gave grey values or profiles, whose noise is that of their cells."""
-    return all(view.observation.cell is not None for view in views)
 
 
 def likelihood_at(
     objective: MatchedObjective, T_world_object: Floats, misfit: float = 1.0
 ) -> Likelihood:
-    """The log-likelihood; what an objective at σ_ε leaves at a pose (4, 4) is taken for noise.
-
-    `misfit`, χ² per degree of freedom of a body that does not fit, is a factor on its variance.
-    """
+    """The log-likelihood; what a pose leaves at σ_ε is noise, of a variance times `misfit`."""
     plain = replace(objective, weights=np.ones_like(objective.weights))
     shares = plain.shares(T_world_object[None])[:, 0]
-    noise = cell_variances(objective.energies[:, 0], shares, _cells(objective))
+    cells = np.array([view.observation.cells for view in objective.views])
+    noise = cell_variances(objective.energies[:, 0], shares, cells)
     weights = (0.5 * objective.energies[:, 0] / (misfit * noise))[:, None]
     return Likelihood(replace(objective, weights=weights), shares, noise)
 
@@ -92,8 +107,7 @@ def most_probable(
     objective: MatchedObjective, T_world_object: Floats, prior: NormalPrior, misfit: float = 1.0
 ) -> Floats:
     """The pose (4, 4) that maximises likelihood and prior, from a maximum of the objective."""
-    T = T_world_object
-    likelihood = likelihood_at(objective, T, misfit)
+    T, likelihood = T_world_object, likelihood_at(objective, T_world_object, misfit)
     if not likelihood.is_alone:
         starts = np.concatenate([T[None], prior.points()])
         # roughly: it is asked which of several maxima is highest
@@ -109,9 +123,8 @@ def believed(
     prior: NormalPrior,
     rules: FitRules = FitRules(),
 ) -> tuple[Floats, bool]:
-    """The most probable pose (4, 4) near a maximum of an objective at σ_ε, whose cells have noise.
-
-    Or the fit to freed features of a body that does not fit, and whether it is that.
+    """The most probable pose (4, 4) near a maximum of an objective at σ_ε, or for a body that does
+    not fit, the fit to freed features; and whether it is that.
     """
     projection, body = objective.projection, objective.projection.body
     T = most_probable(objective, T_world_object, prior)
@@ -144,7 +157,7 @@ def with_amplitudes(
 ) -> tuple[Floats, Floats]:
     """The most probable pose near that of equally bright features, and the noise (L,) of cells."""
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
-    noise, cells = equal, _cells(objective)
+    noise, cells = equal, np.array([view.observation.cells for view in objective.views])
     smallest = NATS * objective.energies[:, 0] / cells
     for _ in range(3):  # noise and pose by turns: the noise holds to a part in a hundred
         unlike = AmplitudesObjective(objective, noise, rules.unlike)
@@ -155,10 +168,6 @@ def with_amplitudes(
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
     is_equal = gain < float(chdtri(freedom, 1 - rules.believed))
     return (T_world_object, equal) if is_equal else (T, noise)
-
-
-def _cells(objective: MatchedObjective) -> Indices:
-    return np.array([view.observation.cells for view in objective.views])
 
 
 def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
@@ -209,12 +218,12 @@ class SensorDensity:
 
 
 def misfit(
-    densities: Sequence[SensorDensity], points: Floats, unknowns: int, rules: FitRules = FitRules()
+    densities: Sequence[SensorDensity],
+    points: Floats,
+    unknowns: int,  # of the pose, that were fitted beside each feature's height
+    rules: FitRules = FitRules(),
 ) -> float:
-    """χ² per degree of freedom of what a body leaves at its features; 1 if it may be noise.
-
-    Each feature's height was fitted, and some unknowns of the pose, to densities at points (n, 3).
-    """
+    """χ² per degree of freedom of what a body leaves at features (n, 3); 1 if it may be noise."""
     statistic, freedom = 0.0, -unknowns
     for sensor in densities:
         rest, heights = sensor.left(sensor.geometry.project(points)[0])
@@ -307,10 +316,9 @@ class LabelledPlaces:
 def fit_freed(
     projection: BodyProjection, densities: Sequence[SensorDensity], starts: Floats, free: Mask
 ) -> Floats | None:
-    """Fit the pose to freed features by least squares; None where no place is surely whose.
+    """Fit the pose to freed features by least squares, from starts (H, 4, 4).
 
-    The features, all of one weight, are seen by all sensors; correspondences are sought from
-    starts (H, 4, 4), which may change in free directions (6,).
+    All sensors see all features, of one weight; None where no place is surely whose.
     """
     count = len(projection.body)
     redundant = int(projection.dimensions.sum()) * count - int(free.sum())

@@ -12,7 +12,7 @@ from scipy.special import fdtri
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.judge import ScoredPose, beliefs, nearest_alike
+from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
@@ -25,50 +25,24 @@ APART = "two sensors contradict each other"
 class AcceptanceRules:
     """When a pose is believed."""
 
-    sure: float = constant(
-        7.0, "log odds against clutter from which a pose is ok: one in a thousand by chance"
-    )
-    possible: float = constant(
-        0.5, "log odds from which a pose is told: even, and a little more, as the best of many"
-    )
-    doubtful: float = constant(
-        -4.5, "the same of a pose that stands out: sure, less the share of two misses"
-    )
+    sure: float = constant(7.0, "log odds against clutter from which a pose is ok: 1 in 1000 errs")
+    possible: float = constant(0.5, "log odds to tell a pose: a little over even, as best of many")
+    doubtful: float = constant(-4.5, "log odds to tell one that stands out: sure less two misses")
     doubtful_coverage: float = constant(0.6, "share of the body that a pose must meet to stand out")
     # of frames of one camera with five features and five false detections
     spare: float = constant(
         4.0, "coordinates beyond six that it must meet: of two fewer chance makes enough, in 9 %"
     )
-    standing_out: float = constant(
-        1.5, "log odds against all other poses: 4 % without the body are told, 96 % with it"
-    )
-    enough: float = constant(
-        8.0, "features met by some sensor that are enough however many are missed: a shape"
-    )
-    rival: float = constant(
-        0.01, "belief from which another pose makes a frame ambiguous; a tenth makes a hypothesis"
-    )
-    widest_turn_deg: float = constant(
-        15.0, "95 % bound on a turn, above which ranges leave a frame ambiguous"
-    )
-    convincing: float = constant(
-        0.75, "share of the body that must be met not to look elsewhere: after a slip less is met"
-    )
-    agreeing: float = constant(
-        0.5, "the same of a sensor that agrees, and of the features in view of a sure pose"
-    )
-    disagreeing: float = constant(
-        25.0, "variance over the others' of a sensor to leave out: five times their deviation"
-    )
-    same: float = constant(
-        0.02, "of the body's radius, and rad: poses nearer than this are one, unless both fit"
-    )
-    same_peak: float = constant(
-        3.0, "standard deviations of their distance within which uncertain poses are one"
-    )
-    same_peak_deg: float = constant(
-        5.0, "turn above which they are two all the same: another tilt of a small flat body"
-    )
+    standing_out: float = constant(1.5, "log odds against all others: told without the body in 4 %")
+    enough: float = constant(8.0, "features met that are enough however many are missed: a shape")
+    rival: float = constant(0.01, "belief from which a pose is a rival; from a tenth, a hypothesis")
+    widest_turn_deg: float = constant(15.0, "95 % bound on a turn that ranges may leave open")
+    convincing: float = constant(0.75, "share of the body to look nowhere else: a slip meets less")
+    agreeing: float = constant(0.5, "share that a sensor that agrees, and a sure pose, must meet")
+    disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
+    same: float = constant(0.02, "of the body's radius, and rad: nearer poses are one")
+    same_peak: float = constant(3.0, "deviations of their distance within which poses are one")
+    same_peak_deg: float = constant(5.0, "turn of two poses all the same: tilts of a flat body")
 
 
 @dataclass(frozen=True)
@@ -98,9 +72,8 @@ def is_possible(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
     """Whether a pose is believed, if no rival casts doubt on it.
 
-    So much of the body is met that another one cannot pass for it: three markers of another may
-    well lie as three of this one, where it was expected even.  And no wide sector of turns is left
-    open, as ranges may.
+    So much of the body is met that another one cannot pass for it, as three markers of it may; and
+    no wide sector of turns is left open, as by ranges.
     """
     turn = 0.0 if pose.spread is None else 1.96 * float(pose.spread[3:].max())
     met, in_view = pose.features
@@ -113,10 +86,9 @@ def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 
 
 def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether a sure pose, near its prediction, needs no other to compare with.
+    """Whether a sure pose, near its prediction, meets so much that it could not be elsewhere.
 
-    So much is met that it could not be elsewhere.  Of two sensors or more that agree, others may be
-    covered, blind or out of step.
+    Beside two sensors that agree, others may be covered, blind or out of step.
     """
     agreeing = [share for share in pose.matches.coverage.tolist() if share >= rules.agreeing]
     share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else pose.coverage
@@ -134,10 +106,9 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
     # what is not possible by itself still casts doubt on the others
     rivals = [weight for one, weight in zip(ranked, weights, strict=True) if one is not best]
     clear = max(rivals, default=0.0) < rules.rival
-    # nor is a turn left open, as about the line that all features met lie on
     if clear := clear and is_sure(best, free, rules):
-        anywhere = np.pi**2 / 3  # rad², of a turn of which nothing is known
-        clear = bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < anywhere)
+        # nor is a turn unknown (π²/3 rad²), as about the line that all features met lie on
+        clear = bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < np.pi**2 / 3)
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
@@ -201,9 +172,8 @@ def contradict(
 ) -> bool:
     """Whether the two sensors of a frame contradict each other: no pose is right for both.
 
-    Of three sensors the one that disagrees is left out; of two, nobody can tell which is wrong.
-    `before` are squares and degrees of freedom (2,) of residuals of the frames before, and where
-    two sensors `agreed` in one of them, one may miss the body now.
+    `before` are squares and degrees of freedom (2,) of residuals of the frames before; where two
+    sensors `agreed` in one of them, one may miss the body now.
     """
     used = judged.used
     if used.dimensions.tolist() != [2, 2]:
@@ -240,7 +210,28 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
     degrees = float(used.measurements.sum()) - 6
     if degrees < 1:
         return False
-    limit = rules.disagreeing / 4 * model.errors.typical**2
+    variance = model.errors.typical**2 / 4
     if before[1] >= model.known:
-        limit = rules.disagreeing * max(before[0] / before[1], LEAST_VARIANCE)
-    return bool(float(used.squares.sum()) / degrees >= limit)
+        variance = max(before[0] / before[1], LEAST_VARIANCE)
+    return bool(float(used.squares.sum()) / degrees >= rules.disagreeing * variance)
+
+
+def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
+    """Of the poses that look the same, the one turned least against a reference, or the world."""
+    if len(body.symmetries) == 1:
+        return T_world_object
+    alike, reference = T_world_object @ body.symmetries, np.eye(4)
+    reference = reference if T_reference is None else T_reference
+    # the angle grows as the trace of the difference falls
+    nearest = int(np.argmax(np.einsum("ij,kij->k", reference[:3, :3], alike[:, :3, :3])))
+    # the very same, where it is that: what was worked out for it holds
+    return T_world_object if nearest == body.identity else np.asarray(alike[nearest])
+
+
+def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
+    """Share of belief of each pose among its rivals; even where none meets anything."""
+    logs = np.array([one.log_evidence for one in judged])
+    if not np.isfinite(logs).any():
+        return [1.0 / len(judged)] * len(judged) if judged else []
+    weights = np.exp(logs - logs.max())
+    return list((weights / weights.sum()).tolist())

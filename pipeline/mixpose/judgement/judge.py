@@ -1,4 +1,16 @@
-"""What a pose is worth: matches, noise, covariance and evidence, worked out once and kept."""
+"""What a pose is worth: matches, noise, covariance, and how sure it is that the body is there.
+
+The log of the odds against clutter is a sum over the features in view.  With the probability of
+detection P_D, the noise s and the density ρ of observed features in a sensor, or ρ₃ of points in
+space that cameras see together, d standard deviations away by their information A,
+
+    met:  ln P_D + ln N(offset; 0, s²) − ln ρ,    missed:  ln (1 − P_D),
+    met together:  − d²/2 + ½ ln det(A / 2π) − ln ρ₃;
+
+what makes clutter likelier counts, feature by feature.  A pose was chosen to fit, and pays for it
+by volume, + ½ ln det(2π Cov) + ln p(pose), or by count: features that fix it earn nothing, and cost
+the logarithm of the ways to choose them.  See *Evidence* in `docs/method.md`.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +18,47 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from mixpose.body import Body
-from mixpose.judgement.covariance import information_of, inverses
-from mixpose.judgement.evidence import DetectionModel, Prior, flat_prior, log_evidence
-from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
+from mixpose.constants import constant
+from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverses, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import Floats, SensorReport
+from mixpose.records import Floats, Indices, Mask, SensorReport
 
-# objective, pose (4, 4), noise before, prior, and matches and noise where the fit has them
+
+class Prior(NamedTuple):
+    """What is known of a pose before its frame."""
+
+    log_density: float  # of its probability, per length and radian of each free direction
+    spread: Floats  # (6,) how uncertain it is; matters where the data leave a direction open
+
+
 Case: TypeAlias = tuple[
     MatchedObjective, Floats, RememberedNoise, Prior | None, Matches | None, NoiseEstimate | None
 ]
+"""Objective, pose (4, 4), noise before, prior, and matches and noise where the fit has them."""
+
+
+@dataclass(frozen=True)
+class DetectionModel:
+    """How likely features are seen, and where a body may be."""
+
+    probability: float = constant(0.75, "P_D of a feature in view: one or two of eight are hidden")
+    log_unseen: float = constant(-1.2, "per feature that faces a sensor out of its view: ln 0.3")
+    log_blind: float = constant(-5.0, "at least, for a sensor that misses all: 1 in 150 does")
+    by_count: bool = constant(True, "whether features that fix a pose may pay for its freedom")
+    in_space: bool = constant(True, "whether clutter may be a point in space, and counts once")
+    room: float = constant(10.0, "radii of the body: how far it may be where nothing is known")
+
+    @property
+    def log_missed(self) -> float:
+        """Of a feature in view without a detection."""
+        return math.log(1 - self.probability)
 
 
 @dataclass(frozen=True)
@@ -94,15 +130,14 @@ class ScoredPose:
 
 def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
     """The matches of the sensors that are not left out."""
-    if not left_out:
-        return matches
-    return matches.of_sensors([k for k, name in enumerate(matches.names) if name not in left_out])
+    kept = [name not in left_out for name in matches.names]
+    return matches if all(kept) else matches.of_sensors(kept)
 
 
 def judge(
     objective: MatchedObjective,
     T_world_object: Floats,
-    free: NDArray[np.bool_],
+    free: Mask,
     rules: JudgementRules = JudgementRules(),
     *,
     before: RememberedNoise = RememberedNoise(),
@@ -111,25 +146,21 @@ def judge(
     matches: Matches | None = None,
     noise: NoiseEstimate | None = None,
 ) -> ScoredPose:
-    """Judge a pose (4, 4), estimated in free directions (6,), by the matched objective at σ_ε.
-
-    `before` is the noise of earlier frames, `prior` what was known of the pose; sensors left out
-    count as if they had met nothing.  `matches` and `noise` are the fit's, where it has them.
-    """
+    """Judge a pose, estimated in free directions (6,); arguments as in `Case`."""
     case = objective, T_world_object, before, prior, matches, noise
     return judge_together([case], free, rules, left_out)[0]
 
 
 def judge_together(
     cases: Sequence[Case],
-    free: NDArray[np.bool_],
+    free: Mask,
     rules: JudgementRules = JudgementRules(),
     left_out: Mapping[str, str] | None = None,
 ) -> list[ScoredPose]:
-    """Judge K poses that the same sensors see and take part in, at once: as `judge` does each."""
-    left_out, narrowest = left_out or {}, rules.noise.errors.narrowest
-    whole, noises = [], []
+    """Judge K poses that the same sensors see and take part in; those left out meet nothing."""
+    left_out, whole, noises = left_out or {}, [], []
     for objective, T, before, _, matches, noise in cases:
+        narrowest = rules.noise.errors.narrowest
         whole.append(matches or associate(objective, T, rules.association, narrowest))
         part = taken_part(whole[-1], left_out)
         noises.append(noise_of(part, free, before, rules.noise, noise))
@@ -156,22 +187,14 @@ def judge_together(
 
 
 def _evidence(
-    cases: Sequence[Case],
-    seen: Matches,
-    variances: Floats,
-    free: NDArray[np.bool_],
-    detection: DetectionModel,
+    cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
 ) -> tuple[Floats, Floats]:
     """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
     bodies = [case[0].projection.body for case in cases]
-    priors = [
-        case[3] or flat_prior(body, free, detection)
-        for case, body in zip(cases, bodies, strict=True)
-    ]
-    sizes = np.array([2 * body.radius for body in bodies])
+    priors = [case[3] or flat_prior(body, free, detection) for case, body in zip(cases, bodies)]
+    sizes, bent = np.array([2 * body.radius for body in bodies]), np.zeros((len(cases), 6, 6))
     given = seen, variances, free, priors, sizes, detection
     evidence = log_evidence(*given, information_of(seen, variances))
-    bent = np.zeros((len(cases), 6, 6))
     if any(body.spread for body in bodies):
         spreads = np.zeros((len(cases), seen.shares.shape[2], 3, 3))
         for own, body, case in zip(spreads, bodies, cases, strict=True):
@@ -185,25 +208,131 @@ def _evidence(
     return evidence, bent
 
 
-def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:
-    """Of the poses that look the same, the one turned least against a reference, or the world."""
-    if len(body.symmetries) == 1:
-        return T_world_object
-    alike = T_world_object @ body.symmetries
-    reference = np.eye(4) if T_reference is None else T_reference
-    # the angle grows as the trace of the difference falls
-    traces = np.einsum("ij,kij->k", reference[:3, :3], alike[:, :3, :3])
-    nearest = int(np.argmax(traces))
-    # the very same, where it is that: what was worked out for it holds
-    return T_world_object if nearest == body.identity else np.asarray(alike[nearest])
+def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
+    """Nothing is known: anywhere within some radii of the body, turned in any way."""
+    room = detection.room * body.radius
+    turns = int(free[3:].sum())
+    rotations = 8 * np.pi**2 if turns == 3 else (2 * np.pi) ** turns
+    volume = room ** int(free[:3].sum()) * rotations / len(body.symmetries)
+    return Prior(-float(np.log(volume)), np.repeat([room, np.pi], 3))
 
 
-def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
-    """Share of belief of each pose among its rivals."""
-    if not judged:
-        return []
-    logs = np.array([one.log_evidence for one in judged])
-    if not np.isfinite(logs.max()):  # none meets anything
-        return [1.0 / len(judged)] * len(judged)
-    weights = np.exp(logs - logs.max())
-    return [float(w) for w in weights / weights.sum()]
+def log_evidence(
+    found: Matches,
+    variances: Floats,
+    free: Mask,
+    priors: Sequence[Prior],
+    sizes: Floats,
+    detection: DetectionModel,
+    information: Floats,  # (K, 6, 6)
+    spreads: Floats | None = None,
+) -> Floats:
+    """Log odds (K,) for bodies at K poses against clutter, of arguments as in `odds_of`."""
+    odds = odds_of(found, variances, sizes, detection, spreads)
+    # a direction that the data leave open is as uncertain as before
+    log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
+    wide = wide[:, free]
+    inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
+    laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
+    evidence = odds[0] + odds[1] + laplace + log_densities
+    if detection.by_count:
+        evidence = np.maximum(evidence, paid_by_count(odds, found, free))
+    return np.where(found.shares.any(axis=(1, 2)), evidence, -np.inf)
+
+
+def odds_of(
+    found: Matches,
+    variances: Floats,  # (K, L) of the noise of each sensor, in σ_ε²
+    sizes: Floats,  # (K,) of the body, length units
+    detection: DetectionModel,
+    spreads: Floats | None = None,  # (K, N, 3, 3) of features in the world, where a body gives way
+) -> tuple[Floats, Floats, Floats]:
+    """What features met gain (K,) against clutter, others lose, and coordinates that tell anything.
+
+    Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
+    """
+    roots, m = np.sqrt(variances), found.dimensions
+    crowd = found.crowd * roots**m
+    rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
+    gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
+    missed = (found.weights - found.shares) * detection.log_missed
+    # what a sensor that is covered, blurred or out of step meets, it meets by chance
+    is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
+    even = found.weights / np.maximum(found.expected, 1.0)[..., None]
+    missed = np.where(is_blind, even * detection.log_blind, missed)
+    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
+    missed = missed.sum(axis=1)
+    # a detection that chance puts as near is not the feature's
+    near = (gained > 0) & (m == 2)[:, None]
+    gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
+    # a feature that no sensor sees is covered, as if two had missed it: not one by one
+    most = 2 * detection.log_missed * found.weights.max(axis=1)
+    missed = np.where((shares > 0).any(axis=1), missed, np.maximum(missed, most))
+    together = np.nonzero(near.sum(axis=1) > 1)
+    if detection.in_space and len(together[0]):
+        space, share = _in_space(found, roots, crowd, near, together, sizes, spreads)
+        likelier = space < (gained + missed)[together]
+        pose, feature = (index[likelier] for index in together)
+        gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
+        most = 3 * share[likelier]
+        coordinates[pose, feature] = np.minimum(coordinates[pose, feature], most)
+    unseen = found.unseen.sum(axis=1) * detection.log_unseen
+    return gained.sum(axis=1), missed.sum(axis=1) + unseen, coordinates.sum(axis=1)
+
+
+def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
+    """What offsets (K, L, N) cost: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
+    if spreads is None:
+        return np.asarray(found.squared / (2 * roots**2)[..., None])
+    r = (found.offsets / roots[..., None, None])[..., None]
+    by_world = found.J[..., :3] / roots[..., None, None, None]
+    S = np.eye(2) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
+    away = (r * np.linalg.solve(S, r)).sum(axis=(3, 4))
+    return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
+
+
+def _in_space(
+    found: Matches,
+    roots: Floats,
+    crowd: Floats,
+    near: Mask,
+    chosen: tuple[Indices, ...],
+    sizes: Floats,
+    spreads: Floats | None,
+) -> tuple[Floats, Floats]:
+    """What features met by several cameras say if clutter are points in space (C,), and shares.
+
+    A clutter point lies where the cameras see it; only that it lies at the feature tells.
+    """
+    pose, feature = chosen
+    at, sizes, roots = (pose, slice(None), feature), sizes[pose], roots[pose][..., None]
+    met, J, r = near[at], found.J[at][..., :3] / roots[..., None], found.offsets[at] / roots
+    rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
+    A = np.eye(3) / sizes[:, None, None] ** 2 + rows @ rows.swapaxes(1, 2)
+    pull = rows @ r.reshape(len(pose), -1, 1)
+    place = np.linalg.solve(A, pull)
+    share = (met * found.shares[at]).max(axis=1)
+    # detections per area, of which each has a depth
+    (aa, ab), (_, bb) = (J @ J.swapaxes(2, 3)).transpose(2, 3, 0, 1)
+    across = 0.5 * np.log(np.maximum(aa * bb - ab * ab, 1e-300))
+    rarity = np.log(sizes)[:, None] - np.log(np.maximum(crowd[pose], 1e-300)) - across
+    if spreads is not None:  # as far as it is known, and as far as the feature may be off
+        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads[chosen], A))
+        pull = A @ place
+    away = (place * pull).sum(axis=(1, 2))
+    tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
+    log_rarity = np.where(met, rarity, -np.inf).max(axis=1)
+    return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
+
+
+def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mask) -> Floats:
+    """Evidence (K,) of poses that pay by count: by the ways to fix them by what was observed."""
+    gained, missed, coordinates = odds
+    expected, count = found.weights.sum(axis=2), int(free.sum())
+    pins = -(-count // int(found.dimensions.max()))
+    observed = np.maximum((found.count * (expected > 0)).sum(axis=1), pins)
+    features = np.maximum(expected.max(axis=1), pins)
+    ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
+    assigned = gammaln(features + 1) - gammaln(features - pins + 1)
+    spare = np.maximum(1.0 - count / np.maximum(coordinates, 1.0), 0.0)
+    return np.asarray(gained * spare + missed - (ways + assigned + math.log(2)))

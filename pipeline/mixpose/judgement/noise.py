@@ -22,26 +22,17 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
+from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.covariance import inverses
 from mixpose.matching import ErrorRules, Matches, NoiseEstimate, errors_seen, pooled
-from mixpose.records import Floats
+from mixpose.objective import project_body
+from mixpose.records import Floats, Mask
+from mixpose.sensors import Sensor
 
 Biases: TypeAlias = Mapping[tuple[str, ...], Floats]
-
-
-@dataclass(frozen=True)
-class BiasRules:
-    """What is believed of errors that last."""
-
-    deviation: float = constant(
-        0.25, "σ_ε: of fields that last, once some are seen: 0.4 px, a camera turned by 0.02°"
-    )
-    memory: float = constant(0.99, "per frame, of what was seen before: 100 frames count")
 
 
 @dataclass(frozen=True)
@@ -49,20 +40,13 @@ class NoiseModel:
     """What is believed of detection noise before residuals are seen, and for how long."""
 
     errors: ErrorRules = ErrorRules()
-    bias: BiasRules = BiasRules()
-    by_chance: float = constant(
-        0.999, "frames whose residuals are larger than so many by chance stand on their own"
-    )
-    known: float = constant(
-        20.0, "degrees of freedom from which the noise of a recording is known to 16 %, √(1/2ν)"
-    )
+    by_chance: float = constant(0.999, "frames of residuals rarer than this stand on their own")
+    known: float = constant(20.0, "degrees of freedom that tell the noise to 16 %, √(1/2ν)")
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
-    confidence: float = constant(
-        0.95, "of the ellipsoid that is as large as the F distribution's; 0 enlarges nothing"
-    )
-    lasting: float = constant(
-        0.18, "of the noise: fields of a sensor before they are seen; half and twice do as well"
-    )
+    confidence: float = constant(0.95, "of the F distribution's ellipsoid; 0 enlarges nothing")
+    lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
+    bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
+    bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
         """Factors that make the Gaussian ellipsoid as large as that of the F distribution.
@@ -102,7 +86,7 @@ class RememberedNoise:
 
 def noise_of(
     found: Matches,
-    free: NDArray[np.bool_],
+    free: Mask,
     before: RememberedNoise,
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
@@ -152,6 +136,36 @@ def noise_of(
     return variances, covariance + steady, steady, remembered, ratio
 
 
+def _level(
+    matches: Matches,
+    before: RememberedNoise,
+    count: int,
+    model: NoiseModel,
+    estimate: NoiseEstimate | None,
+) -> tuple[Floats, Floats, Floats, float, float]:
+    """Variances (L,) as offsets show them, and those that residuals are measured in.
+
+    As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
+    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Then the
+    degrees of freedom of all that was seen, and the ratio.
+    """
+    rules, past = model.errors, before.of(matches.names)
+    sums, ratio = model.memory * past, 0.0
+    own, variances, *_ = estimate or errors_seen(matches, count, sums, rules)
+    known, degrees = float(past[1].sum()), float(own[1].sum())
+    if known >= model.known and degrees >= 1:
+        ratio = float((own[0] / pooled(past, rules, 0.0)).sum()) / degrees
+        ratio /= float(fdtri(degrees, known, model.by_chance))
+    told = sums + own / [[max(ratio, 1.0)], [1.0]]
+    if ratio > 1:
+        sums = np.zeros_like(past)
+        own, variances, *_ = errors_seen(matches, count, sums, rules)
+    sums = sums + own
+    degrees = float(sums[1].sum())
+    scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
+    return variances, scale, told, degrees, ratio
+
+
 def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Floats]:
     """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
 
@@ -184,6 +198,26 @@ def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats]
     return columns, np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
 
 
+def _lasting(
+    before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel
+) -> tuple[Biases, Floats, Floats]:
+    """Sums [A | v] with those (q, q + 1) of a frame, and what they show of fields that last.
+
+    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
+    """
+    if names in before and before[names].shape == shown.shape:
+        shown = model.bias_memory * before[names] + shown
+    others = [(own, sums) for own, sums in before.items() if own != names]
+    biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
+    A, v = shown[:, :-1], shown[:, -1]
+    if model.bias:
+        S = np.linalg.inv(A + np.eye(len(v)) / model.bias**2)
+        mean, degrees = S @ v, float((S * A).sum())
+        if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
+            return biases, mean, S + np.outer(mean, mean)
+    return biases, np.zeros_like(v), np.zeros_like(A)
+
+
 def _normal_equations(
     r: Floats, redundancy: float, fields: Floats, left: Floats, pulls: Floats, kinds: Floats
 ) -> Floats:
@@ -199,56 +233,6 @@ def _normal_equations(
         moments[0, 0], moments[0, 4] = redundancy, r @ r
         moments[1:, 4] = pulls**2 @ kinds[:, 1:]
     return moments
-
-
-def _level(
-    matches: Matches,
-    before: RememberedNoise,
-    count: int,
-    model: NoiseModel,
-    estimate: NoiseEstimate | None,
-) -> tuple[Floats, Floats, Floats, float, float]:
-    """Variances (L,) as offsets show them, and those that residuals are measured in.
-
-    As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Then the
-    degrees of freedom of all that was seen, and the ratio.
-    """
-    rules, past = model.errors, before.of(matches.names)
-    sums, ratio = model.memory * past, 0.0
-    seen = estimate or errors_seen(matches, count, sums, rules)
-    known, degrees = float(past[1].sum()), float(seen.own[1].sum())
-    if known >= model.known and degrees >= 1:
-        ratio = float((seen.own[0] / pooled(past, rules, 0.0)).sum()) / degrees
-        ratio /= float(fdtri(degrees, known, model.by_chance))
-    told = sums + seen.own / [[max(ratio, 1.0)], [1.0]]
-    if ratio > 1:
-        sums = np.zeros_like(past)
-        seen = errors_seen(matches, count, sums, rules)
-    sums = sums + seen.own
-    degrees = float(sums[1].sum())
-    scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return seen.variances, scale, told, degrees, ratio
-
-
-def _lasting(
-    before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel
-) -> tuple[Biases, Floats, Floats]:
-    """Sums [A | v] with those (q, q + 1) of a frame, and what they show of fields that last.
-
-    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
-    """
-    if names in before and before[names].shape == shown.shape:
-        shown = model.bias.memory * before[names] + shown
-    others = [(own, sums) for own, sums in before.items() if own != names]
-    biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
-    A, v, deviation = shown[:, :-1], shown[:, -1], model.bias.deviation
-    if deviation:
-        S = np.linalg.inv(A + np.eye(len(v)) / deviation**2)
-        mean, degrees = S @ v, float((S * A).sum())
-        if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
-            return biases, mean, S + np.outer(mean, mean)
-    return biases, np.zeros_like(v), np.zeros_like(A)
 
 
 def _variances(
@@ -272,3 +256,65 @@ def _variances(
     once = own[0, 1:4] + [fields * met, fields * met, fields * own[0, 3] + least]
     squared = own.diagonal()[1:] + believed[1:]
     return variances, once**2 / np.maximum(squared, least)
+
+
+def inverses(information: Floats) -> Floats:
+    """Inverses of information matrices (..., k, k).
+
+    Directions that the data leave open get the variance that their information says: large, and
+    at most what float64 can invert.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(axis1=-2, axis2=-1), 1e-18))
+    both = scale[..., :, None] * scale[..., None, :]
+    values, vectors = np.linalg.eigh(information * both)
+    # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+    halves = vectors / np.sqrt(np.maximum(values, 1e-14))[..., None, :]
+    return np.asarray(halves @ halves.swapaxes(-2, -1) * both)
+
+
+def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε².
+
+    What features tell that are off by `spreads` (K, N, 3, 3) in the world is less.
+    """
+    frames, sensors, n, m, _ = found.J.shape
+    by_feature, weights = (frames, n, sensors * m, 6), found.shares / variances[..., None]
+    rows = found.J, weights[..., None, None] * found.J
+    J, scaled = (one.swapaxes(1, 2).reshape(by_feature) for one in rows)
+    information = scaled.swapaxes(2, 3) @ J
+    if spreads is not None:
+        place = information[..., :3, :3]
+        taken = spreads @ np.linalg.inv(np.eye(3) + place @ spreads)
+        information = information - information[..., :3] @ taken @ information[..., :3, :]
+    return np.asarray(information.sum(axis=1))
+
+
+def invert_information(information: Floats, free: Mask) -> Floats:
+    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
+    inner, covariance = np.ix_(free, free), np.zeros((6, 6))
+    covariance[inner] = inverses(information[inner])
+    # so much larger than if all other directions were known
+    inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
+    unknown = inflation > 1e9
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
+def expected_covariance(
+    sensors: Sequence[Sensor],
+    sigmas: Sequence[float],  # σ_ε, sensor units
+    body: Body,
+    T_world_object: Floats,
+    free: Mask,
+) -> tuple[Floats, list[int]]:
+    """Covariance that one frame gives when every feature in view is found with error σ_ε.
+
+    As `invert_information` has it, in the axes of `mixpose.rigid`; and the number of features
+    that each sensor sees.
+    """
+    at = project_body(tuple(sensors), body).project(T_world_object[None])
+    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
+    information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
+    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
+    return invert_information(information, free), counts

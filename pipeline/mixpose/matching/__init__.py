@@ -5,12 +5,13 @@ from mixpose.matching.associate import (
     associate as associate,
     crowding as crowding,
 )
-from mixpose.matching.errors import (
+from mixpose.matching.matches import (
     LEAST_VARIANCE as LEAST_VARIANCE,
     ErrorRules as ErrorRules,
+    Matches as Matches,
     NoiseEstimate as NoiseEstimate,
     errors_seen as errors_seen,
     log_likelihood as log_likelihood,
     pooled as pooled,
+    welsch as welsch,
 )
-from mixpose.matching.matches import Matches as Matches

@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING, peak
@@ -27,21 +25,10 @@ from mixpose.sensors import by_calibration
 class AssociationRules:
     """When a feature counts as met."""
 
-    min_share: float = constant(
-        0.3, "of a feature's peak density: within 2.2 σ_ε; false features pass for true ones beyond"
-    )
-    min_region: float = constant(
-        20.0, "σ_ε over which features crowd at least: two alone make no infinite density"
-    )
-    crowded: bool = constant(
-        True, "whether clutter is as dense as detections around the body, where they are denser"
-    )
-    merged: bool = constant(
-        True, "whether two features may share one detection: blobs that touch have one centre"
-    )
-    slip: float = constant(
-        0.25, "of the body's size, around it: where a slipped grid (steps of 1/8) has detections"
-    )
+    min_share: float = constant(0.3, "of a feature's peak: within 2.2 σ_ε; false ones pass beyond")
+    min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
+    crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
+    slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
     def reach_squared(self) -> float:
@@ -63,11 +50,9 @@ def associate(
     if body.spread:  # variances along an axis by which features may be off
         spreads = body.node_spreads(T_world_object)
         reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
-    # shares, offsets in sensor units, detections, and partners of features in merged pairs
-    met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
-    shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
+    by, offsets = _nearest(y, detections, rules.reach_squared * reach, is_open)
+    shares = np.where(by >= 0, weights, 0.0)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
@@ -75,8 +60,6 @@ def associate(
         shares[k, of], offsets[k, of, :m] = _residuals(
             *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
         )
-    paired, J = np.nonzero(partner >= 0), J / sigmas[:, None, None, None]
-    J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
@@ -86,11 +69,10 @@ def associate(
         shares=shares,
         places=y,
         offsets=offsets / sigmas[:, None, None],
-        J=J,
+        J=J / sigmas[:, None, None, None],
         detections=by,
         explained=np.minimum(explained, 1.0),
         unseen=(body.nodes.weights * (match.faced[:, 0] & ~seen)).sum(axis=1),
-        merged=np.bincount(paired[0], minlength=len(views)) // 2,
         count=count,
         crowd=crowd,
         unmatched_nearby=unmatched,
@@ -110,17 +92,14 @@ def _detections(views: Sequence[View]) -> Floats:
     return detections
 
 
-def _to_nearest(
+def _nearest(
     y: Floats,
-    weights: Floats,
     detections: Floats,
     reach: Floats,  # (L, n) squared, in sensor units
     is_open: Mask,
-    merged: bool,
-    met: tuple[Floats, Floats, Indices, Indices],
-) -> None:
-    """Write what the nearest detections meet, each taken once or by a pair of features."""
-    shares, offsets, by, _ = met
+) -> tuple[Indices, Floats]:
+    """By which detection each feature is met (L, n), and its offset; each is taken once."""
+    by, offsets = np.full(is_open.shape, -1), np.zeros(y.shape)
     away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
@@ -128,37 +107,8 @@ def _to_nearest(
     for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
         if by[k, i] < 0 and (k, j) not in taken:
             taken.add((k, j))
-            shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
-    if merged and len(taken) < len(order):
-        # only a feature near a detection that is taken can share it
-        for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
-            _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
-
-
-def _run_together(
-    y: Floats,
-    weights: Floats,
-    reach: Floats,
-    is_open: Mask,
-    met: Sequence[NDArray[Any]],
-) -> None:
-    """Let two features share a detection that lies nearer to their middle than to either.
-
-    Images that overlap are detected as one.  The two count as one feature in their middle.
-    """
-    shares, offsets, detections, partner = met
-    single = shares > 0
-    for i in np.flatnonzero(is_open & ~single).tolist():
-        places = y + offsets
-        near = single & (((places - y[i]) ** 2).sum(axis=1) <= reach[i])
-        middle = places - (y + y[i]) / 2
-        closer = (middle**2).sum(axis=1) - (offsets**2).sum(axis=1)
-        k = int(np.argmin(np.where(near, closer, np.inf)))
-        if near[k] and closer[k] < 0:
-            pair = [i, k]
-            shares[pair], offsets[pair] = weights[pair] / 2, middle[k]
-            partner[pair], detections[pair] = pair[::-1], detections[k]
-            single[k] = False
+            by[k, i], offsets[k, i] = j, away[k, i, j]
+    return by, offsets
 
 
 def _residuals(
@@ -172,9 +122,8 @@ def _residuals(
 ) -> tuple[Floats, Floats]:
     """Shares and offsets by which a grid of values puts features (n, m) from their predictions.
 
-    Around a prediction that fits, C is the predicted mixture blurred alike, each feature with an
-    amplitude of its own about `amplitude`, or with that where they are not `unlike`.  What is left
-    of the gradient once all are taken off is the pull on this feature alone.
+    C is the predicted mixture blurred alike, each feature with an amplitude of its own where they
+    are `unlike`.  What is left of the gradient without all others is the pull on a feature.
     """
     n, top, away = len(y), peak(variance, y.shape[1]), y[:, None] - y[None]
     bells = weights * np.exp(-0.5 * (away * away).sum(axis=-1) / variance) * top
@@ -204,9 +153,8 @@ def _surroundings(
     detections: Floats,
     rules: AssociationRules,
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Number of detections of L sensors, their density, those of no feature, and the finest blur.
-
-    All but the first go by the box of the features in view at places y (L, n, 2).
+    """Number of detections of L sensors, and around features in view at places y (L, n, 2), their
+    density, those of no feature, and the finest blur.
     """
     observations = [view.observation for view in objective.views]
     sigmas = np.array([one.sigma for one in observations])
@@ -214,8 +162,7 @@ def _surroundings(
     in_view = np.where(seen[..., None], y, np.nan)
     lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
     size, middle = upper - lower, (lower + upper) / 2
-    smallest = np.tile(rules.min_region * sigmas[:, None], 2)
-    smallest[is_flat, 1] = sigmas[is_flat]
+    smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     no_box = np.full_like(upper, np.nan)
     crowd = crowding(detections, lower, upper if rules.crowded else no_box, smallest) * sigmas**2
     count = np.count_nonzero(~np.isnan(detections[..., 0]), axis=1).astype(np.float64)
@@ -237,10 +184,8 @@ def _surroundings(
 
 
 def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | float) -> Floats:
-    """Detections (...,) per unit of coordinates, in all or in boxes where they are denser.
-
-    Of points (..., M, m), NaN where there are fewer, and boxes (..., m) around predicted features;
-    the side of a region counts as `smallest` at least.
+    """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,): of all, or
+    in boxes (..., m) where they are denser; a side counts as `smallest` at least.
     """
     number = np.count_nonzero(points[..., 0] == points[..., 0], axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)

@@ -1,17 +1,24 @@
-"""Poses against what all sensors observed: which feature is met by which detection, how far off.
+"""Which feature of a pose is met by which detection, how far off, and what the extraction errs by.
 
-`Matches` is the one record of this; noise, evidence, covariance, claims and reports read it.
+At a blur σ a feature r away from its prediction pulls with r exp(−r²/4σ²), as in robust least
+squares with the loss of Welsch.  Offsets of standard deviation s, weighted so, have the variance q
+with 1/q = 1/s² + 1/2σ².  σ = 1.5 s and s² = q / (1 − q / 2σ²) follow from one another, from σ_ε
+down and from what is known upwards, to where they agree.  Lengths are in σ_ε of their sensor.
+Of noise, squares of residuals and degrees of freedom are added up (2, L): sensor by sensor.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
+from mixpose.constants import constant
+from mixpose.density import DRAWING
 from mixpose.records import Floats, Indices, Mask
 
 
@@ -19,9 +26,8 @@ from mixpose.records import Floats, Indices, Mask
 class Matches:
     """L sensors at the N features (nodes) of a body, at one pose, or by a leading axis at K.
 
-    A feature that a sensor does not have in view has no weight, one that is not met has no share;
-    what is not there has no offset and no Jacobian.  A sensor of one coordinate has 0 as its
-    second.
+    What is not in view has no weight, what is not met no share; what is not there no offset and no
+    Jacobian.  A sensor of one coordinate has 0 as its second.
     """
 
     names: tuple[str, ...]  # of the sensors
@@ -30,12 +36,11 @@ class Matches:
     weights: Floats  # (..., L, N) of the features in view; 0 of the others
     shares: Floats  # (..., L, N) how far each is met, 0 to its weight
     places: Floats  # (..., L, N, 2) where they are predicted, sensor units
-    offsets: Floats  # (..., L, N, 2) observed minus predicted, σ_ε; of a merged pair its middle's
+    offsets: Floats  # (..., L, N, 2) observed minus predicted, σ_ε
     J: Floats  # (..., L, N, 2, 6) Jacobian of the predicted places by the pose, σ_ε
     detections: Indices  # (..., L, N) by which each is met; -1 for none
     explained: Floats  # (..., L) share of the sensor's density that the pose accounts for
     unseen: Floats  # (..., L) weight of the features that face the sensor outside its view
-    merged: Indices  # (..., L) pairs of features that share a detection
     count: Floats  # (..., L) number of detections
     crowd: Floats  # (..., L) of them per m-th power of σ_ε, around the prediction
     unmatched_nearby: Floats  # (..., L) of no feature, about the body, where some feature is missed
@@ -44,9 +49,10 @@ class Matches:
 
     def at(self, index: int | list[int] | None) -> Matches:
         """At one of K poses; None makes K = 1 of one."""
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in _BY_POSE}
-        for name, array in arrays.items():
-            arrays[name] = None if array is None else array[index]
+        arrays: dict[str, Any] = {
+            name: None if (array := getattr(self, name)) is None else array[index]
+            for name in _BY_POSE
+        }
         return replace(self, **arrays)
 
     def of_sensors(self, chosen: Sequence[int] | Mask | Indices) -> Matches:
@@ -132,3 +138,122 @@ class Matches:
 
 _BY_SENSOR = ("names", "dimensions", "sigmas")
 _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SENSOR])
+
+
+@dataclass(frozen=True)
+class ErrorRules:
+    """What is believed of the extraction's error before offsets are seen."""
+
+    typical: float = constant(0.2, "of σ_ε: centres of blobs err by 0.01-0.3 px, σ_ε is 1.5 px")
+    typical_degrees: float = constant(
+        4.0, "degrees of freedom that `typical` counts as, and all sensors for one: two features"
+    )
+    blur: float = constant(1.5, "of the noise: Welsch's loss is then 95 % as efficient as squares")
+    narrowest: float = constant(0.05, "of σ_ε, the last blur: centres err by 0.03 σ_ε at best")
+    astray: float = constant(0.1, "chance that an offset within `met` is no noise: a cut spot")
+    met: float = constant(3.0, "σ_ε within which detections may be a feature's: pull 1/10")
+    outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
+
+    @property
+    def reach(self) -> float:
+        """σ_ε around features within which detections count: as far as C is drawn, and `met`."""
+        return math.sqrt(2) * DRAWING.reach + self.met
+
+
+LEAST_VARIANCE = float(np.finfo(np.float32).eps)
+"""In σ_ε²: densities of single precision do not resolve smaller offsets."""
+
+
+NoiseEstimate: TypeAlias = tuple[Floats, Floats, Floats, Floats]
+"""What offsets show: squares, in σ_ε², and degrees of freedom (2, L) of each sensor in the frame;
+variances (L,) of its noise, together with what was known; its blurs (L,) in σ_ε, and those by what
+was known before the frame."""
+
+
+def welsch(squared: Floats, blurs: Floats) -> Floats:
+    """How much squared offsets (L, N) count at blurs (L,), in least squares with Welsch's loss."""
+    return np.asarray(np.exp(squared * (-0.25 / (blurs * blurs))[:, None]))
+
+
+def errors_seen(
+    matches: Matches, free: int, known: Floats, rules: ErrorRules = ErrorRules()
+) -> NoiseEstimate:
+    """How large errors are, of matches at a pose fitted to them in so many free directions.
+
+    `known` (2, L) has the squares and degrees of freedom of each sensor's noise so far.
+    """
+    before = _blurs(pooled(known, rules, rules.typical_degrees), matches, rules)
+    given = before, matches, free, known, rules
+    at = np.ones(len(before))
+    wide = _seen_at(at, *given)
+    while (wide[2] <= 0.9 * at).any():
+        at = np.minimum(wide[2], at)
+        wide = _seen_at(at, *given)
+    if (wide[2] <= 1.2 * before).all():
+        return wide
+    at, narrow = before, _seen_at(before, *given)
+    for _ in range(3):  # as a rule it takes one
+        if (narrow[2] <= 1.2 * at).all():
+            break
+        at, narrow = narrow[2], _seen_at(narrow[2], *given)
+    return max(wide, narrow, key=lambda seen: log_likelihood(seen[2], matches, free, rules))
+
+
+def _blurs(variances: Floats, matches: Matches, rules: ErrorRules) -> Floats:
+    """Blurs (L,) that suit a noise."""
+    return np.minimum(np.maximum(rules.blur * np.sqrt(variances), matches.finest), 1.0)
+
+
+def _seen_at(
+    blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
+) -> NoiseEstimate:
+    """The same, as seen at one blur (L,) for each sensor."""
+    squared, m = matches.squared, matches.dimensions
+    weights = matches.shares * welsch(squared, blurs)
+    coordinates = m * weights.sum(axis=1) + 1e-12
+    q = (weights * squared).sum(axis=1) / coordinates
+    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+    factor = 1 / (1 - np.minimum(0.5 * q / (blurs * blurs), 0.5))
+    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+    degrees = factor ** (m / 2) * coordinates
+    most = float(degrees.sum())
+    # shares do not add up to whole ones: half a degree of freedom is none
+    left = 1 - free / most if most - free > 0.5 else 0.0
+    own = np.array([factor * q * degrees if left else 0.0 * q, degrees * left])
+    variances = pooled(known + own, rules, rules.typical_degrees)
+    # narrower only where this frame alone allows it, too: it may not be like those before it
+    wide = np.maximum(variances, pooled(own, rules, 0.0))
+    # half way to all sensors': what calibrations err by is in no sensor's own noise
+    wide = (wide + float(wide @ coordinates) / float(coordinates.sum())) / 2
+    return own, variances, _blurs(wide, matches, rules), before
+
+
+def log_likelihood(
+    blurs: Floats, matches: Matches, free: int, rules: ErrorRules = ErrorRules()
+) -> float:
+    """Of offsets, normal ones and some that are anywhere, less that of none being noise.
+
+    What a pose is free to fit is paid for.  Blurs (L,) go by the noise.
+    """
+    m, variances = matches.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2
+    peaks = (2 * np.pi * variances) ** (-0.5 * m)
+    anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
+    odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * matches.squared / variances)
+    believed = m * matches.shares * odds / (1 + odds)
+    logs = believed * np.log(2 * np.pi * variances)
+    price = 0.5 * free * float(logs.sum()) / max(float(believed.sum()), 1e-12)
+    return float((matches.shares * np.log1p(odds)).sum()) + price
+
+
+def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
+    """Variances (L,) of squares and degrees of freedom (2, L), each drawn to that of all sensors.
+
+    In that the typical variance counts as `typical` degrees of freedom.
+    """
+    squares, degrees = sums
+    total_squares, total_degrees = sums.sum(axis=1).tolist()
+    most = total_degrees + typical
+    common = (total_squares + typical * rules.typical**2) / max(most, 1e-12)
+    pull = min(rules.typical_degrees, most)
+    variances = (squares + pull * common) / np.maximum(degrees + pull, 1e-12)
+    return np.asarray(np.maximum(variances, LEAST_VARIANCE))

@@ -16,7 +16,7 @@ import numpy as np
 
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverses, nearest_alike
-from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen
+from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
@@ -142,10 +142,10 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
         squares = ((matches.J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
         beside = float(np.sqrt(squares.max(initial=0.0, where=seen)))
         errors, known = frame.rules.judgement.noise.errors, frame.noise[:, chosen]
-        noise = errors_seen(matches, int(frame.free.sum()), known, errors).blurs
+        _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
         blurs = np.minimum(np.hypot(noise, errors.blur * beside), 1.0)
-    pull = np.sqrt(matches.shares * np.exp(-0.25 * matches.squared / blurs[:, None] ** 2))
+    pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
     kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
     numbers = np.arange(len(views))[:, None, None]
     return Offsets(

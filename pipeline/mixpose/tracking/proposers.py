@@ -263,28 +263,26 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     """Least squares with the middle of two features that run into each other in one detection."""
     if not likelihood.knows_detections:
         return []
-    at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
+    reach = frame.rules.judgement.association.reach_squared
+    T, paired = judged.T_world_object, _paired(judged.matches, reach)
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
-        if not seen.merged.any():
+        if paired is None:
             break
-        J, offsets = seen.rows()
-        step = gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free)
-        start = Start(perturb(at.T_world_object, step))
-        at = likelihood.judge(likelihood.fit(start), start)
-        seen = at.matches
-    return [] if at is judged else [Start(at.T_world_object)]
+        J, offsets = paired.rows()
+        T = perturb(T, gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free))
+        start = Start(T)
+        paired = _paired(likelihood.judge(likelihood.fit(start), start).matches, reach)
+    return [] if T is judged.T_world_object else [Start(T, matches=paired)]
 
 
-def _paired(seen: Matches, reach: float) -> Matches:
+def _paired(seen: Matches, reach: float) -> Matches | None:
     """In each sensor the feature missed nearest to the detection of another, as one with that.
 
-    `reach` is how far that may be, squared, in variances of C.
+    `reach` is how far that may be, squared, in variances of C; None where there is no such pair.
     """
-    if not seen.missed.any():
-        return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
-    merged = seen.merged.copy()
-    for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
+    detections = seen.detections.copy()
+    for k in np.flatnonzero((seen.missed > 0) & (seen.met > 0)):
         met = np.flatnonzero(seen.detections[k] >= 0)
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
         if not len(met) or not len(lost):
@@ -298,9 +296,10 @@ def _paired(seen: Matches, reach: float) -> Matches:
         pair = [lost[i], met[j]]
         shares[k, pair] = shares[k, met[j]] / 2
         offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
-        J[k, pair] = J[k, pair].mean(axis=0)
-        merged[k] = 1
-    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged)
+        J[k, pair], detections[k, pair] = J[k, pair].mean(axis=0), detections[k, met[j]]
+    if (shares == seen.shares).all():
+        return None
+    return replace(seen, shares=shares, offsets=offsets, J=J, detections=detections)
 
 
 def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
