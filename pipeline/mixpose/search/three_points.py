@@ -33,6 +33,7 @@ _ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of 
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
 FIRST, SECOND = np.transpose(SIDES)
+_EACH = np.arange(3)
 
 
 def gathered(points: Floats, corners: Indices) -> Floats:
@@ -51,8 +52,8 @@ def align_triples(body: Floats, world: Floats) -> Floats:
     # between the corners as seen from their centres, in the planes
     turn = side * side_world + third.conj() * third_world
     turn -= (side + third).conj() * (side_world + third_world) / 3
-    length = np.abs(turn)
-    turn = np.where(length < _TINY, 1.0, turn / np.maximum(length, _TINY))
+    turn = np.where(turn == 0, 1.0, turn)
+    turn /= np.abs(turn)
     c, s = turn.real, turn.imag
     R = axes[0][:, None] * (c * x - s * y)
     R += axes[1][:, None] * (s * x + c * y)
@@ -63,18 +64,15 @@ def align_triples(body: Floats, world: Floats) -> Floats:
 
 def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.complex128]]:
     """Axes (3, K each), the first side's length (K,), and the third corner in the plane, x + iy."""
-    side, second = triangles[1] - triangles[0], triangles[2] - triangles[0]
+    side, second = triangles[1:] - triangles[0]
     length = np.sqrt(_dot(side, side))
     x = side / np.maximum(length, _TINY)
     x[0, length == 0] = 1.0  # two at one place: any direction
     across = cross(x, second)
-    height = np.sqrt(_dot(across, across))
-    third = _dot(x, second) + 1j * height
-    flat = height <= _ROUNDING * np.abs(third)
-    if flat.any():  # three in a row: any plane through them
-        across = np.where(flat, cross(x, np.eye(3)[:, np.abs(x).argmin(axis=0)]), across)
-        height = np.sqrt(_dot(across, across))
-    z = across / np.maximum(height, _TINY)
+    third = _dot(x, second) + 1j * np.sqrt(_dot(across, across))
+    flat = third.imag <= _ROUNDING * np.abs(third)  # three in a row: any plane through them
+    across[:, flat] = cross(x[:, flat], np.eye(3)[:, np.abs(x[:, flat]).argmin(axis=0)])
+    z = across / np.sqrt(_dot(across, across))
     return (x, cross(z, x), z), length, third
 
 
@@ -96,27 +94,37 @@ def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
     1, 0 and 2, 1 and 2 (3, K) each.
     """
     with np.errstate(all="ignore"):
-        D1, D2 = _conics(cosines, squared)
+        laws = np.zeros((3, 3, 3, cosines.shape[1]))  # λᵀ M λ = d²
+        laws[_EACH, FIRST, FIRST] = laws[_EACH, SECOND, SECOND] = 1.0
+        laws[_EACH, FIRST, SECOND] = laws[_EACH, SECOND, FIRST] = -cosines
+        D1, D2 = (squared[2] * laws[k] - squared[k] * laws[2] for k in (0, 1))
         larger = np.where(np.abs(D1).sum(axis=(0, 1)) >= np.abs(D2).sum(axis=(0, 1)), D1, D2)
-        found = []
-        for line in _two_lines(D1 + _pencil_root(D1, D2) * D2):
-            for ratios in _cut(line, larger):
-                # made distances by the sum of the three cosine laws
-                sides, _ = _sides_squared(ratios, cosines)
-                scale = np.sqrt(squared.sum(axis=0) / sides.sum(axis=0))
-                found.append(ratios * (np.sign(ratios[0]) * scale))
-        x = np.concatenate(found, axis=1)
+        lines = _two_lines(D1 + _pencil_root(D1, D2) * D2)
+        x = np.concatenate([ratios for line in lines for ratios in _cut(line, larger)], axis=1)
+        x *= np.sign(x[0])
         which = np.flatnonzero((x > 0).all(axis=0))
         x, which = x[:, which], which % cosines.shape[1]
-        return _polished(x, which, cosines[:, which], squared[:, which])
+        cosines, squared = cosines[:, which], squared[:, which]
+        # made distances by the sum of the three cosine laws
+        x *= np.sqrt(squared.sum(axis=0) / _sides_squared(x, cosines)[0].sum(axis=0))
+        for _ in range(2):  # Newton's method doubles the digits each time
+            sides, J = _sides_squared(x, cosines)
+            cofactors = _cofactors(J)
+            step = np.einsum("ijk,ik->jk", cofactors, sides - squared)
+            step /= 2 * _dot(J[0], cofactors[0])
+            x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
+        off = np.abs(_sides_squared(x, cosines)[0] - squared)
+        # steps from double roots end a thousandth off
+        exact = ((off <= 1e-3 * squared.max(axis=0)) & (x > 0)).all(axis=0)
+        return x[:, exact], which[exact]
 
 
-def _conics(cosines: Floats, squared: Floats) -> tuple[Floats, Floats]:
-    """M01 d12² − M12 d01² and M02 d12² − M12 d02² (3, 3, K), where λᵀ M_ij λ = d_ij²."""
-    (c01, c02, c12), (a01, a02, a12), o = -cosines, squared, np.zeros_like(squared[0])
-    D1 = [[a12, c01 * a12, o], [c01 * a12, a12 - a01, -c12 * a01], [o, -c12 * a01, -a01]]
-    D2 = [[a12, o, c02 * a12], [o, -a02, -c12 * a02], [c02 * a12, -c12 * a02, a12 - a02]]
-    return np.array(D1), np.array(D2)
+def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, Floats]:
+    """Sides squared (3, K) by the cosine laws, and half their Jacobian (3, 3, K)."""
+    J = np.zeros((3, *x.shape))
+    J[_EACH, FIRST] = x[FIRST] - x[SECOND] * cosines
+    J[_EACH, SECOND] = x[SECOND] - x[FIRST] * cosines
+    return (J * x).sum(axis=1), J
 
 
 def _cofactors(A: Floats) -> Floats:
@@ -126,9 +134,8 @@ def _cofactors(A: Floats) -> Floats:
 def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     """A real γ with det(D1 + γ D2) = 0 (K,), of three the one farthest from the others."""
     A1, A2 = _cofactors(D1), _cofactors(D2)
-    d, c, b, a = (
-        np.einsum("ijk,ijk->k", A, D) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2))
-    )
+    pairs = (A1, D1), (A1, D2), (A2, D1), (A2, D2)
+    d, c, b, a = (np.einsum("ijk,ijk->k", A, D) for A, D in pairs)
     a = np.where(a == 0, _TINY, a / 3)
     b, c, d = b / a, c / a, d / (3 * a)
     p, q = c - b * b / 3, (2 * b * b / 27 - c / 3) * b + d
@@ -148,55 +155,26 @@ def _two_lines(C: Floats) -> tuple[Floats, Floats]:
     k = diagonal.argmax(axis=0)
     N = C + _crossed(B[:, k, every] / np.sqrt(diagonal[k, every]))
     row, column = np.divmod(np.abs(N).reshape(9, -1).argmax(axis=0), 3)
-    return N[row, [[0], [1], [2]], every], N[:, column, every]
+    return N[row, :, every].T, N[:, column, every]
 
 
 def _crossed(v: Floats) -> Floats:
     """Matrices (3, 3, K) by which cross products with vectors (3, K) are taken."""
-    (x, y, z), o = v, np.zeros_like(v[0])
-    return np.array([[o, -z, y], [z, o, -x], [-y, x, o]])
+    return cross(v[:, None], np.eye(3)[..., None])
 
 
 def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
     """Where lines (3, K) meet conics (3, 3, K): two times ratios (3, K), NaN where not real."""
     # two points that span the line: its cross products with the axes that it is least along
     by, most = _crossed(line), np.abs(line).argmax(axis=0)
-    P = np.where(most == 0, by[:, 1], by[:, 0])
-    Q = np.where(most == 2, by[:, 1], by[:, 2])
-    CP, CQ = (np.einsum("ijk,jk->ik", C, each) for each in (P, Q))
-    a, b, c = (Q * CQ).sum(axis=0), (P * CQ).sum(axis=0), (P * CP).sum(axis=0)
+    P, Q = np.where(most == 0, by[:, 1], by[:, 0]), np.where(most == 2, by[:, 1], by[:, 2])
+    CP, CQ = (np.einsum("ijk,jk->ik", C, one) for one in (P, Q))
+    a, b, c = _dot(Q, CQ), _dot(P, CQ), _dot(P, CP)
     square = b * b - a * c
     square = np.where(square < -_ROUNDING * b * b, np.nan, np.maximum(square, 0.0))
     w = -(b + np.copysign(np.sqrt(square), b))
     # w/a and c/w, as homogeneous pairs so that neither division can fail
     return a * P + w * Q, w * P + c * Q
-
-
-def _polished(
-    x: Floats, which: Indices, cosines: Floats, squared: Floats
-) -> tuple[Floats, Indices]:
-    """Newton steps on the three cosine laws, and the solutions that satisfy them in the end."""
-    o = np.zeros_like(x[0])
-    for _ in range(2):  # Newton's method doubles the digits each time
-        sides, (a, b, c, d, e, f) = _sides_squared(x, cosines)
-        J = np.array([[a, b, o], [c, o, d], [o, e, f]])
-        cofactors = _cofactors(J)
-        step = np.einsum("ijk,ik->jk", cofactors, sides - squared)
-        step /= 2 * (J[0] * cofactors[0]).sum(axis=0)
-        x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
-    off = np.abs(_sides_squared(x, cosines)[0] - squared)
-    # steps from double roots end a thousandth off
-    exact = ((off <= 1e-3 * squared.max(axis=0)) & (x > 0)).all(axis=0)
-    return x[:, exact], which[exact]
-
-
-def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, list[Floats]]:
-    """Sides squared (3, K) by the cosine laws, and half their slopes by either distance."""
-    sides, slopes = np.empty_like(x), []
-    for k, (i, j) in enumerate(SIDES):
-        slopes += [x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]]
-        sides[k] = x[i] * slopes[-2] + x[j] * slopes[-1]
-    return sides, slopes
 
 
 class Generator(NamedTuple):
