@@ -30,7 +30,7 @@ from mixpose.search.problem import (
     sensor_detections,
 )
 from mixpose.search.scoring import count_inliers, evidence, label_image
-from mixpose.search.three_points import Generator, far_apart, from_three_rays
+from mixpose.search.three_points import Guesses, far_apart, from_three_rays
 
 
 class Candidate(NamedTuple):
@@ -100,7 +100,7 @@ def search_frame(
     return SearchResult(search.candidates(), SearchReport(**search.cost), after)
 
 
-def generators_of(problem: SearchProblem) -> list[Generator]:
+def generators_of(problem: SearchProblem) -> list[Guesses]:
     """Ways to make guesses from rays, the quickest first.
 
     Points in space; one such point and two rays, in crowds at last; three rays of one camera.
@@ -177,7 +177,7 @@ class _Search:
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
-    def _draw(self, generator: Generator, most: float, skipped: int = 0) -> int:
+    def _draw(self, generator: Guesses, most: float, skipped: int = 0) -> int:
         """Batches tried of a generator until `most` guesses were made, the best of them refined.
 
         The guesses that explain most distinct detections, and among equals most closely, are
@@ -186,11 +186,11 @@ class _Search:
         budget, body, length = self._budget, self._body, self._budget.refined(len(self._body))
         few = sparse(body, 2 * budget.sample)
         poses, ranks, best, checked, done = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0, skipped
-        for batch in islice(generator.batches, skipped, None):
+        for make in islice(generator, skipped, None):
             if self.cost["made"] >= most:
                 break
             done += 1
-            more = self._problem.allowed(generator.poses(batch))
+            more = self._problem.allowed(make())
             self.cost["made"] += len(more)
             if few is not body and len(more) > budget.shortlist:
                 rank = self._count(few, more)

@@ -12,11 +12,11 @@ runs over long rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import combinations, permutations, product
 from math import comb, perm
-from typing import Any, NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,8 @@ from mixpose.rigid import from_parts
 from mixpose.search.problem import SearchProblem
 from mixpose.sensors import Rays
 
-Triples: TypeAlias = tuple[Indices, Indices]  # (3, K) detections, and the features they may be
+# batches of poses (K, 4, 4), worked out when they are called: what is skipped costs nothing
+Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 
 _TINY = np.finfo(np.float64).tiny
 _ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers
@@ -177,19 +178,11 @@ def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
     return a * P + w * Q, w * P + c * Q
 
 
-class Generator(NamedTuple):
-    """A way to make guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
-
-    name: str
-    batches: Iterable[Any]
-    poses: Callable[[Any], Floats]
-
-
-def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Generator:
+def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Guesses:
     """Poses from triples of one camera's rays, whose detections err by `reach` px at most."""
     solve = _perspective if rays.central else _orthographic
-    chunks = _problems(problem, rays) if min(len(rays), len(problem.body)) > 2 else []
-    return Generator("three rays", chunks, partial(solve, problem.body.means, reach, rays))
+    for triples in ray_triples(problem, rays) if min(len(rays), len(problem.body)) > 2 else ():
+        yield partial(solve, problem.body.means, reach, rays, *triples)
 
 
 def far_apart(points: Floats, count: int) -> Indices:
@@ -202,8 +195,8 @@ def far_apart(points: Floats, count: int) -> Indices:
     return np.array(chosen)
 
 
-def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
-    """Chunks of problems: three detections (3, K) as three features (3, K).
+def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
+    """Batches of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
     fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
@@ -229,18 +222,16 @@ def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
             yield by_detection[:, a], by_feature[:, b]
     if all_tried:
         return
-    near_rays, near_features = _nearest(rays.pixels), _nearest(features)
+    # indices of points, from each of them to its farthest
+    near_rays, near_features = (
+        np.argsort(np.linalg.norm(p[:, None] - p, axis=2), axis=1) for p in (rays.pixels, features)
+    )
     # a body is seen in one place, larger or smaller
     crowds = [budget.sample, 2 * budget.sample, 4 * budget.sample, M]
     for k in range(most // batch):
         crowd = crowds[k % len(crowds)]
         some, few = min(crowd, M), min(max(crowd // 2, 3), n)
         yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
-
-
-def _nearest(points: Floats) -> Indices:
-    """Indices (n, n) of points, from each of them to its farthest."""
-    return np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
 
 
 def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
@@ -250,9 +241,10 @@ def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -
     return np.stack([first, *nearest[first, chosen]])
 
 
-def _perspective(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
-    """Rays that meet in one centre."""
-    detections, corners = triples
+def _perspective(
+    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+) -> Floats:
+    """Three rays that meet in one centre."""
     between = rays.directions @ rays.directions.T
     squared = ((features[corners[FIRST]] - features[corners[SECOND]]) ** 2).sum(axis=-1)
     distances, which = depths(between[detections[FIRST], detections[SECOND]], squared)
@@ -265,12 +257,13 @@ def _perspective(features: Floats, reach: float, rays: Rays, triples: Triples) -
     return align_triples(gathered(features, corners[:, which]), world)
 
 
-def _orthographic(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
+def _orthographic(
+    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+) -> Floats:
     """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    detections, corners = triples
     body, seen = gathered(features, corners), gathered(rays.origins, detections)
     tolerance = 2 * reach * rays.offset
     length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))
