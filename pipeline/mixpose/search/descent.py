@@ -1,7 +1,4 @@
-"""Many poses at once: how guesses descend through narrowing blurs, and guesses of all orientations.
-
-These have the body's middle where the sensors see the middle of what they see.
-"""
+"""Many poses at once: how they descend through narrowing blurs, and those of all orientations."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from mixpose.objective import MatchedObjective, View, matched_objective
 from mixpose.optimise import NewtonOptions, Quadratic, ascend
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
-from mixpose.search.problem import SearchBudget, SearchProblem
+from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
 
 
 class Stage(NamedTuple):
@@ -85,40 +82,19 @@ def unlike(body: Body, poses: Floats, cell: float) -> Indices:
     return np.sort(np.unique(keys, return_index=True)[1])
 
 
-def first_of_each(body: Body, poses: Floats, count: int, alike: float) -> list[int]:
-    """Indices of the first `count` poses (H, 4, 4) that put the body somewhere else each.
-
-    Poses are one where the root mean square distance of their features, symmetries aside, is less
-    than a share `alike` of the body's radius.
-    """
-    kept, images = list[int](), np.zeros((0, len(body), 3))
-    for k, pose in enumerate(poses):
-        squares = ((transform(pose, body.means) - images) ** 2).sum(axis=-1).mean(axis=-1)
-        if len(kept) < count and (squares > (alike * body.radius) ** 2).all():
-            kept.append(k)
-            images = np.concatenate([images, transform(pose @ body.symmetries, body.means)])
-    return kept
-
-
 def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage]]:
     """Poses (H, 4, 4) of all orientations, and how to descend from them."""
-    body, budget, T_reference = problem.body, problem.budget, problem.T_reference
-    rotations = spread_turns(problem.free[3:], budget.orientation_step) @ T_reference[:3, :3]
-    shapes = _Middles(problem, body.nodes.points @ rotations.swapaxes(1, 2))
-    poses = [np.zeros((0, 4, 4))]
-    for centre in _centres(problem):
-        places = centre - rotations @ body.means.mean(axis=0)
-        places = np.where(problem.free[:3], places, T_reference[:3, 3])
-        poses.append(from_parts(rotations, shapes.approached(places, 3, limit=body.radius)))
+    budget, T_reference, free = problem.budget, problem.T_reference, problem.free
+    rotations = spread_turns(free[3:], budget.orientation_step) @ T_reference[:3, :3]
+    places = _centres(problem)[:, None] - rotations @ problem.body.means.mean(axis=0)
+    poses = from_parts(rotations, np.where(free[:3], places, T_reference[:3, 3]))
     # a turn by a step moves features by so much of their spread
-    sigmas = [
-        max(budget.orientation_step * one.moments[1] / one.sigma, 1.0) for one in problem.detections
-    ]
+    blurs = [budget.orientation_step * one.moments[1] / one.sigma for one in problem.detections]
     stages = [
-        Stage(tuple(sigma**power for sigma in sigmas), steps, survivors)
+        Stage(tuple(max(blur, 1.0) ** power for blur in blurs), steps, survivors)
         for power, steps, survivors in budget.orientation_stages
     ]
-    return np.concatenate(poses), stages
+    return poses.reshape(-1, 4, 4), stages
 
 
 def spread_turns(free: Mask, step: float) -> Floats:
@@ -148,16 +124,20 @@ def spread_rotations(count: int) -> Floats:
 
 def _centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
-    radius, places = problem.body.radius, _starts(problem)
-    middles = _Middles(problem, np.zeros((len(places), 1, 3)))
-    places = middles.approached(places, 12, limit=5 * radius)
-    off = np.sqrt(-2 * middles.linearise(places).value)
-    kept = list[int]()
-    for k in np.argsort(off, kind="stable"):
+    radius, middles = problem.body.radius, _Middles(problem.detections)
+
+    def moved(places: Floats, steps: Floats) -> Floats:
+        length = np.linalg.norm(steps, axis=1, keepdims=True)
+        return np.asarray(places + steps * np.minimum(1.0, 5 * radius / np.maximum(length, 1e-30)))
+
+    options = NewtonOptions(12, damping=1e-6, unchecked=True)
+    places = ascend(middles, _starts(problem), moved, problem.free[:3], options).states
+    off, kept = np.sqrt(-2 * middles.linearise(places).value), list[int]()
+    for k in np.argsort(off, kind="stable").tolist():
         apart = np.linalg.norm(places[k] - places[kept], axis=1)
         if off[k] < off.min() + radius and (apart > 0.2 * radius).all():
-            kept.append(int(k))
-    return places[kept[: problem.budget.sample // 2]]
+            kept.append(k)
+    return np.asarray(places[kept[: problem.budget.sample // 2]])
 
 
 def _starts(problem: SearchProblem) -> Floats:
@@ -180,36 +160,20 @@ def _starts(problem: SearchProblem) -> Floats:
     return np.where(problem.free[:3], np.array(starts).reshape(-1, 3), held)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class _Middles:
-    """Minus half the squared distance of means of points from where sensors see the middle."""
+    """Minus half the squared distance of a place from where sensors see the middle of features."""
 
-    problem: SearchProblem
-    arms: Floats  # (H, n, 3) from the places to points
+    detections: Sequence[SensorDetections]
 
     def linearise(self, places: Floats) -> Quadratic:
         """Second-order models at places (H, 3), of lengths: the sensors' units are taken off."""
-        count, points = len(places), self.arms + places[:, None]
-        A, b, off = np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros(count)
-        for one in self.problem.detections:
-            y, by_world, seen = one.view.sensor.linearise(points)
-            share = seen / np.maximum(seen.sum(axis=1, keepdims=True), 1)
-            J = np.einsum("hn,hnmk->hmk", share, by_world)
-            any_seen = np.asarray(seen.any(axis=1))
-            residual = one.moments[0] - np.einsum("hn,hnm->hm", share, y)
-            residual = np.where(any_seen[:, None], residual, 0.0)
-            scale = np.maximum((J * J).sum(axis=(1, 2)) / y.shape[2], 1e-30)
-            A += np.einsum("hmk,hml->hkl", J, J) / scale[:, None, None]
-            b += np.einsum("hmk,hm->hk", J, residual) / scale[:, None]
-            off += np.where(any_seen, (residual**2).sum(axis=1) / scale, 1e30)
-        return Quadratic(-0.5 * off, b, A)
-
-    def approached(self, places: Floats, count: int, limit: float) -> Floats:
-        """Places (H, 3) after so many steps, none longer than a limit."""
-
-        def moved(places: Floats, steps: Floats) -> Floats:
-            length = np.linalg.norm(steps, axis=1, keepdims=True)
-            return np.asarray(places + steps * np.minimum(1.0, limit / np.maximum(length, 1e-30)))
-
-        options = NewtonOptions(count, damping=1e-6, unchecked=True)
-        return np.asarray(ascend(self, places, moved, self.problem.free[:3], options).states)
+        value, pull, C = np.zeros(len(places)), np.zeros((len(places), 3)), np.zeros((1, 3, 3))
+        for one in self.detections:
+            y, J, _ = one.view.sensor.linearise(places)
+            scale = np.sqrt(np.maximum((J * J).mean(axis=1).sum(axis=1), 1e-30))[:, None]
+            J, residual = J / scale[..., None], (one.moments[0] - y) / scale
+            value -= 0.5 * (residual**2).sum(axis=1)
+            pull = pull + np.einsum("hmk,hm->hk", J, residual)
+            C = C + np.einsum("hmk,hml->hkl", J, J)
+        return Quadratic(value, pull, C)

@@ -6,7 +6,7 @@ Rows are those of `tools/benchmark.py search`, written N/hidden/false.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -39,22 +39,17 @@ class SearchBudget:
         0.02, "of angles between rays, or of sides: below it no depth and no turn is fixed"
     )
     crowded: float = constant(
-        2.0,
-        "detections for a feature above which those far apart are not tried: of the web cams' "
-        "corners the right triples drawn are 2.7 times as many",
+        2.0, "detections for a feature above which those drawn far apart are right 2.7 times less"
     )
-    behind: float = constant(3.0, "detections that a refined guess may explain less than the best")
     alike: float = constant(
-        0.05,
-        "of the body's radius: poses nearer to each other are one, and refined ones at a fifth of "
-        "it; guesses that differ by 0.03 crowd out one right pose in 150 of 8/4/8",
+        0.05, "of the radius: poses nearer are one; at 0.03 they crowd out one in 150 of 8/4/8"
     )
     convincing: float = constant(0.7, "share of the body met from which guesses are enough")
     sufficient: float = constant(0.45, "the same beyond doubt, or of spread orientations")
     beyond_doubt: float = constant(
         8.0,
-        "evidence in nats from which guesses are enough: a frame is ok from 7; of 900 frames with "
-        "clutter no other wrong pose had as much than mirror images and near twins",
+        "nats from which guesses are enough: a frame is ok from 7; of 900 frames with clutter no "
+        "other wrong poses had as much than mirror images and near twins",
     )
     outdone: float = constant(
         12.0,
@@ -63,8 +58,7 @@ class SearchBudget:
     )
     descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2), (0.4, 2)),
-        "blurs in σ_ε and steps: clutter near a feature draws less; one more at 1.5 finds no "
-        "more, and takes a quarter longer where two cameras see little else",
+        "blurs in σ_ε and steps: clutter near features draws less; one at 1.5 before finds no more",
     )
     wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
@@ -135,19 +129,17 @@ def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetection
     """Detections of all views that saw something."""
     sensors = []
     for view in views:
-        observation, pattern = view.observation, view.observation.pattern
-        if observation.is_empty:
-            continue
+        seen, pattern = view.observation, view.observation.pattern
+        points = np.zeros((0, seen.dimension))
         if isinstance(pattern, PointPattern):
             points = pattern.points[pattern.weights > 0]
-        elif observation.dimension == 2 and is_pointlike(body):
-            points = peaks(pattern, observation.sigma)
-        else:
-            sensors.append(SensorDetections(view, np.zeros((0, observation.dimension)), None))
-            continue
-        alike = Observation(PointPattern(points, np.ones(len(points))), observation.sigma)
-        even = View(view.name, view.sensor, alike, view.delay)
-        sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
+        elif seen.dimension == 2 and is_pointlike(body) and not seen.is_empty:
+            points = peaks(pattern, seen.sigma)
+        if len(points):
+            seen = Observation(PointPattern(points, np.ones(len(points))), seen.sigma)
+        if not seen.is_empty:
+            even = replace(view, observation=seen)
+            sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
     return sensors
 
 

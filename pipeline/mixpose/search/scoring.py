@@ -21,7 +21,6 @@ from mixpose.matching import Matches, crowding
 from mixpose.objective import project_body
 from mixpose.records import Floats, Indices, Mask
 from mixpose.search.problem import SearchProblem, SensorDetections
-from mixpose.search.three_points import cross
 from mixpose.sensors import Rays
 
 
@@ -39,9 +38,9 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     """Draw the detections of a camera."""
     middle = rays.directions.mean(axis=0)
     middle /= np.linalg.norm(middle)
-    side = cross(middle, np.eye(3)[np.abs(middle).argmin()])
+    side = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
     side /= np.linalg.norm(side)
-    axes, centre = np.array([side, cross(middle, side), middle]), rays.origins[0]
+    axes, centre = np.array([side, np.cross(middle, side), middle]), rays.origins[0]
     to_plane, eye = np.column_stack([axes, -axes @ centre]), np.append(centre, 1.0)
     if not rays.central:
         to_plane[2], eye = [0.0, 0.0, 0.0, 1.0], np.append(-middle, 0.0)
@@ -60,24 +59,21 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     step = max(np.median(radii) / 4, np.sqrt(np.prod(extent) / 2**24))
     margin = radii.max() + 2 * step
     columns, rows = (np.ceil((extent + 2 * margin) / step) + 1).astype(int)
-    u, v = (margin - lower) / step
-    cells = np.zeros((rows, columns), dtype=np.int32)
-    _draw(cells, places / step + np.array([u, v]), radii / step)
-    to_cells = np.array([[1 / (unit * step), 0.0, u], [0.0, 1 / (unit * step), v], [0.0, 0.0, 1.0]])
-    return LabelImage(to_cells @ to_plane, eye, cells)
-
-
-def _draw(cells: NDArray[np.int32], places: Floats, radii: Floats) -> None:
-    """Disks of labels and nearness, at places (M, 2) in cells."""
-    half = int(np.ceil(radii.max()))
-    u, v = np.floor(places).astype(np.int64).T[..., None] + np.arange(-half, half + 1)
-    du, dv = places[:, :1] - u - 0.5, places[:, 1:] - v - 0.5
-    near = 1 - np.sqrt(dv[:, :, None] ** 2 + du[:, None] ** 2) / radii[:, None, None]
+    shift = (margin - lower) / step
+    (u, v), radii = (places / step + shift).T[..., None], radii[:, None] / step
+    around = np.arange(-np.ceil(radii.max()), np.ceil(radii.max()) + 1)
+    column, row = (np.floor(middle).astype(np.intp) + around.astype(np.intp) for middle in (u, v))
+    du, dv = (u - column - 0.5) / radii, (v - row - 0.5) / radii
+    near = 1 - np.sqrt(dv[:, :, None] ** 2 + du[:, None] ** 2)
     label, iv, iu = np.nonzero(near > 0)
     value = (near[label, iv, iu] * 255).astype(np.int32)
     order = np.argsort(value, kind="stable")  # where disks overlap the nearest is drawn last
-    label, iv, iu, value = (column[order] for column in (label, iv, iu, value))
-    cells[v[label, iv], u[label, iu]] = ((label + 1) << 8) + value
+    label, iv, iu, value = (part[order] for part in (label, iv, iu, value))
+    cells = np.zeros((rows, columns), dtype=np.int32)
+    cells[row[label, iv], column[label, iu]] = ((label + 1) << 8) + value
+    to_cells = np.diag([1 / (unit * step), 1 / (unit * step), 1.0])
+    to_cells[:2, 2] = shift
+    return LabelImage(to_cells @ to_plane, eye, cells)
 
 
 def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tuple[Floats, Floats]:
@@ -132,36 +128,33 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     """Detections that sensors have where they are predicted to see the features of poses."""
     sensors, rules = problem.detections, problem.rules.association
     projection = project_body(tuple(one.view.sensor for one in sensors), problem.body)
-    at, sigmas = projection.project(poses), np.array([one.sigma for one in sensors])
-    shares, offsets, crowd = np.zeros(at.seen.shape), np.zeros(at.y.shape), []
-    for k, (sensor, y, seen) in enumerate(zip(sensors, at.y, at.seen, strict=True)):
-        points, sigma = sensor.points, sensor.sigma
-        pose, feature, detection = _pairs(y, seen, points, problem.reach(sensor))
-        shares[k, pose, feature] = 1.0
-        offsets[k, pose, feature] = (points[detection] - y[pose, feature]) / sigma
-        lower, upper = points.min(axis=0)[None], points.max(axis=0)[None]
-        if rules.crowded:
-            inside, blind = seen[..., None], ~seen.any(axis=1)[:, None]
-            lower = np.where(blind, 0.0, np.where(inside, y, np.inf).min(axis=1))
-            upper = np.where(blind, 0.0, np.where(inside, y, -np.inf).max(axis=1))
-        dense = crowding(points, lower, upper, rules.min_region * sigma) * sigma**2
-        crowd.append(np.broadcast_to(dense, len(poses)))
-    nothing = np.zeros((len(poses), len(sensors)))
+    sigmas = np.array([one.sigma for one in sensors])
+    y, J, seen, faced = (part.swapaxes(0, 1) for part in projection.project(poses)[:4])
+    shares, offsets, crowd = np.zeros(seen.shape), np.zeros(y.shape), np.zeros(seen.shape[:2])
+    boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
+    lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)
+    for k, (sensor, sigma) in enumerate(zip(sensors, sigmas, strict=True)):
+        points, smallest = sensor.points, rules.min_region * sigma
+        pose, feature, detection = _pairs(y[:, k], seen[:, k], points, problem.reach(sensor))
+        shares[pose, k, feature] = 1.0
+        offsets[pose, k, feature] = (points[detection] - y[pose, k, feature]) / sigma
+        crowd[:, k] = crowding(points, lower[:, k], upper[:, k], smallest) * sigma**2
+    nothing = np.zeros(crowd.shape)
     return Matches(
         names=tuple(one.view.name for one in sensors),
         dimensions=projection.dimensions,
         sigmas=sigmas,
-        weights=at.seen.swapaxes(0, 1).astype(np.float64),
-        shares=shares.swapaxes(0, 1),
-        places=at.y.swapaxes(0, 1),
-        offsets=offsets.swapaxes(0, 1),
-        J=(at.J / sigmas[:, None, None, None, None]).swapaxes(0, 1),
-        detections=np.full(at.seen.shape, -1).swapaxes(0, 1),
+        weights=seen.astype(np.float64),
+        shares=shares,
+        places=y,
+        offsets=offsets,
+        J=J / sigmas[:, None, None, None],
+        detections=np.full(seen.shape, -1),
         explained=nothing,
-        unseen=np.count_nonzero(at.faced & ~at.seen, axis=2).T,
+        unseen=np.count_nonzero(faced & ~seen, axis=2),
         merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
-        crowd=np.stack(crowd, axis=1),
+        crowd=crowd,
         unmatched_nearby=nothing,
         finest=nothing + 1.0,
     )

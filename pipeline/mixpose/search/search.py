@@ -15,7 +15,8 @@ from mixpose.errors import SessionError
 from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats, Mask
-from mixpose.search.descent import Descent, Stage, first_of_each, from_spread_orientations, unlike
+from mixpose.rigid import transform
+from mixpose.search.descent import Descent, Stage, from_spread_orientations, unlike
 from mixpose.search.from_points import (
     by_promise,
     from_point_and_rays,
@@ -34,11 +35,10 @@ from mixpose.search.three_points import Guesses, far_apart, from_three_rays
 
 
 class Candidate(NamedTuple):
-    """A pose that may explain the views.
+    """A pose that may explain the views, ranked by its evidence.
 
-    Candidates are ranked by `evidence`: logarithm of the odds that this is not chance; with ranges
-    among the sensors, the matched objective at the finest blur, summed over views, every detection
-    counting alike.
+    That is the logarithm of the odds that it is not chance; with ranges among the sensors, the
+    matched objective at σ_ε, summed over views, every detection counting alike.
     """
 
     T_world_object: Floats  # (4, 4)
@@ -143,10 +143,11 @@ class _Search:
             Descent(views, body, problem.free, self._budget)
             for body in (self._body, sparse(self._body, 4 * self._budget.sample))
         )
+        # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         most = self._budget.shortlist
         self._stages = [Stage((blur,) * len(views), steps, most) for blur, steps in plan]
-        self._poses, (self._ranks, self._met) = np.zeros((0, 4, 4)), np.zeros((2, 0))
+        self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((2, 0))
         self.cost = Counter(made=0)
 
     def run(self, state: SearchState) -> SearchState:
@@ -165,15 +166,15 @@ class _Search:
                 break
         doubtful = self._coverage() < budget.sufficient
         if doubtful and not (self._by_evidence and self.cost["made"]):
-            poses, stages = from_spread_orientations(self._problem)
-            self._keep(self._descent.refine(poses, stages))
+            self._keep(self._descent.refine(*from_spread_orientations(self._problem)))
         return after
 
     def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._distinct(self._budget.sample), self._ranks
+        budget, (ranks, _) = self._budget, self._judged
+        kept = self._distinct(budget.sample)
         if self._by_evidence and kept:
-            least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
+            least = max(ranks[0] - budget.outdone, budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
@@ -210,7 +211,8 @@ class _Search:
                     rivals = slice(3, 3 + 2 * budget.sample)
                     poses, ranks = poses[rivals], ranks[rivals]
                     break
-        self._refine(poses[ranks > best - budget.behind])
+        # detections that are missed cost four nats each
+        self._refine(poses[ranks > best - budget.outdone / 4])
         return done
 
     def _count(self, body: Body, poses: Floats) -> Floats:
@@ -224,7 +226,7 @@ class _Search:
         if not (self._by_evidence and several):
             return False
         doubtful = explained < budget.sufficient * self._explainable
-        if doubtful and self._judged(guesses)[0].max() < budget.hopeless:
+        if doubtful and self._judge(guesses)[0].max() < budget.hopeless:
             return False
         self._refine(guesses)
         return self._is_found()
@@ -234,11 +236,12 @@ class _Search:
 
         Chance would hardly make the best pose so evident, by itself or among those that there are.
         """
-        budget, best = self._budget, self._ranks.max(initial=0.0)
+        budget, ranks = self._budget, self._judged[0]
+        best = ranks.max(initial=0.0)
         if not self._by_evidence or len(self._problem.detections) < 2 or best <= 0:
             return False
         two = self._distinct(2)
-        lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
+        lead = best - ranks[two[1]] if len(two) > 1 else 0.0
         if best <= budget.beyond_doubt and lead <= budget.outdone:
             return False
         most = budget.sufficient * self._explainable
@@ -247,25 +250,31 @@ class _Search:
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
-        return float(self._met[:1].sum())
+        return float(self._judged[1, :1].sum())
 
     def _distinct(self, count: int) -> list[int]:
-        return first_of_each(self._body, self._poses, count, self._budget.alike)
+        """Indices of the best poses that put the body, symmetries aside, somewhere else each."""
+        means, kept, images = self._body.means, list[int](), np.zeros((0, len(self._body), 3))
+        alike = self._budget.alike * self._body.radius  # root mean square distance of features
+        for k, pose in enumerate(self._poses):
+            squares = ((transform(pose, means) - images) ** 2).sum(axis=-1).mean(axis=-1)
+            if len(kept) < count and (squares > alike**2).all():
+                kept.append(k)
+                images = np.append(images, transform(pose @ self._body.symmetries, means), axis=0)
+        return kept
 
     def _refine(self, guesses: Floats) -> None:
-        """Keep what guesses lead to from less to less blur; to σ_ε with others than cameras."""
+        """Keep what guesses lead to from less to less blur."""
         self.cost["refined"] += len(guesses)
         self._keep(self._quick_descent.refine(guesses, self._stages))
 
     def _keep(self, poses: Floats) -> None:
         if len(poses):
-            judged = self._judged(poses)
-            ranks, met = np.append(self._ranks, judged[0]), np.append(self._met, judged[1])
-            best = np.argsort(-ranks, kind="stable")
-            self._poses = np.concatenate([self._poses, poses])[best]
-            self._ranks, self._met = ranks[best], met[best]
+            judged = np.append(self._judged, self._judge(poses), axis=1)
+            best = np.argsort(-judged[0], kind="stable")
+            self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]
 
-    def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
+    def _judge(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""
         if self._by_evidence:
             return evidence(self._problem, poses)
