@@ -9,9 +9,8 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.descent import spread_rotations, spread_turns
+from mixpose.search.poses import count_inliers, label_image, spread_rotations, spread_turns
 from mixpose.search.problem import SearchProblem, peaks, sensor_detections
-from mixpose.search.scoring import count_inliers, label_image
 from mixpose.sensors import PinholeCamera
 
 TRUTH = from_rotation_vector([0.3, -0.2, 0.5], [5.0, -3.0, 8.0])

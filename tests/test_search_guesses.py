@@ -13,8 +13,8 @@ from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.search.from_points import TriangulatedPoints, from_point_triples
+from mixpose.search.poses import count_inliers, label_image
 from mixpose.search.problem import SearchProblem, sensor_detections
-from mixpose.search.scoring import count_inliers, label_image
 from mixpose.search.search import generators_of
 from mixpose.search.three_points import align_triples, from_three_rays
 from mixpose.sensors import PinholeCamera

@@ -273,7 +273,7 @@ _REFLECTION = (
 _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
-        "search/scoring.py",
+        "search/poses.py",
         "weights=at.seen.swapaxes(0, 1).astype(np.float64)",
         "weights=shares.swapaxes(0, 1)",
         "a pose that misses half of the body is as good as one that meets it",
@@ -281,7 +281,7 @@ _SEARCH_EVIDENCE = (
     ),
     Mutant(
         "search-errors-count-alike",
-        "search/scoring.py",
+        "search/poses.py",
         "variances = (degrees * errors.typical**2 + squares) / (degrees + spare)",
         "variances = np.full(spare.shape, 0.04)",
         "a pose met to a tenth of a pixel is hardly better than one met to a pixel",
@@ -289,7 +289,7 @@ _SEARCH_EVIDENCE = (
     ),
     Mutant(
         "search-noise-of-one-camera-is-that-of-all",
-        "search/scoring.py",
+        "search/poses.py",
         "odds_of(matches, variances,",
         "odds_of(matches, 0 * variances + variances.max(axis=1)[:, None],",
         "a pose of one camera is doubtful where another meets a few features by chance",
@@ -297,7 +297,7 @@ _SEARCH_EVIDENCE = (
     ),
     Mutant(
         "search-crowds-are-no-clutter",
-        "search/scoring.py",
+        "search/poses.py",
         "crowding(points, lower, upper, ",
         "crowding(points, lower * 0 - 1e6, upper * 0 + 1e6, ",
         "where false detections crowd poses are found by chance",
@@ -329,14 +329,14 @@ _SEARCH = (
     ),
     Mutant(
         "search-back-sides-counted",
-        "search/scoring.py",
+        "search/poses.py",
         "met = np.where((outward * towards).sum(axis=0) > 0, met, 0)",
         "met = np.where(True, met, 0)",
         "a pose seen from behind explains as much as the right one",
     ),
     Mutant(
         "search-symmetric-poses-are-candidates",
-        "search/descent.py",
+        "search/poses.py",
         "transform(pose @ body.symmetries, body.means)",
         "transform(pose[None], body.means)",
         "candidates are the same pose several times",

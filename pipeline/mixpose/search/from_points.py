@@ -52,21 +52,15 @@ def triangulate(
         on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
         on_b = b.origins[None] + t[..., None] * b.directions[None]
         gap = np.linalg.norm(on_a - on_b, axis=-1)
-        tolerance = np.hypot(
-            gates[first] * (a.offset + a.slope * np.abs(s)),
-            gates[second] * (b.offset + b.slope * np.abs(t)),
-        )
+        off_a = gates[first] * (a.offset + a.slope * np.abs(s))
+        off_b = gates[second] * (b.offset + b.slope * np.abs(t))
+        tolerance = np.hypot(off_a, off_b)
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
-        pairs = np.argwhere(good)
+        points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
+        sensors = np.broadcast_to([first, second], pairs.shape)
         meetings.append(
-            (
-                0.5 * (on_a[good] + on_b[good]),
-                tolerance[good] / np.sqrt(sine2[good]),
-                gap[good] / tolerance[good],
-                np.broadcast_to([first, second], pairs.shape),
-                pairs,
-            )
+            (points, allowed / np.sqrt(sine2[good]), gap[good] / allowed, sensors, pairs)
         )
     return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
 

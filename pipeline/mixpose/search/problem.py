@@ -47,14 +47,10 @@ class SearchBudget:
     convincing: float = constant(0.7, "share of the body met from which guesses are enough")
     sufficient: float = constant(0.45, "the same beyond doubt, or of spread orientations")
     beyond_doubt: float = constant(
-        8.0,
-        "nats from which guesses are enough: a frame is ok from 7; of 900 frames with clutter no "
-        "other wrong poses had as much than mirror images and near twins",
+        8.0, "nats from which guesses are enough: of 900 frames only mirror images had as much"
     )
     outdone: float = constant(
-        12.0,
-        "nats behind the best from which a pose is no candidate: of 470 frames of the rows and of "
-        "clutter in space none had the right pose more than 4.2 behind",
+        12.0, "nats behind the best from which poses are out: right ones were 4.2 behind at most"
     )
     descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2), (0.4, 2)),
@@ -87,10 +83,8 @@ class SearchBudget:
 
 
 THOROUGH = SearchBudget()
-"""Everything is tried."""
-
+# for each frame of a live stream: so many guesses and the rest of the last batch
 LIVE = SearchBudget(max_guesses=2000, shortlist=24)
-"""For each frame of a live stream: 2,000 guesses and the rest of the last batch."""
 
 
 @dataclass(frozen=True)

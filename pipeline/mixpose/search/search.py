@@ -16,12 +16,20 @@ from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
-from mixpose.search.descent import Descent, Stage, from_spread_orientations, unlike
 from mixpose.search.from_points import (
     by_promise,
     from_point_and_rays,
     from_point_triples,
     triangulate,
+)
+from mixpose.search.poses import (
+    Descent,
+    Stage,
+    count_inliers,
+    evidence,
+    from_spread_orientations,
+    label_image,
+    unlike,
 )
 from mixpose.search.problem import (
     THOROUGH,
@@ -30,7 +38,6 @@ from mixpose.search.problem import (
     is_pointlike,
     sensor_detections,
 )
-from mixpose.search.scoring import count_inliers, evidence, label_image
 from mixpose.search.three_points import Guesses, far_apart, from_three_rays
 
 
@@ -139,6 +146,7 @@ class _Search:
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         are_cameras = all(one.rays is not None for one in problem.detections)
         self._by_evidence = bool(self._images) and are_cameras
+        self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
         self._descent, self._quick_descent = (
             Descent(views, body, problem.free, self._budget)
             for body in (self._body, sparse(self._body, 4 * self._budget.sample))
@@ -222,11 +230,10 @@ class _Search:
 
     def _are_enough(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras, refined, leave no need for others."""
-        budget, several = self._budget, len(self._problem.detections) > 1
-        if not (self._by_evidence and several):
-            return False
-        doubtful = explained < budget.sufficient * self._explainable
-        if doubtful and self._judge(guesses)[0].max() < budget.hopeless:
+        doubtful = explained < self._budget.sufficient * self._explainable
+        if not self._confirm or (
+            doubtful and self._judge(guesses)[0].max() < self._budget.hopeless
+        ):
             return False
         self._refine(guesses)
         return self._is_found()
@@ -237,16 +244,14 @@ class _Search:
         Chance would hardly make the best pose so evident, by itself or among those that there are.
         """
         budget, ranks = self._budget, self._judged[0]
-        best = ranks.max(initial=0.0)
-        if not self._by_evidence or len(self._problem.detections) < 2 or best <= 0:
+        if not self._confirm or ranks.max(initial=0.0) <= 0:
             return False
-        two = self._distinct(2)
-        lead = best - ranks[two[1]] if len(two) > 1 else 0.0
-        if best <= budget.beyond_doubt and lead <= budget.outdone:
+        lead = ranks[0] - ranks[self._distinct(2)[-1]]
+        if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:
             return False
-        most = budget.sufficient * self._explainable
+        explained = int(self._count(self._body, self._poses[:1])[0])
         enough = self._coverage() >= budget.sufficient
-        return enough or int(self._count(self._body, self._poses[:1])[0]) >= most
+        return enough or explained >= budget.sufficient * self._explainable
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""

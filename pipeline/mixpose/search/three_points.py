@@ -100,8 +100,10 @@ def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
         laws[_EACH, FIRST, SECOND] = laws[_EACH, SECOND, FIRST] = -cosines
         D1, D2 = (squared[2] * laws[k] - squared[k] * laws[2] for k in (0, 1))
         larger = np.where(np.abs(D1).sum(axis=(0, 1)) >= np.abs(D2).sum(axis=(0, 1)), D1, D2)
-        lines = _two_lines(D1 + _pencil_root(D1, D2) * D2)
-        x = np.concatenate([ratios for line in lines for ratios in _cut(line, larger)], axis=1)
+        lines = [line[:, None] for line in _halves(D1 + _pencil_root(D1, D2) * D2)]
+        # the points of a conic on a line, as a pair
+        pairs = [cross(line, cross(line, larger).swapaxes(0, 1)) for line in lines]
+        x = np.concatenate([ratios for pair in pairs for ratios in _halves(pair)], axis=1)
         x *= np.sign(x[0])
         which = np.flatnonzero((x > 0).all(axis=0))
         x, which = x[:, which], which % cosines.shape[1]
@@ -149,33 +151,18 @@ def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     return np.where(np.isfinite(x), x, 0.0)
 
 
-def _two_lines(C: Floats) -> tuple[Floats, Floats]:
-    """The lines (3, K) that degenerate conics (3, 3, K) consist of; NaN where they are not real."""
+def _halves(C: Floats) -> tuple[Floats, Floats]:
+    """Lines or points (3, K) that pairs of them (3, 3, K) consist of; NaN where they are not real.
+
+    A pair is g hᵀ + h gᵀ, whose cofactors are −p pᵀ with p = g × h; with [p]× it is of rank one.
+    """
     B, every = -_cofactors(C), np.arange(C.shape[2])
     diagonal = np.einsum("iik->ik", B)
     k = diagonal.argmax(axis=0)
-    N = C + _crossed(B[:, k, every] / np.sqrt(diagonal[k, every]))
+    p = B[:, k, every] / np.sqrt(diagonal[k, every])
+    N = C + cross(p[:, None], np.eye(3)[..., None])
     row, column = np.divmod(np.abs(N).reshape(9, -1).argmax(axis=0), 3)
     return N[row, :, every].T, N[:, column, every]
-
-
-def _crossed(v: Floats) -> Floats:
-    """Matrices (3, 3, K) by which cross products with vectors (3, K) are taken."""
-    return cross(v[:, None], np.eye(3)[..., None])
-
-
-def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
-    """Where lines (3, K) meet conics (3, 3, K): two times ratios (3, K), NaN where not real."""
-    # two points that span the line: its cross products with the axes that it is least along
-    by, most = _crossed(line), np.abs(line).argmax(axis=0)
-    P, Q = np.where(most == 0, by[:, 1], by[:, 0]), np.where(most == 2, by[:, 1], by[:, 2])
-    CP, CQ = (np.einsum("ijk,jk->ik", C, one) for one in (P, Q))
-    a, b, c = _dot(Q, CQ), _dot(P, CQ), _dot(P, CP)
-    square = b * b - a * c
-    square = np.where(square < -_ROUNDING * b * b, np.nan, np.maximum(square, 0.0))
-    w = -(b + np.copysign(np.sqrt(square), b))
-    # w/a and c/w, as homogeneous pairs so that neither division can fail
-    return a * P + w * Q, w * P + c * Q
 
 
 def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Guesses:
