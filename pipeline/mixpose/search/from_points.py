@@ -18,8 +18,34 @@ from scipy.spatial import cKDTree
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask, Singles
 from mixpose.search.problem import SearchProblem
-from mixpose.search.three_points import FIRST, SECOND, Guesses, align_triples, far_apart, gathered
+from mixpose.search.three_points import (
+    FIRST,
+    SECOND,
+    Guesses,
+    align_triples,
+    far_apart,
+    from_three_rays,
+    gathered,
+)
 from mixpose.sensors import Rays
+
+
+def generators_of(problem: SearchProblem) -> list[Guesses]:
+    """Ways to make guesses from rays, the quickest first.
+
+    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
+    """
+    budget, rays = problem.budget, [rays for _, rays in problem.cameras]
+    reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
+    generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
+    if len(rays) < 2:
+        return generators
+    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
+    crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
+    # of the points tried in a crowd, and of the rays near them, few are right
+    place = len(generators) if crowded else 0
+    generators.insert(place, from_point_and_rays(problem, points))
+    return [from_point_triples(problem, points), *generators]
 
 
 class TriangulatedPoints(NamedTuple):
@@ -92,9 +118,9 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
 def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
     """Poses of triples of points, the most promising first."""
     budget = problem.budget
-    corners, tree = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
-    for triples in point_triples(problem, points) if len(corners) else ():
-        yield partial(_of_triples, problem, points, corners, tree, triples)
+    triangles = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
+    for triples in point_triples(problem, points) if len(triangles[0]) else ():
+        yield partial(_of_triples, problem, points, triangles, triples)
 
 
 @lru_cache(maxsize=16)
@@ -129,12 +155,11 @@ def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterato
 def _of_triples(
     problem: SearchProblem,
     points: TriangulatedPoints,
-    corners: Indices,
-    tree: cKDTree,
+    triangles: tuple[Indices, cKDTree],
     triples: Indices,
 ) -> Floats:
     """Poses that bring triangles of features onto those of triples (K, 3) of points."""
-    budget, body = problem.budget, problem.body
+    budget, body, (corners, tree) = problem.budget, problem.body, triangles
     # of a side between two features that give way
     bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
     sides, is_wide = _sides(points.points, triples, budget.min_sine)

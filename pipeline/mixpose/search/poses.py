@@ -258,12 +258,8 @@ def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage
 
 
 def spread_turns(free: Mask, step: float) -> Floats:
-    """Turns (count, 3, 3) about the free world axes (3,), about `step` radians apart.
-
-    About all three on a super-Fibonacci spiral (Alexa, Low-Discrepancy Sampling of SO(3), CVPR
-    2022).
-    """
-    if free.all():
+    """Turns (count, 3, 3) about the free world axes (3,), about `step` radians apart."""
+    if free.all():  # a super-Fibonacci spiral (Alexa, Low-Discrepancy Sampling of SO(3), CVPR 2022)
         count = int(np.ceil(np.pi**2 * 1.5 / step**3))
         s = np.arange(count) + 0.5
         r, R = np.sqrt(s / count), np.sqrt(1 - s / count)

@@ -27,17 +27,11 @@ class SearchBudget:
     """Limits and thresholds of one search."""
 
     max_guesses: float = constant(np.inf, "of one search; not its time, so that results repeat")
-    sample: int = constant(
-        8, "features or detections that stand for all in pairs or triples; of others a multiple"
-    )
+    sample: int = constant(8, "features or detections that stand for all; of others a multiple")
     shortlist: int = constant(150, "guesses refined; fewer for bodies of more than 8 features")
-    max_triples: int = constant(
-        40_000, "triples of points tried, all of the most promising ones: they take 0.1 s"
-    )
+    max_triples: int = constant(40_000, "of points, all of the most promising: they take 0.1 s")
     max_problems: int = constant(250_000, "triples of rays as triples of features, of one camera")
-    min_sine: float = constant(
-        0.02, "of angles between rays, or of sides: below it no depth and no turn is fixed"
-    )
+    min_sine: float = constant(0.02, "of angles between rays or sides: less fixes no depth or turn")
     crowded: float = constant(
         2.0, "detections for a feature above which those drawn far apart are right 2.7 times less"
     )
@@ -59,9 +53,7 @@ class SearchBudget:
     wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
     )
-    orientation_step: float = constant(
-        float(np.radians(12.0)), "between spread orientations: 3 ranges 6/0/0 99 of 100"
-    )
+    orientation_step: float = constant(np.pi / 15, "between orientations: 3 ranges 6/0/0 99 of 100")
     orientation_stages: tuple[tuple[float, int, int], ...] = constant(
         ((1.0, 0, 500), (1.0, 3, 300), (0.6, 4, 150), (0.3, 4, 60), (0.0, 6, 24)),
         "power of the blur that such a turn amounts to, steps and survivors, in these rows",
@@ -110,7 +102,7 @@ class SensorDetections:
         if isinstance(pattern, PointPattern):
             places, weights = pattern.points, pattern.weights
         else:
-            rows, columns = np.nonzero(_is_bright(pattern.values))
+            rows, columns = np.nonzero(pattern.values > 0.1 * pattern.values.max())
             steps = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
             places = pattern.origin + pattern.step * steps
             weights = pattern.values[rows, columns].astype(np.float64)
@@ -153,7 +145,7 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     )
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((blurred >= highest) & _is_bright(blurred))
+    rows, columns = np.nonzero((blurred >= highest) & (blurred > 0.1 * blurred.max()))
     order = np.argsort(-blurred[rows, columns], kind="stable")[: 8 * THOROUGH.sample]
     places = np.stack([rows[order], columns[order]])
     inner = np.clip(places, 1, np.array(blurred.shape)[:, None] - 2)
@@ -165,11 +157,6 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     slope, bend = 0.5 * (after - before), 2.0 * here - before - after
     shift = np.clip(slope / np.maximum(bend, 1e-12), -0.5, 0.5)
     return np.asarray(pattern.origin + pattern.step * (inner + shift)[::-1].T)
-
-
-def _is_bright(values: Singles) -> Mask:
-    """Where values are no background: above a tenth of the largest."""
-    return np.asarray(values > 0.1 * values.max())
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,7 @@ from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
-from mixpose.search.from_points import (
-    by_promise,
-    from_point_and_rays,
-    from_point_triples,
-    triangulate,
-)
+from mixpose.search.from_points import generators_of
 from mixpose.search.poses import (
     Descent,
     Stage,
@@ -38,7 +33,7 @@ from mixpose.search.problem import (
     is_pointlike,
     sensor_detections,
 )
-from mixpose.search.three_points import Guesses, far_apart, from_three_rays
+from mixpose.search.three_points import Guesses, far_apart
 
 
 class Candidate(NamedTuple):
@@ -105,24 +100,6 @@ def search_frame(
     search = _Search(SearchProblem(detections, body, free, reference, rules, budget, seed))
     after = search.run(state)
     return SearchResult(search.candidates(), SearchReport(**search.cost), after)
-
-
-def generators_of(problem: SearchProblem) -> list[Guesses]:
-    """Ways to make guesses from rays, the quickest first.
-
-    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
-    """
-    budget, rays = problem.budget, [rays for _, rays in problem.cameras]
-    reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
-    generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
-    if len(rays) < 2:
-        return generators
-    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
-    crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
-    # of the points tried in a crowd, and of the rays near them, few are right
-    place = len(generators) if crowded else 0
-    generators.insert(place, from_point_and_rays(problem, points))
-    return [from_point_triples(problem, points), *generators]
 
 
 @lru_cache(maxsize=32)

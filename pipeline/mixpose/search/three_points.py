@@ -30,7 +30,6 @@ from mixpose.sensors import Rays
 Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 
 _TINY = np.finfo(np.float64).tiny
-_ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
 FIRST, SECOND = np.transpose(SIDES)
@@ -71,7 +70,8 @@ def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.co
     x[0, length == 0] = 1.0  # two at one place: any direction
     across = cross(x, second)
     third = _dot(x, second) + 1j * np.sqrt(_dot(across, across))
-    flat = third.imag <= _ROUNDING * np.abs(third)  # three in a row: any plane through them
+    # three in a row, to half of the digits: any plane through them
+    flat = third.imag <= 2**-26 * np.abs(third)
     across[:, flat] = cross(x[:, flat], np.eye(3)[:, np.abs(x[:, flat]).argmin(axis=0)])
     z = across / np.sqrt(_dot(across, across))
     return (x, cross(z, x), z), length, third
