@@ -274,8 +274,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
         "search/poses.py",
-        "weights=at.seen.swapaxes(0, 1).astype(np.float64)",
-        "weights=shares.swapaxes(0, 1)",
+        "weights=seen.astype(np.float64)",
+        "weights=shares",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),
@@ -298,8 +298,8 @@ _SEARCH_EVIDENCE = (
     Mutant(
         "search-crowds-are-no-clutter",
         "search/poses.py",
-        "crowding(points, lower, upper, ",
-        "crowding(points, lower * 0 - 1e6, upper * 0 + 1e6, ",
+        "seen[..., None] & rules.crowded, y, np.nan",
+        "seen[..., None] & False, y, np.nan",
         "where false detections crowd poses are found by chance",
         ("test_search_evidence.py",),
     ),
@@ -309,8 +309,8 @@ _SEARCH = (
     Mutant(
         "search-bright-detections-count-more",
         "search/problem.py",
-        "alike = Observation(PointPattern(points, np.ones(len(points))),",
-        "alike = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
+        "seen = Observation(PointPattern(points, np.ones(len(points))),",
+        "seen = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
         "a bright blob is worth more features than a faint one",
     ),
     Mutant(
@@ -336,9 +336,9 @@ _SEARCH = (
     ),
     Mutant(
         "search-symmetric-poses-are-candidates",
-        "search/poses.py",
-        "transform(pose @ body.symmetries, body.means)",
-        "transform(pose[None], body.means)",
+        "search/search.py",
+        "transform(pose @ self._body.symmetries, means)",
+        "transform(pose[None], means)",
         "candidates are the same pose several times",
     ),
     Mutant(
@@ -365,8 +365,8 @@ _SEARCH = (
     Mutant(
         "search-hopeless-poses-are-candidates",
         "search/search.py",
-        "ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)",
-        "self._ranks[kept[0]] - self._budget.outdone, -np.inf)",
+        "max(ranks[0] - budget.outdone, budget.hopeless)",
+        "max(ranks[0] - budget.outdone, -np.inf)",
         "where the body is absent poses are fitted that no fit can save",
         ("test_search_poses.py",),
     ),
@@ -388,7 +388,7 @@ _SEARCH = (
     ),
     Mutant(
         "search-points-of-a-crowd-first",
-        "search/search.py",
+        "search/from_points.py",
         "place = len(generators) if crowded else 0",
         "place = 0",
         "the first frame of web cams takes a third longer",

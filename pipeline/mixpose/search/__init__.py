@@ -14,11 +14,11 @@ from mixpose.search.search import (
     SearchResult as SearchResult,
     SearchState as SearchState,
     search_frame as search_frame,
-    sparse as sparse,
 )
 from mixpose.search.three_points import (
     SIDES as SIDES,
     align_triples as align_triples,
     depths as depths,
     far_apart as far_apart,
+    sparse as sparse,
 )

@@ -30,6 +30,16 @@ from mixpose.search.three_points import (
 from mixpose.sensors import Rays
 
 
+class TriangulatedPoints(NamedTuple):
+    """Points where a ray of one sensor comes close to a ray of another."""
+
+    points: Floats  # (P, 3) in the world
+    tolerance: Floats  # (P,) how far off the point may be, in length units
+    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
+    sensors: Indices  # (P, 2) the two sensors, first before second
+    rays: Indices  # (P, 2) the ray of either sensor
+
+
 def generators_of(problem: SearchProblem) -> list[Guesses]:
     """Ways to make guesses from rays, the quickest first.
 
@@ -46,16 +56,6 @@ def generators_of(problem: SearchProblem) -> list[Guesses]:
     place = len(generators) if crowded else 0
     generators.insert(place, from_point_and_rays(problem, points))
     return [from_point_triples(problem, points), *generators]
-
-
-class TriangulatedPoints(NamedTuple):
-    """Points where a ray of one sensor comes close to a ray of another."""
-
-    points: Floats  # (P, 3) in the world
-    tolerance: Floats  # (P,) how far off the point may be, in length units
-    gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
-    sensors: Indices  # (P, 2) the two sensors, first before second
-    rays: Indices  # (P, 2) the ray of either sensor
 
 
 def triangulate(
@@ -85,9 +85,8 @@ def triangulate(
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
         points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
         sensors = np.broadcast_to([first, second], pairs.shape)
-        meetings.append(
-            (points, allowed / np.sqrt(sine2[good]), gap[good] / allowed, sensors, pairs)
-        )
+        error = allowed / np.sqrt(sine2[good])
+        meetings.append((points, error, gap[good] / allowed, sensors, pairs))
     return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
 
 

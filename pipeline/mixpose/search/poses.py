@@ -21,7 +21,7 @@ from mixpose.body import Body
 from mixpose.judgement import odds_of, paid_by_count
 from mixpose.matching import Matches, crowding
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
-from mixpose.optimise import NewtonOptions, Quadratic, ascend
+from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
@@ -276,7 +276,7 @@ def spread_turns(free: Mask, step: float) -> Floats:
 
 def _centres(problem: SearchProblem) -> Floats:
     """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
-    radius, middles = problem.body.radius, _Middles(problem.detections)
+    radius, middles = problem.body.radius, Sum(tuple(map(_Middle, problem.detections)))
 
     def moved(places: Floats, steps: Floats) -> Floats:
         length = np.linalg.norm(steps, axis=1, keepdims=True)
@@ -313,19 +313,15 @@ def _starts(problem: SearchProblem) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Middles:
-    """Minus half the squared distance of a place from where sensors see the middle of features."""
+class _Middle:
+    """Minus half the squared distance of a place from where a sensor sees the middle."""
 
-    detections: Sequence[SensorDetections]
+    seen: SensorDetections
 
     def linearise(self, places: Floats) -> Quadratic:
-        """Second-order models at places (H, 3), of lengths: the sensors' units are taken off."""
-        value, pull, C = np.zeros(len(places)), np.zeros((len(places), 3)), np.zeros((1, 3, 3))
-        for one in self.detections:
-            y, J, _ = one.view.sensor.linearise(places)
-            scale = np.sqrt(np.maximum((J * J).mean(axis=1).sum(axis=1), 1e-30))[:, None]
-            J, residual = J / scale[..., None], (one.moments[0] - y) / scale
-            value -= 0.5 * (residual**2).sum(axis=1)
-            pull = pull + np.einsum("hmk,hm->hk", J, residual)
-            C = C + np.einsum("hmk,hml->hkl", J, J)
-        return Quadratic(value, pull, C)
+        """Second-order models at places (H, 3), of lengths: the sensor's unit is taken off."""
+        y, J, _ = self.seen.view.sensor.linearise(places)
+        scale = np.sqrt(np.maximum((J * J).mean(axis=1).sum(axis=1), 1e-30))[:, None]
+        J, residual = J / scale[..., None], (self.seen.moments[0] - y) / scale
+        pull, C = np.einsum("hmk,hm->hk", J, residual), np.einsum("hmk,hml->hkl", J, J)
+        return Quadratic(-0.5 * (residual**2).sum(axis=1), pull, C)

@@ -75,8 +75,7 @@ class SearchBudget:
 
 
 THOROUGH = SearchBudget()
-# for each frame of a live stream: so many guesses and the rest of the last batch
-LIVE = SearchBudget(max_guesses=2000, shortlist=24)
+LIVE = SearchBudget(max_guesses=2000, shortlist=24)  # of a frame; the last batch is finished
 
 
 @dataclass(frozen=True)
@@ -173,8 +172,8 @@ class SearchProblem:
 
     @cached_property
     def cameras(self) -> list[tuple[SensorDetections, Rays]]:
-        """Sensors whose detections have lines of sight, with these."""
-        return [(one, one.rays) for one in self.detections if one.rays]
+        """Sensors that detect features which are points, with their lines of sight."""
+        return [(one, one.rays) for one in self.detections if one.rays and is_pointlike(self.body)]
 
     def reach(self, sensor: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
@@ -26,14 +25,8 @@ from mixpose.search.poses import (
     label_image,
     unlike,
 )
-from mixpose.search.problem import (
-    THOROUGH,
-    SearchBudget,
-    SearchProblem,
-    is_pointlike,
-    sensor_detections,
-)
-from mixpose.search.three_points import Guesses, far_apart
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
+from mixpose.search.three_points import Guesses, sparse
 
 
 class Candidate(NamedTuple):
@@ -87,7 +80,6 @@ def search_frame(
     guesses are tried, where not all can be; `state` of the frame before, where its budget was used
     up.  Raises `SessionError` if directions are held without a reference pose.
     """
-    free = np.asarray(free, dtype=np.bool_)
     if T_reference is None and not free.all():
         raise SessionError(
             "search: start: found none, but some directions are not free: a start must say where "
@@ -96,20 +88,10 @@ def search_frame(
     detections = sensor_detections(views, body)
     if not detections:
         return SearchResult([])
-    reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
+    reference = np.eye(4) if T_reference is None else T_reference
     search = _Search(SearchProblem(detections, body, free, reference, rules, budget, seed))
     after = search.run(state)
     return SearchResult(search.candidates(), SearchReport(**search.cost), after)
-
-
-@lru_cache(maxsize=32)
-def sparse(body: Body, count: int) -> Body:
-    """A body with `count` of its features, far from one another; itself where it has no more."""
-    if len(body) <= count or not is_pointlike(body):
-        return body
-    few = far_apart(body.means, count)
-    normals = None if body.normals is None else body.normals[few]
-    return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
 
 
 class _Search:
@@ -118,16 +100,15 @@ class _Search:
     def __init__(self, problem: SearchProblem) -> None:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
-        self._images = [label_image(problem, *one) for one in cameras if is_pointlike(self._body)]
+        self._images = [label_image(problem, *camera) for camera in cameras]
         self._explainable = sum(min(len(rays), len(self._body)) for _, rays in cameras)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         are_cameras = all(one.rays is not None for one in problem.detections)
         self._by_evidence = bool(self._images) and are_cameras
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
-        self._descent, self._quick_descent = (
-            Descent(views, body, problem.free, self._budget)
-            for body in (self._body, sparse(self._body, 4 * self._budget.sample))
-        )
+        bodies = self._body, sparse(self._body, 4 * self._budget.sample)
+        descents = [Descent(views, body, problem.free, self._budget) for body in bodies]
+        self._descent, self._quick_descent = descents
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         most = self._budget.shortlist
@@ -149,8 +130,8 @@ class _Search:
             if self.cost["made"] >= budget.max_guesses:
                 after = SearchState(k, done)
                 break
-        doubtful = self._coverage() < budget.sufficient
-        if doubtful and not (self._by_evidence and self.cost["made"]):
+        no_more = self._by_evidence and self.cost["made"]
+        if self._coverage() < budget.sufficient and not no_more:
             self._keep(self._descent.refine(*from_spread_orientations(self._problem)))
         return after
 

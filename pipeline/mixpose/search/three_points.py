@@ -13,7 +13,7 @@ runs over long rows.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import lru_cache, partial
 from itertools import combinations, permutations, product
 from math import comb, perm
 from typing import TypeAlias
@@ -21,9 +21,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.body import Body
 from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts
-from mixpose.search.problem import SearchProblem
+from mixpose.search.problem import SearchProblem, is_pointlike
 from mixpose.sensors import Rays
 
 # batches of poses (K, 4, 4), worked out when they are called: what is skipped costs nothing
@@ -180,6 +181,16 @@ def far_apart(points: Floats, count: int) -> Indices:
         from_last = np.linalg.norm(points - points[chosen[-1]], axis=1)
         distance = np.minimum(distance, from_last) if k else from_last
     return np.array(chosen)
+
+
+@lru_cache(maxsize=32)
+def sparse(body: Body, count: int) -> Body:
+    """A body with `count` of its features, far from one another; itself where it has no more."""
+    if len(body) <= count or not is_pointlike(body):
+        return body
+    few = far_apart(body.means, count)
+    normals = None if body.normals is None else body.normals[few]
+    return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
 
 
 def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
