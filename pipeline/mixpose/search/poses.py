@@ -133,7 +133,9 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     sensors, rules = problem.detections, problem.rules.association
     projection = project_body(tuple(one.view.sensor for one in sensors), problem.body)
     sigmas = np.array([one.sigma for one in sensors])
-    y, J, seen, faced = (part.swapaxes(0, 1) for part in projection.project(poses)[:4])
+    at = projection.project(poses)
+    y, J = at.y.swapaxes(0, 1), at.J.swapaxes(0, 1)
+    seen, faced = at.seen.swapaxes(0, 1), at.faced.swapaxes(0, 1)
     shares, offsets, crowd = np.zeros(seen.shape), np.zeros(y.shape), np.zeros(seen.shape[:2])
     boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
     lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)

@@ -106,9 +106,9 @@ class _Search:
         are_cameras = all(one.rays is not None for one in problem.detections)
         self._by_evidence = bool(self._images) and are_cameras
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
-        bodies = self._body, sparse(self._body, 4 * self._budget.sample)
-        descents = [Descent(views, body, problem.free, self._budget) for body in bodies]
-        self._descent, self._quick_descent = descents
+        few = sparse(self._body, 4 * self._budget.sample)
+        self._descent = Descent(views, self._body, problem.free, self._budget)
+        self._quick_descent = Descent(views, few, problem.free, self._budget)
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         most = self._budget.shortlist
@@ -233,7 +233,7 @@ class _Search:
 
     def _keep(self, poses: Floats) -> None:
         if len(poses):
-            judged = np.append(self._judged, self._judge(poses), axis=1)
+            judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
             best = np.argsort(-judged[0], kind="stable")
             self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]
 

@@ -33,8 +33,7 @@ Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 _TINY = np.finfo(np.float64).tiny
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
-FIRST, SECOND = np.transpose(SIDES)
-_EACH = np.arange(3)
+_EACH, (FIRST, SECOND) = np.arange(3), np.transpose(SIDES)
 
 
 def gathered(points: Floats, corners: Indices) -> Floats:
@@ -247,8 +246,7 @@ def _perspective(
     squared = ((features[corners[FIRST]] - features[corners[SECOND]]) ** 2).sum(axis=-1)
     distances, which = depths(between[detections[FIRST], detections[SECOND]], squared)
     # smaller than the error in the image, nothing is told apart
-    largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > reach * rays.slope * distances.min(axis=0)
+    near = np.sqrt(squared.max(axis=0))[which] > reach * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
     directions = gathered(rays.directions, detections[:, which])
     world = rays.origins[0][:, None] + directions * distances[:, None]
