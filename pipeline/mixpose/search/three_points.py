@@ -33,7 +33,7 @@ Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 _TINY = np.finfo(np.float64).tiny
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
-_EACH, (FIRST, SECOND) = np.arange(3), np.transpose(SIDES)
+_EACH, (FIRST, SECOND) = np.arange(len(SIDES)), np.transpose(SIDES)
 
 
 def gathered(points: Floats, corners: Indices) -> Floats:
