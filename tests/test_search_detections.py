@@ -9,9 +9,8 @@ from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import GridPattern, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
-from mixpose.search.descent import spread_rotations, spread_turns
+from mixpose.search.poses import count_inliers, label_image, spread_turns
 from mixpose.search.problem import SearchProblem, peaks, sensor_detections
-from mixpose.search.scoring import count_inliers, label_image
 from mixpose.sensors import PinholeCamera
 
 TRUTH = from_rotation_vector([0.3, -0.2, 0.5], [5.0, -3.0, 8.0])
@@ -52,7 +51,8 @@ def test_peaks_of_an_image_are_found_between_pixels() -> None:
 
 
 def test_spread_rotations_leave_no_large_gap() -> None:
-    rotations = Rotation.from_matrix(spread_rotations(4608))
+    rotations = Rotation.from_matrix(spread_turns(ALL_FREE[3:], np.radians(8.45)))
+    assert len(rotations) == 4616
     for probe in Rotation.random(50, rng=np.random.default_rng(0)):
         # 4608 balls of 8° radius would fill the orientations; the worst gap is under twice that
         assert np.degrees((rotations * probe.inv()).magnitude().min()) < 16

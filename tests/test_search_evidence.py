@@ -16,8 +16,8 @@ from mixpose.matching import AssociationRules, ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
 from mixpose.search import search_frame
+from mixpose.search.poses import evidence
 from mixpose.search.problem import SearchProblem, sensor_detections
-from mixpose.search.scoring import evidence
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
 from mixpose.tracking.proposers import candidates_of

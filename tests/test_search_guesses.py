@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from mixpose.body import Body
 from mixpose.rigid import from_parts, from_rotation_vector, perturb, transform, twist_between
 from mixpose.search import LIVE, THOROUGH, SearchBudget
-from mixpose.search.from_points import TriangulatedPoints, from_point_triples
+from mixpose.search.from_points import TriangulatedPoints, generators_of, point_triples
+from mixpose.search.poses import count_inliers, label_image
 from mixpose.search.problem import SearchProblem, sensor_detections
-from mixpose.search.scoring import count_inliers, label_image
-from mixpose.search.search import generators_of
-from mixpose.search.three_points import align_triples, from_three_rays
+from mixpose.search.three_points import align_triples, ray_triples
 from mixpose.sensors import PinholeCamera
 
 Floats = NDArray[np.float64]
@@ -79,9 +78,9 @@ def test_where_false_detections_crowd_three_rays_come_before_points_and_rays(
         views = detect(pinhole_cameras[:2], EIGHT, TRUTH, false=false)
         seen = sensor_detections(views, EIGHT)
         problem = SearchProblem(seen, EIGHT, ALL_FREE, np.eye(4))
-        return [generator.name for generator in generators_of(problem)]
+        return [getattr(guesses, "__name__", "") for guesses in generators_of(problem)]
 
-    triples, point, rays = "point triples", "point and rays", "three rays"
+    triples, point, rays = "from_point_triples", "from_point_and_rays", "from_three_rays"
     assert names(8) == [triples, point, rays, rays]
     assert names(9) == [triples, rays, rays, point]  # more than two detections for a feature
 
@@ -98,7 +97,7 @@ def test_triples_are_drawn_near_each_other_where_most_detections_are_false() -> 
     assert rays is not None
     budget = SearchBudget(max_problems=4 * THOROUGH.batch)
     problem = SearchProblem([], EIGHT, ALL_FREE, np.eye(4), budget=budget)
-    chunks = list(from_three_rays(problem, 4.5, rays).batches)
+    chunks = list(ray_triples(problem, rays))
     own = [float((triples < 8).all(axis=0).mean()) for triples, _ in chunks]
     assert len(chunks) == 4  # one for each crowd and one for all
     assert own[0] == pytest.approx(1 / 7, rel=0.1)
@@ -111,7 +110,7 @@ def test_sizes_of_a_search_follow_from_its_numbers() -> None:
     points = TriangulatedPoints(
         none, none[:, 0], none[:, 0], np.tile([0, 1], (100, 1)), np.arange(200).reshape(-1, 2)
     )
-    triples = from_point_triples(SearchProblem([], EIGHT, ALL_FREE, np.eye(4)), points).batches
+    triples = point_triples(SearchProblem([], EIGHT, ALL_FREE, np.eye(4)), points)
     assert sum(len(batch) for batch in triples) == comb(63, 3) <= THOROUGH.max_triples < comb(64, 3)
     # a search of 2,000 guesses is not spent on one batch
     assert (THOROUGH.batch, LIVE.batch) == (4096, 1000)

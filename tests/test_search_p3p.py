@@ -89,8 +89,7 @@ def test_five_detections_of_a_body_of_36_features_are_enough_for_all_draws() -> 
     body = Body("36", tuple(PointFeature(one) for one in features))
     budget = SearchBudget(max_problems=40_000)
     problem = SearchProblem([], body, ALL_FREE, np.eye(4), budget=budget)
-    generator = from_three_rays(problem, 4.5, rays)
-    found = [generator.poses(batch) for batch in generator.batches]
+    found = [poses() for poses in from_three_rays(problem, 4.5, rays)]
     # one chunk of those far apart, and four that are drawn, the last among all five
     assert len(found) == 5
     assert rotation_angle_deg(T, np.concatenate(found)).min() < 0.1

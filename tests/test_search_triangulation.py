@@ -63,7 +63,7 @@ def test_three_points_in_space_give_the_pose() -> None:
     found = triangulate([each for each in rays if each is not None], [0.1, 0.1], 0.02)
     body = Body("six", tuple(PointFeature(point) for point in features))
     generator = from_point_triples(SearchProblem([], body, ALL_FREE, np.eye(4)), found)
-    guesses = np.concatenate([generator.poses(batch) for batch in generator.batches])
+    guesses = np.concatenate([poses() for poses in generator])
     error = np.abs(guesses - T).max(axis=(1, 2))
     assert error.min() < 1e-6
 

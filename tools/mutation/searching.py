@@ -289,15 +289,15 @@ _REFLECTION = (
 _SEARCH_EVIDENCE = (
     Mutant(
         "search-misses-are-free",
-        "search/scoring.py",
-        "weights=at.seen.swapaxes(0, 1).astype(np.float64)",
-        "weights=shares.swapaxes(0, 1)",
+        "search/poses.py",
+        "weights=seen.astype(np.float64)",
+        "weights=shares",
         "a pose that misses half of the body is as good as one that meets it",
         ("test_search_evidence.py",),
     ),
     Mutant(
         "search-errors-count-alike",
-        "search/scoring.py",
+        "search/poses.py",
         "variances = (degrees * errors.typical**2 + squares) / (degrees + spare)",
         "variances = np.full(spare.shape, 0.04)",
         "a pose met to a tenth of a pixel is hardly better than one met to a pixel",
@@ -305,7 +305,7 @@ _SEARCH_EVIDENCE = (
     ),
     Mutant(
         "search-noise-of-one-camera-is-that-of-all",
-        "search/scoring.py",
+        "search/poses.py",
         "odds_of(matches, variances,",
         "odds_of(matches, 0 * variances + variances.max(axis=1)[:, None],",
         "a pose of one camera is doubtful where another meets a few features by chance",
@@ -313,9 +313,9 @@ _SEARCH_EVIDENCE = (
     ),
     Mutant(
         "search-crowds-are-no-clutter",
-        "search/scoring.py",
-        "crowding(points, lower, upper, ",
-        "crowding(points, lower * 0 - 1e6, upper * 0 + 1e6, ",
+        "search/poses.py",
+        "seen[..., None] & rules.crowded, y, np.nan",
+        "seen[..., None] & False, y, np.nan",
         "where false detections crowd poses are found by chance",
         ("test_search_evidence.py",),
     ),
@@ -325,8 +325,8 @@ _SEARCH = (
     Mutant(
         "search-bright-detections-count-more",
         "search/problem.py",
-        "alike = Observation(PointPattern(points, np.ones(len(points))),",
-        "alike = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
+        "seen = Observation(PointPattern(points, np.ones(len(points))),",
+        "seen = Observation(PointPattern(points, 1.0 + np.arange(len(points))),",
         "a bright blob is worth more features than a faint one",
     ),
     Mutant(
@@ -345,16 +345,16 @@ _SEARCH = (
     ),
     Mutant(
         "search-back-sides-counted",
-        "search/scoring.py",
+        "search/poses.py",
         "met = np.where((outward * towards).sum(axis=0) > 0, met, 0)",
         "met = np.where(True, met, 0)",
         "a pose seen from behind explains as much as the right one",
     ),
     Mutant(
         "search-symmetric-poses-are-candidates",
-        "search/descent.py",
-        "transform(pose @ body.symmetries, body.means)",
-        "transform(pose[None], body.means)",
+        "search/search.py",
+        "transform(pose @ self._body.symmetries, means)",
+        "transform(pose[None], means)",
         "candidates are the same pose several times",
     ),
     Mutant(
@@ -381,8 +381,8 @@ _SEARCH = (
     Mutant(
         "search-hopeless-poses-are-candidates",
         "search/search.py",
-        "ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)",
-        "self._ranks[kept[0]] - self._budget.outdone, -np.inf)",
+        "max(ranks[0] - budget.outdone, budget.hopeless)",
+        "max(ranks[0] - budget.outdone, -np.inf)",
         "where the body is absent poses are fitted that no fit can save",
         ("test_search_poses.py",),
     ),
@@ -404,7 +404,7 @@ _SEARCH = (
     ),
     Mutant(
         "search-points-of-a-crowd-first",
-        "search/search.py",
+        "search/from_points.py",
         "place = len(generators) if crowded else 0",
         "place = 0",
         "the first frame of web cams takes a third longer",

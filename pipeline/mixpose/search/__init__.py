@@ -1,6 +1,6 @@
 """Search: the first pose from nothing, over all orientations and positions."""
 
-from mixpose.search.descent import Descent as Descent, Stage as Stage, spread_turns as spread_turns
+from mixpose.search.poses import Descent as Descent, Stage as Stage, spread_turns as spread_turns
 from mixpose.search.problem import (
     LIVE as LIVE,
     THOROUGH as THOROUGH,
@@ -14,11 +14,11 @@ from mixpose.search.search import (
     SearchResult as SearchResult,
     SearchState as SearchState,
     search_frame as search_frame,
-    sparse as sparse,
 )
 from mixpose.search.three_points import (
     SIDES as SIDES,
     align_triples as align_triples,
     depths as depths,
     far_apart as far_apart,
+    sparse as sparse,
 )

@@ -18,7 +18,15 @@ from scipy.spatial import cKDTree
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask, Singles
 from mixpose.search.problem import SearchProblem
-from mixpose.search.three_points import FIRST, SECOND, Generator, align_triples, far_apart, gathered
+from mixpose.search.three_points import (
+    FIRST,
+    SECOND,
+    Guesses,
+    align_triples,
+    far_apart,
+    from_three_rays,
+    gathered,
+)
 from mixpose.sensors import Rays
 
 
@@ -30,6 +38,24 @@ class TriangulatedPoints(NamedTuple):
     gap: Floats  # (P,) distance of the two rays as a share of what the gates allow, 0 to 1
     sensors: Indices  # (P, 2) the two sensors, first before second
     rays: Indices  # (P, 2) the ray of either sensor
+
+
+def generators_of(problem: SearchProblem) -> list[Guesses]:
+    """Ways to make guesses from rays, the quickest first.
+
+    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
+    """
+    budget, rays = problem.budget, [rays for _, rays in problem.cameras]
+    reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
+    generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
+    if len(rays) < 2:
+        return generators
+    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
+    crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
+    # of the points tried in a crowd, and of the rays near them, few are right
+    place = len(generators) if crowded else 0
+    generators.insert(place, from_point_and_rays(problem, points))
+    return [from_point_triples(problem, points), *generators]
 
 
 def triangulate(
@@ -52,22 +78,15 @@ def triangulate(
         on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
         on_b = b.origins[None] + t[..., None] * b.directions[None]
         gap = np.linalg.norm(on_a - on_b, axis=-1)
-        tolerance = np.hypot(
-            gates[first] * (a.offset + a.slope * np.abs(s)),
-            gates[second] * (b.offset + b.slope * np.abs(t)),
-        )
+        off_a = gates[first] * (a.offset + a.slope * np.abs(s))
+        off_b = gates[second] * (b.offset + b.slope * np.abs(t))
+        tolerance = np.hypot(off_a, off_b)
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
-        pairs = np.argwhere(good)
-        meetings.append(
-            (
-                0.5 * (on_a[good] + on_b[good]),
-                tolerance[good] / np.sqrt(sine2[good]),
-                gap[good] / tolerance[good],
-                np.broadcast_to([first, second], pairs.shape),
-                pairs,
-            )
-        )
+        points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
+        sensors = np.broadcast_to([first, second], pairs.shape)
+        error = allowed / np.sqrt(sine2[good])
+        meetings.append((points, error, gap[good] / allowed, sensors, pairs))
     return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
 
 
@@ -76,35 +95,31 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
 
     They are combined in this order (PROSAC, Chum and Matas, CVPR 2005).
     """
-    places, (support, error) = points.points, np.zeros((2, len(points.points)))
-    # the first of forty triples each
-    kept, most = list[int](), problem.budget.max_triples // 40
-    if len(problem.cameras) == 2:  # every feature once
-        kept = np.argsort(points.gap, kind="stable").tolist()
-    else:
+    places, most = points.points, problem.budget.max_triples // 40  # the first of forty triples
+    first = np.argsort(points.gap, kind="stable")[:most]
+    if len(problem.cameras) > 2:  # else every feature is there once
+        (support, error), kept = np.zeros((2, len(places))), list[int]()
         for sensor, _ in problem.cameras:
             y, seen = sensor.view.sensor.project(places)
-            reach = problem.reach(sensor)
-            away, _ = cKDTree(sensor.points).query(y, distance_upper_bound=reach)
-            met = seen & np.isfinite(away)
+            away, _ = cKDTree(sensor.points).query(y)
+            met = seen & (away < problem.reach(sensor))
             support += met
-            error += np.where(met, away / reach, 0.0)
+            error += np.where(met, away / problem.reach(sensor), 0.0)
         left = np.ones(len(places), dtype=np.bool_)
         for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
             if left[k] and len(kept) < most:
                 kept.append(k)
                 left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
-    first = np.array(kept[:most], dtype=np.intp)
+        first = np.array(kept, dtype=np.intp)
     return TriangulatedPoints._make(array[first] for array in points)
 
 
-def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
+def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
     """Poses of triples of points, the most promising first."""
     budget = problem.budget
-    corners, tree = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
-    enough = len(corners) and len(points.points) > 2
-    batches = _point_triples(problem, points) if enough else ()
-    return Generator("point triples", batches, partial(_of_triples, problem, points, corners, tree))
+    triangles = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
+    for triples in point_triples(problem, points) if len(triangles[0]) else ():
+        yield partial(_of_triples, problem, points, triangles, triples)
 
 
 @lru_cache(maxsize=16)
@@ -116,25 +131,39 @@ def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices,
     """
     few = np.sort(far_apart(body.means, count))
     corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
-    sides = _sides(body.means, corners)
-    wide = _is_wide(sides, min_sine)
-    return corners[wide], cKDTree(sides[wide].reshape(-1, 3))
+    sides, is_wide = _sides(body.means, corners, min_sine)
+    return corners[is_wide], cKDTree(sides[is_wide].reshape(-1, 3))
+
+
+def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterator[Indices]:
+    """Batches of triples (K, 3) of points that share no ray, the most promising first."""
+    rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
+    # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
+    most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
+    k, i, j = np.ogrid[(slice(min(len(rays), most)),) * 3]
+    triples = np.argwhere((i < j) & (j < k))[:, [1, 2, 0]]
+    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
+    size, end = problem.budget.batch // 32, 0
+    while end < len(triples):
+        start, end = end, end + min(max(end, size), 8 * size)
+        batch = triples[start:end]
+        six = np.sort(rays[batch].reshape(-1, 6), axis=1)
+        yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 
 
 def _of_triples(
     problem: SearchProblem,
     points: TriangulatedPoints,
-    corners: Indices,
-    tree: cKDTree,
+    triangles: tuple[Indices, cKDTree],
     triples: Indices,
 ) -> Floats:
     """Poses that bring triangles of features onto those of triples (K, 3) of points."""
-    budget, body = problem.budget, problem.body
+    budget, body, (corners, tree) = problem.budget, problem.body, triangles
     # of a side between two features that give way
     bent = problem.rules.noise.errors.met * np.sqrt(2) * body.spread
-    sides = _sides(points.points, triples)
+    sides, is_wide = _sides(points.points, triples, budget.min_sine)
     slack = 2 * points.tolerance[triples].max(axis=1) + bent
-    possible = _is_wide(sides, budget.min_sine) & (sides.max(axis=1) < tree.data.max() + slack)
+    possible = is_wide & (sides.max(axis=1) < tree.data.max() + slack)
     triples, sides = triples[possible], sides[possible]
     squares = points.tolerance[triples] ** 2
     allowed = np.sqrt(squares[:, FIRST] + squares[:, SECOND] + bent**2)
@@ -150,45 +179,19 @@ def _of_triples(
     return align_triples(gathered(body.means, features.T), gathered(points.points, world.T))
 
 
-def _point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterator[Indices]:
-    """Batches of triples (K, 3) of points that share no ray, the most promising first."""
-    rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
-    # n (n - 1) (n - 2) / 6 triples are `max_triples` or less
-    most = int(np.cbrt(6 * problem.budget.max_triples)) + 1
-    triples = _combinations(min(len(points.points), most))
-    # as many triangles are alike as `2 * sample` at most; later ones twice as many, up to eight
-    size, end = problem.budget.batch // 32, 0
-    while end < len(triples):
-        start, end = end, end + min(max(end, size), 8 * size)
-        batch = triples[start:end]
-        six = np.sort(rays[batch].reshape(-1, 6), axis=1)
-        yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
-
-
-@lru_cache(maxsize=64)
-def _combinations(count: int) -> Indices:
-    """Triples (K, 3) of numbers below `count`, those of the first numbers first."""
-    triples = np.array(list(combinations(range(count), 3)), dtype=np.intp).reshape(-1, 3)
-    return triples[np.argsort(triples[:, 2], kind="stable")]
-
-
-def _sides(points: Floats, triples: Indices) -> Floats:
-    sides = points[triples[:, FIRST]] - points[triples[:, SECOND]]
-    return np.asarray(np.linalg.norm(sides, axis=2))
-
-
-def _is_wide(sides: Floats, min_sine: float) -> Mask:
-    """Whether triangles with sides (K, 3) have a height, as a share of the longest side."""
+def _sides(points: Floats, triples: Indices, min_sine: float) -> tuple[Floats, Mask]:
+    """Sides (K, 3) of triangles, and whether their heights are such a share of the longest."""
+    sides = np.linalg.norm(points[triples[:, FIRST]] - points[triples[:, SECOND]], axis=2)
     a, b, c = np.sort(sides, axis=1).T
     # Heron's formula; twice the area is height times longest side
     area4 = np.maximum((a + b + c) * (a + b - c) * (a - b + c) * (b + c - a), 0.0)
-    return np.asarray(np.sqrt(area4) / 2 > min_sine * c * c)
+    return sides, np.sqrt(area4) / 2 > min_sine * c * c
 
 
-def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Generator:
+def from_point_and_rays(problem: SearchProblem, points: TriangulatedPoints) -> Guesses:
     """Poses with one point in space as each feature, point by point, the most promising first."""
-    most = min(len(points.points), 2 * problem.budget.sample)
-    return Generator("point and rays", range(most), partial(_of_point, problem, points))
+    for p in range(min(len(points.points), 2 * problem.budget.sample)):
+        yield partial(_of_point, problem, points, p)
 
 
 def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Floats:

@@ -6,7 +6,7 @@ Rows are those of `tools/benchmark.py search`, written N/hidden/false.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -27,51 +27,33 @@ class SearchBudget:
     """Limits and thresholds of one search."""
 
     max_guesses: float = constant(np.inf, "of one search; not its time, so that results repeat")
-    sample: int = constant(
-        8, "features or detections that stand for all in pairs or triples; of others a multiple"
-    )
+    sample: int = constant(8, "features or detections that stand for all; of others a multiple")
     shortlist: int = constant(150, "guesses refined; fewer for bodies of more than 8 features")
-    max_triples: int = constant(
-        40_000, "triples of points tried, all of the most promising ones: they take 0.1 s"
-    )
+    max_triples: int = constant(40_000, "of points, all of the most promising: they take 0.1 s")
     max_problems: int = constant(250_000, "triples of rays as triples of features, of one camera")
-    min_sine: float = constant(
-        0.02, "of angles between rays, or of sides: below it no depth and no turn is fixed"
-    )
+    min_sine: float = constant(0.02, "of angles between rays or sides: less fixes no depth or turn")
     crowded: float = constant(
-        2.0,
-        "detections for a feature above which those far apart are not tried: of the web cams' "
-        "corners the right triples drawn are 2.7 times as many",
+        2.0, "detections for a feature above which those drawn far apart are right 2.7 times less"
     )
-    behind: float = constant(3.0, "detections that a refined guess may explain less than the best")
     alike: float = constant(
-        0.05,
-        "of the body's radius: poses nearer to each other are one, and refined ones at a fifth of "
-        "it; guesses that differ by 0.03 crowd out one right pose in 150 of 8/4/8",
+        0.05, "of the radius: poses nearer are one; at 0.03 they crowd out one in 150 of 8/4/8"
     )
     convincing: float = constant(0.7, "share of the body met from which guesses are enough")
     sufficient: float = constant(0.45, "the same beyond doubt, or of spread orientations")
     beyond_doubt: float = constant(
-        8.0,
-        "evidence in nats from which guesses are enough: a frame is ok from 7; of 900 frames with "
-        "clutter no other wrong pose had as much than mirror images and near twins",
+        8.0, "nats from which guesses are enough: of 900 frames only mirror images had as much"
     )
     outdone: float = constant(
-        12.0,
-        "nats behind the best from which a pose is no candidate: of 470 frames of the rows and of "
-        "clutter in space none had the right pose more than 4.2 behind",
+        12.0, "nats behind the best from which poses are out: right ones were 4.2 behind at most"
     )
     descent_plan: tuple[tuple[float, int], ...] = constant(
         ((1.0, 2), (0.4, 2)),
-        "blurs in σ_ε and steps: clutter near a feature draws less; one more at 1.5 finds no "
-        "more, and takes a quarter longer where two cameras see little else",
+        "blurs in σ_ε and steps: clutter near features draws less; one at 1.5 before finds no more",
     )
     wide_plan: tuple[tuple[float, int], ...] = constant(
         ((3.0, 1), (1.5, 2), (1.0, 3)), "the same where not all sensors are cameras"
     )
-    orientation_step: float = constant(
-        float(np.radians(12.0)), "between spread orientations: 3 ranges 6/0/0 99 of 100"
-    )
+    orientation_step: float = constant(np.pi / 15, "between orientations: 3 ranges 6/0/0 99 of 100")
     orientation_stages: tuple[tuple[float, int, int], ...] = constant(
         ((1.0, 0, 500), (1.0, 3, 300), (0.6, 4, 150), (0.3, 4, 60), (0.0, 6, 24)),
         "power of the blur that such a turn amounts to, steps and survivors, in these rows",
@@ -93,10 +75,7 @@ class SearchBudget:
 
 
 THOROUGH = SearchBudget()
-"""Everything is tried."""
-
-LIVE = SearchBudget(max_guesses=2000, shortlist=24)
-"""For each frame of a live stream: 2,000 guesses and the rest of the last batch."""
+LIVE = SearchBudget(max_guesses=2000, shortlist=24)  # of a frame; the last batch is finished
 
 
 @dataclass(frozen=True)
@@ -122,7 +101,7 @@ class SensorDetections:
         if isinstance(pattern, PointPattern):
             places, weights = pattern.points, pattern.weights
         else:
-            rows, columns = np.nonzero(_is_bright(pattern.values))
+            rows, columns = np.nonzero(pattern.values > 0.1 * pattern.values.max())
             steps = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
             places = pattern.origin + pattern.step * steps
             weights = pattern.values[rows, columns].astype(np.float64)
@@ -135,19 +114,17 @@ def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetection
     """Detections of all views that saw something."""
     sensors = []
     for view in views:
-        observation, pattern = view.observation, view.observation.pattern
-        if observation.is_empty:
-            continue
+        seen, pattern = view.observation, view.observation.pattern
+        points = np.zeros((0, seen.dimension))
         if isinstance(pattern, PointPattern):
             points = pattern.points[pattern.weights > 0]
-        elif observation.dimension == 2 and is_pointlike(body):
-            points = peaks(pattern, observation.sigma)
-        else:
-            sensors.append(SensorDetections(view, np.zeros((0, observation.dimension)), None))
-            continue
-        alike = Observation(PointPattern(points, np.ones(len(points))), observation.sigma)
-        even = View(view.name, view.sensor, alike, view.delay)
-        sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
+        elif seen.dimension == 2 and is_pointlike(body) and not seen.is_empty:
+            points = peaks(pattern, seen.sigma)
+        if len(points):
+            seen = Observation(PointPattern(points, np.ones(len(points))), seen.sigma)
+        if not seen.is_empty:
+            even = replace(view, observation=seen)
+            sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
     return sensors
 
 
@@ -167,7 +144,7 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     )
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((blurred >= highest) & _is_bright(blurred))
+    rows, columns = np.nonzero((blurred >= highest) & (blurred > 0.1 * blurred.max()))
     order = np.argsort(-blurred[rows, columns], kind="stable")[: 8 * THOROUGH.sample]
     places = np.stack([rows[order], columns[order]])
     inner = np.clip(places, 1, np.array(blurred.shape)[:, None] - 2)
@@ -179,11 +156,6 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     slope, bend = 0.5 * (after - before), 2.0 * here - before - after
     shift = np.clip(slope / np.maximum(bend, 1e-12), -0.5, 0.5)
     return np.asarray(pattern.origin + pattern.step * (inner + shift)[::-1].T)
-
-
-def _is_bright(values: Singles) -> Mask:
-    """Where values are no background: above a tenth of the largest."""
-    return np.asarray(values > 0.1 * values.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +172,8 @@ class SearchProblem:
 
     @cached_property
     def cameras(self) -> list[tuple[SensorDetections, Rays]]:
-        """Sensors whose detections have lines of sight, with these."""
-        return [(one, one.rays) for one in self.detections if one.rays]
+        """Sensors that detect features which are points, with their lines of sight."""
+        return [(one, one.rays) for one in self.detections if one.rays and is_pointlike(self.body)]
 
     def reach(self, sensor: SensorDetections) -> float:
         """Largest error of a sensor's detections, in its units."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import lru_cache
 from itertools import islice
 from typing import NamedTuple
 
@@ -15,30 +14,26 @@ from mixpose.errors import SessionError
 from mixpose.judgement import JudgementRules
 from mixpose.objective import View
 from mixpose.records import Floats, Mask
-from mixpose.search.descent import Descent, Stage, first_of_each, from_spread_orientations, unlike
-from mixpose.search.from_points import (
-    by_promise,
-    from_point_and_rays,
-    from_point_triples,
-    triangulate,
+from mixpose.rigid import transform
+from mixpose.search.from_points import generators_of
+from mixpose.search.poses import (
+    Descent,
+    Stage,
+    count_inliers,
+    evidence,
+    from_spread_orientations,
+    label_image,
+    unlike,
 )
-from mixpose.search.problem import (
-    THOROUGH,
-    SearchBudget,
-    SearchProblem,
-    is_pointlike,
-    sensor_detections,
-)
-from mixpose.search.scoring import count_inliers, evidence, label_image
-from mixpose.search.three_points import Generator, far_apart, from_three_rays
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
+from mixpose.search.three_points import Guesses, sparse
 
 
 class Candidate(NamedTuple):
-    """A pose that may explain the views.
+    """A pose that may explain the views, ranked by its evidence.
 
-    Candidates are ranked by `evidence`: logarithm of the odds that this is not chance; with ranges
-    among the sensors, the matched objective at the finest blur, summed over views, every detection
-    counting alike.
+    That is the logarithm of the odds that it is not chance; with ranges among the sensors, the
+    matched objective at σ_ε, summed over views, every detection counting alike.
     """
 
     T_world_object: Floats  # (4, 4)
@@ -85,7 +80,6 @@ def search_frame(
     guesses are tried, where not all can be; `state` of the frame before, where its budget was used
     up.  Raises `SessionError` if directions are held without a reference pose.
     """
-    free = np.asarray(free, dtype=np.bool_)
     if T_reference is None and not free.all():
         raise SessionError(
             "search: start: found none, but some directions are not free: a start must say where "
@@ -94,38 +88,10 @@ def search_frame(
     detections = sensor_detections(views, body)
     if not detections:
         return SearchResult([])
-    reference = np.eye(4) if T_reference is None else np.asarray(T_reference, dtype=np.float64)
+    reference = np.eye(4) if T_reference is None else T_reference
     search = _Search(SearchProblem(detections, body, free, reference, rules, budget, seed))
     after = search.run(state)
     return SearchResult(search.candidates(), SearchReport(**search.cost), after)
-
-
-def generators_of(problem: SearchProblem) -> list[Generator]:
-    """Ways to make guesses from rays, the quickest first.
-
-    Points in space; one such point and two rays, in crowds at last; three rays of one camera.
-    """
-    budget, rays = problem.budget, [rays for _, rays in problem.cameras]
-    reaches = [problem.reach(sensor) for sensor, _ in problem.cameras]
-    generators = [from_three_rays(problem, *pair) for pair in zip(reaches, rays, strict=True)]
-    if len(rays) < 2:
-        return generators
-    points = by_promise(problem, triangulate(rays, reaches, budget.min_sine))
-    crowded = sum(map(len, rays)) > budget.crowded * len(problem.body) * len(rays)
-    # of the points tried in a crowd, and of the rays near them, few are right
-    place = len(generators) if crowded else 0
-    generators.insert(place, from_point_and_rays(problem, points))
-    return [from_point_triples(problem, points), *generators]
-
-
-@lru_cache(maxsize=32)
-def sparse(body: Body, count: int) -> Body:
-    """A body with `count` of its features, far from one another; itself where it has no more."""
-    if len(body) <= count or not is_pointlike(body):
-        return body
-    few = far_apart(body.means, count)
-    normals = None if body.normals is None else body.normals[few]
-    return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
 
 
 class _Search:
@@ -134,19 +100,20 @@ class _Search:
     def __init__(self, problem: SearchProblem) -> None:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
-        self._images = [label_image(problem, *one) for one in cameras if is_pointlike(self._body)]
+        self._images = [label_image(problem, *camera) for camera in cameras]
         self._explainable = sum(min(len(rays), len(self._body)) for _, rays in cameras)
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         are_cameras = all(one.rays is not None for one in problem.detections)
         self._by_evidence = bool(self._images) and are_cameras
-        self._descent, self._quick_descent = (
-            Descent(views, body, problem.free, self._budget)
-            for body in (self._body, sparse(self._body, 4 * self._budget.sample))
-        )
+        self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
+        few = sparse(self._body, 4 * self._budget.sample)
+        self._descent = Descent(views, self._body, problem.free, self._budget)
+        self._quick_descent = Descent(views, few, problem.free, self._budget)
+        # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         most = self._budget.shortlist
         self._stages = [Stage((blur,) * len(views), steps, most) for blur, steps in plan]
-        self._poses, (self._ranks, self._met) = np.zeros((0, 4, 4)), np.zeros((2, 0))
+        self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((2, 0))
         self.cost = Counter(made=0)
 
     def run(self, state: SearchState) -> SearchState:
@@ -163,21 +130,21 @@ class _Search:
             if self.cost["made"] >= budget.max_guesses:
                 after = SearchState(k, done)
                 break
-        doubtful = self._coverage() < budget.sufficient
-        if doubtful and not (self._by_evidence and self.cost["made"]):
-            poses, stages = from_spread_orientations(self._problem)
-            self._keep(self._descent.refine(poses, stages))
+        no_more = self._by_evidence and self.cost["made"]
+        if self._coverage() < budget.sufficient and not no_more:
+            self._keep(self._descent.refine(*from_spread_orientations(self._problem)))
         return after
 
     def candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
-        kept, ranks = self._distinct(self._budget.sample), self._ranks
+        budget, (ranks, _) = self._budget, self._judged
+        kept = self._distinct(budget.sample)
         if self._by_evidence and kept:
-            least = max(ranks[kept[0]] - self._budget.outdone, self._budget.hopeless)
+            least = max(ranks[0] - budget.outdone, budget.hopeless)
             kept = kept[:1] + [k for k in kept[1:] if ranks[k] > least]
         return [Candidate(self._poses[k], float(ranks[k])) for k in kept]
 
-    def _draw(self, generator: Generator, most: float, skipped: int = 0) -> int:
+    def _draw(self, generator: Guesses, most: float, skipped: int = 0) -> int:
         """Batches tried of a generator until `most` guesses were made, the best of them refined.
 
         The guesses that explain most distinct detections, and among equals most closely, are
@@ -186,11 +153,11 @@ class _Search:
         budget, body, length = self._budget, self._body, self._budget.refined(len(self._body))
         few = sparse(body, 2 * budget.sample)
         poses, ranks, best, checked, done = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0, skipped
-        for batch in islice(generator.batches, skipped, None):
+        for make in islice(generator, skipped, None):
             if self.cost["made"] >= most:
                 break
             done += 1
-            more = self._problem.allowed(generator.poses(batch))
+            more = self._problem.allowed(make())
             self.cost["made"] += len(more)
             if few is not body and len(more) > budget.shortlist:
                 rank = self._count(few, more)
@@ -210,7 +177,8 @@ class _Search:
                     rivals = slice(3, 3 + 2 * budget.sample)
                     poses, ranks = poses[rivals], ranks[rivals]
                     break
-        self._refine(poses[ranks > best - budget.behind])
+        # detections that are missed cost four nats each
+        self._refine(poses[ranks > best - budget.outdone / 4])
         return done
 
     def _count(self, body: Body, poses: Floats) -> Floats:
@@ -220,11 +188,10 @@ class _Search:
 
     def _are_enough(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras, refined, leave no need for others."""
-        budget, several = self._budget, len(self._problem.detections) > 1
-        if not (self._by_evidence and several):
-            return False
-        doubtful = explained < budget.sufficient * self._explainable
-        if doubtful and self._judged(guesses)[0].max() < budget.hopeless:
+        doubtful = explained < self._budget.sufficient * self._explainable
+        if not self._confirm or (
+            doubtful and self._judge(guesses)[0].max() < self._budget.hopeless
+        ):
             return False
         self._refine(guesses)
         return self._is_found()
@@ -234,38 +201,43 @@ class _Search:
 
         Chance would hardly make the best pose so evident, by itself or among those that there are.
         """
-        budget, best = self._budget, self._ranks.max(initial=0.0)
-        if not self._by_evidence or len(self._problem.detections) < 2 or best <= 0:
+        budget, ranks = self._budget, self._judged[0]
+        if not self._confirm or ranks.max(initial=0.0) <= 0:
             return False
-        two = self._distinct(2)
-        lead = best - self._ranks[two[1]] if len(two) > 1 else 0.0
-        if best <= budget.beyond_doubt and lead <= budget.outdone:
+        lead = ranks[0] - ranks[self._distinct(2)[-1]]
+        if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:
             return False
-        most = budget.sufficient * self._explainable
+        explained = int(self._count(self._body, self._poses[:1])[0])
         enough = self._coverage() >= budget.sufficient
-        return enough or int(self._count(self._body, self._poses[:1])[0]) >= most
+        return enough or explained >= budget.sufficient * self._explainable
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
-        return float(self._met[:1].sum())
+        return float(self._judged[1, :1].sum())
 
     def _distinct(self, count: int) -> list[int]:
-        return first_of_each(self._body, self._poses, count, self._budget.alike)
+        """Indices of the best poses that put the body, symmetries aside, somewhere else each."""
+        means, kept, images = self._body.means, list[int](), np.zeros((0, len(self._body), 3))
+        alike = self._budget.alike * self._body.radius  # root mean square distance of features
+        for k, pose in enumerate(self._poses):
+            squares = ((transform(pose, means) - images) ** 2).sum(axis=-1).mean(axis=-1)
+            if len(kept) < count and (squares > alike**2).all():
+                kept.append(k)
+                images = np.append(images, transform(pose @ self._body.symmetries, means), axis=0)
+        return kept
 
     def _refine(self, guesses: Floats) -> None:
-        """Keep what guesses lead to from less to less blur; to σ_ε with others than cameras."""
+        """Keep what guesses lead to from less to less blur."""
         self.cost["refined"] += len(guesses)
         self._keep(self._quick_descent.refine(guesses, self._stages))
 
     def _keep(self, poses: Floats) -> None:
         if len(poses):
-            judged = self._judged(poses)
-            ranks, met = np.append(self._ranks, judged[0]), np.append(self._met, judged[1])
-            best = np.argsort(-ranks, kind="stable")
-            self._poses = np.concatenate([self._poses, poses])[best]
-            self._ranks, self._met = ranks[best], met[best]
+            judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
+            best = np.argsort(-judged[0], kind="stable")
+            self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]
 
-    def _judged(self, poses: Floats) -> tuple[Floats, Floats]:
+    def _judge(self, poses: Floats) -> tuple[Floats, Floats]:
         """Evidence where all sensors are cameras, else the score; and the share of the body met."""
         if self._by_evidence:
             return evidence(self._problem, poses)

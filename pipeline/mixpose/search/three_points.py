@@ -12,27 +12,28 @@ runs over long rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import partial
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 from itertools import combinations, permutations, product
 from math import comb, perm
-from typing import Any, NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mixpose.body import Body
 from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts
-from mixpose.search.problem import SearchProblem
+from mixpose.search.problem import SearchProblem, is_pointlike
 from mixpose.sensors import Rays
 
-Triples: TypeAlias = tuple[Indices, Indices]  # (3, K) detections, and the features they may be
+# batches of poses (K, 4, 4), worked out when they are called: what is skipped costs nothing
+Guesses: TypeAlias = Iterator[Callable[[], Floats]]
 
 _TINY = np.finfo(np.float64).tiny
-_ROUNDING = np.sqrt(np.finfo(np.float64).eps)  # what is left of differences of like numbers
 
 SIDES = [(0, 1), (0, 2), (1, 2)]
-FIRST, SECOND = np.transpose(SIDES)
+_EACH, (FIRST, SECOND) = np.arange(len(SIDES)), np.transpose(SIDES)
 
 
 def gathered(points: Floats, corners: Indices) -> Floats:
@@ -51,8 +52,8 @@ def align_triples(body: Floats, world: Floats) -> Floats:
     # between the corners as seen from their centres, in the planes
     turn = side * side_world + third.conj() * third_world
     turn -= (side + third).conj() * (side_world + third_world) / 3
-    length = np.abs(turn)
-    turn = np.where(length < _TINY, 1.0, turn / np.maximum(length, _TINY))
+    turn = np.where(turn == 0, 1.0, turn)
+    turn /= np.abs(turn)
     c, s = turn.real, turn.imag
     R = axes[0][:, None] * (c * x - s * y)
     R += axes[1][:, None] * (s * x + c * y)
@@ -63,18 +64,16 @@ def align_triples(body: Floats, world: Floats) -> Floats:
 
 def _shape(triangles: Floats) -> tuple[tuple[Floats, ...], Floats, NDArray[np.complex128]]:
     """Axes (3, K each), the first side's length (K,), and the third corner in the plane, x + iy."""
-    side, second = triangles[1] - triangles[0], triangles[2] - triangles[0]
+    side, second = triangles[1:] - triangles[0]
     length = np.sqrt(_dot(side, side))
     x = side / np.maximum(length, _TINY)
     x[0, length == 0] = 1.0  # two at one place: any direction
     across = cross(x, second)
-    height = np.sqrt(_dot(across, across))
-    third = _dot(x, second) + 1j * height
-    flat = height <= _ROUNDING * np.abs(third)
-    if flat.any():  # three in a row: any plane through them
-        across = np.where(flat, cross(x, np.eye(3)[:, np.abs(x).argmin(axis=0)]), across)
-        height = np.sqrt(_dot(across, across))
-    z = across / np.maximum(height, _TINY)
+    third = _dot(x, second) + 1j * np.sqrt(_dot(across, across))
+    # three in a row, to half of the digits: any plane through them
+    flat = third.imag <= 2**-26 * np.abs(third)
+    across[:, flat] = cross(x[:, flat], np.eye(3)[:, np.abs(x[:, flat]).argmin(axis=0)])
+    z = across / np.sqrt(_dot(across, across))
     return (x, cross(z, x), z), length, third
 
 
@@ -96,27 +95,39 @@ def depths(cosines: Floats, squared: Floats) -> tuple[Floats, Indices]:
     1, 0 and 2, 1 and 2 (3, K) each.
     """
     with np.errstate(all="ignore"):
-        D1, D2 = _conics(cosines, squared)
+        laws = np.zeros((3, 3, 3, cosines.shape[1]))  # λᵀ M λ = d²
+        laws[_EACH, FIRST, FIRST] = laws[_EACH, SECOND, SECOND] = 1.0
+        laws[_EACH, FIRST, SECOND] = laws[_EACH, SECOND, FIRST] = -cosines
+        D1, D2 = (squared[2] * laws[k] - squared[k] * laws[2] for k in (0, 1))
         larger = np.where(np.abs(D1).sum(axis=(0, 1)) >= np.abs(D2).sum(axis=(0, 1)), D1, D2)
-        found = []
-        for line in _two_lines(D1 + _pencil_root(D1, D2) * D2):
-            for ratios in _cut(line, larger):
-                # made distances by the sum of the three cosine laws
-                sides, _ = _sides_squared(ratios, cosines)
-                scale = np.sqrt(squared.sum(axis=0) / sides.sum(axis=0))
-                found.append(ratios * (np.sign(ratios[0]) * scale))
-        x = np.concatenate(found, axis=1)
+        lines = [line[:, None] for line in _halves(D1 + _pencil_root(D1, D2) * D2)]
+        # the points of a conic on a line, as a pair
+        pairs = [cross(line, cross(line, larger).swapaxes(0, 1)) for line in lines]
+        x = np.concatenate([ratios for pair in pairs for ratios in _halves(pair)], axis=1)
+        x *= np.sign(x[0])
         which = np.flatnonzero((x > 0).all(axis=0))
         x, which = x[:, which], which % cosines.shape[1]
-        return _polished(x, which, cosines[:, which], squared[:, which])
+        cosines, squared = cosines[:, which], squared[:, which]
+        # made distances by the sum of the three cosine laws
+        x *= np.sqrt(squared.sum(axis=0) / _sides_squared(x, cosines)[0].sum(axis=0))
+        for _ in range(2):  # Newton's method doubles the digits each time
+            sides, J = _sides_squared(x, cosines)
+            cofactors = _cofactors(J)
+            step = np.einsum("ijk,ik->jk", cofactors, sides - squared)
+            step /= 2 * _dot(J[0], cofactors[0])
+            x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
+        off = np.abs(_sides_squared(x, cosines)[0] - squared)
+        # steps from double roots end a thousandth off
+        exact = ((off <= 1e-3 * squared.max(axis=0)) & (x > 0)).all(axis=0)
+        return x[:, exact], which[exact]
 
 
-def _conics(cosines: Floats, squared: Floats) -> tuple[Floats, Floats]:
-    """M01 d12² − M12 d01² and M02 d12² − M12 d02² (3, 3, K), where λᵀ M_ij λ = d_ij²."""
-    (c01, c02, c12), (a01, a02, a12), o = -cosines, squared, np.zeros_like(squared[0])
-    D1 = [[a12, c01 * a12, o], [c01 * a12, a12 - a01, -c12 * a01], [o, -c12 * a01, -a01]]
-    D2 = [[a12, o, c02 * a12], [o, -a02, -c12 * a02], [c02 * a12, -c12 * a02, a12 - a02]]
-    return np.array(D1), np.array(D2)
+def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, Floats]:
+    """Sides squared (3, K) by the cosine laws, and half their Jacobian (3, 3, K)."""
+    J = np.zeros((3, *x.shape))
+    J[_EACH, FIRST] = x[FIRST] - x[SECOND] * cosines
+    J[_EACH, SECOND] = x[SECOND] - x[FIRST] * cosines
+    return (J * x).sum(axis=1), J
 
 
 def _cofactors(A: Floats) -> Floats:
@@ -126,9 +137,8 @@ def _cofactors(A: Floats) -> Floats:
 def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     """A real γ with det(D1 + γ D2) = 0 (K,), of three the one farthest from the others."""
     A1, A2 = _cofactors(D1), _cofactors(D2)
-    d, c, b, a = (
-        np.einsum("ijk,ijk->k", A, D) for A, D in ((A1, D1), (A1, D2), (A2, D1), (A2, D2))
-    )
+    pairs = (A1, D1), (A1, D2), (A2, D1), (A2, D2)
+    d, c, b, a = (np.einsum("ijk,ijk->k", A, D) for A, D in pairs)
     a = np.where(a == 0, _TINY, a / 3)
     b, c, d = b / a, c / a, d / (3 * a)
     p, q = c - b * b / 3, (2 * b * b / 27 - c / 3) * b + d
@@ -141,77 +151,25 @@ def _pencil_root(D1: Floats, D2: Floats) -> Floats:
     return np.where(np.isfinite(x), x, 0.0)
 
 
-def _two_lines(C: Floats) -> tuple[Floats, Floats]:
-    """The lines (3, K) that degenerate conics (3, 3, K) consist of; NaN where they are not real."""
+def _halves(C: Floats) -> tuple[Floats, Floats]:
+    """Lines or points (3, K) that pairs of them (3, 3, K) consist of; NaN where they are not real.
+
+    A pair is g hᵀ + h gᵀ, whose cofactors are −p pᵀ with p = g × h; with [p]× it is of rank one.
+    """
     B, every = -_cofactors(C), np.arange(C.shape[2])
     diagonal = np.einsum("iik->ik", B)
     k = diagonal.argmax(axis=0)
-    N = C + _crossed(B[:, k, every] / np.sqrt(diagonal[k, every]))
+    p = B[:, k, every] / np.sqrt(diagonal[k, every])
+    N = C + cross(p[:, None], np.eye(3)[..., None])
     row, column = np.divmod(np.abs(N).reshape(9, -1).argmax(axis=0), 3)
-    return N[row, [[0], [1], [2]], every], N[:, column, every]
+    return N[row, :, every].T, N[:, column, every]
 
 
-def _crossed(v: Floats) -> Floats:
-    """Matrices (3, 3, K) by which cross products with vectors (3, K) are taken."""
-    (x, y, z), o = v, np.zeros_like(v[0])
-    return np.array([[o, -z, y], [z, o, -x], [-y, x, o]])
-
-
-def _cut(line: Floats, C: Floats) -> tuple[Floats, Floats]:
-    """Where lines (3, K) meet conics (3, 3, K): two times ratios (3, K), NaN where not real."""
-    # two points that span the line: its cross products with the axes that it is least along
-    by, most = _crossed(line), np.abs(line).argmax(axis=0)
-    P = np.where(most == 0, by[:, 1], by[:, 0])
-    Q = np.where(most == 2, by[:, 1], by[:, 2])
-    CP, CQ = (np.einsum("ijk,jk->ik", C, each) for each in (P, Q))
-    a, b, c = (Q * CQ).sum(axis=0), (P * CQ).sum(axis=0), (P * CP).sum(axis=0)
-    square = b * b - a * c
-    square = np.where(square < -_ROUNDING * b * b, np.nan, np.maximum(square, 0.0))
-    w = -(b + np.copysign(np.sqrt(square), b))
-    # w/a and c/w, as homogeneous pairs so that neither division can fail
-    return a * P + w * Q, w * P + c * Q
-
-
-def _polished(
-    x: Floats, which: Indices, cosines: Floats, squared: Floats
-) -> tuple[Floats, Indices]:
-    """Newton steps on the three cosine laws, and the solutions that satisfy them in the end."""
-    o = np.zeros_like(x[0])
-    for _ in range(2):  # Newton's method doubles the digits each time
-        sides, (a, b, c, d, e, f) = _sides_squared(x, cosines)
-        J = np.array([[a, b, o], [c, o, d], [o, e, f]])
-        cofactors = _cofactors(J)
-        step = np.einsum("ijk,ik->jk", cofactors, sides - squared)
-        step /= 2 * (J[0] * cofactors[0]).sum(axis=0)
-        x = x - np.where(np.isfinite(step), np.clip(step, -0.1 * x, 0.1 * x), 0.0)
-    off = np.abs(_sides_squared(x, cosines)[0] - squared)
-    # steps from double roots end a thousandth off
-    exact = ((off <= 1e-3 * squared.max(axis=0)) & (x > 0)).all(axis=0)
-    return x[:, exact], which[exact]
-
-
-def _sides_squared(x: Floats, cosines: Floats) -> tuple[Floats, list[Floats]]:
-    """Sides squared (3, K) by the cosine laws, and half their slopes by either distance."""
-    sides, slopes = np.empty_like(x), []
-    for k, (i, j) in enumerate(SIDES):
-        slopes += [x[i] - x[j] * cosines[k], x[j] - x[i] * cosines[k]]
-        sides[k] = x[i] * slopes[-2] + x[j] * slopes[-1]
-    return sides, slopes
-
-
-class Generator(NamedTuple):
-    """A way to make guesses: what is drawn, batch by batch, and the poses (K, 4, 4) of a batch."""
-
-    name: str
-    batches: Iterable[Any]
-    poses: Callable[[Any], Floats]
-
-
-def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Generator:
+def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Guesses:
     """Poses from triples of one camera's rays, whose detections err by `reach` px at most."""
     solve = _perspective if rays.central else _orthographic
-    chunks = _problems(problem, rays) if min(len(rays), len(problem.body)) > 2 else []
-    return Generator("three rays", chunks, partial(solve, problem.body.means, reach, rays))
+    for triples in ray_triples(problem, rays) if min(len(rays), len(problem.body)) > 2 else ():
+        yield partial(solve, problem.body.means, reach, rays, *triples)
 
 
 def far_apart(points: Floats, count: int) -> Indices:
@@ -224,8 +182,18 @@ def far_apart(points: Floats, count: int) -> Indices:
     return np.array(chosen)
 
 
-def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
-    """Chunks of problems: three detections (3, K) as three features (3, K).
+@lru_cache(maxsize=32)
+def sparse(body: Body, count: int) -> Body:
+    """A body with `count` of its features, far from one another; itself where it has no more."""
+    if len(body) <= count or not is_pointlike(body):
+        return body
+    few = far_apart(body.means, count)
+    normals = None if body.normals is None else body.normals[few]
+    return Body(body.name, tuple(body.features[k] for k in few), normals, body.gravity)
+
+
+def ray_triples(problem: SearchProblem, rays: Rays) -> Iterator[tuple[Indices, Indices]]:
+    """Batches of problems: three detections (3, K) as three features (3, K).
 
     All, where they can be tried; else of detections and features those far apart first, which
     fix a pose best, unless most detections are false: the outermost are the body's no more.  Then
@@ -251,18 +219,16 @@ def _problems(problem: SearchProblem, rays: Rays) -> Iterator[Triples]:
             yield by_detection[:, a], by_feature[:, b]
     if all_tried:
         return
-    near_rays, near_features = _nearest(rays.pixels), _nearest(features)
+    # indices of points, from each of them to its farthest
+    near_rays, near_features = (
+        np.argsort(np.linalg.norm(p[:, None] - p, axis=2), axis=1) for p in (rays.pixels, features)
+    )
     # a body is seen in one place, larger or smaller
     crowds = [budget.sample, 2 * budget.sample, 4 * budget.sample, M]
     for k in range(most // batch):
         crowd = crowds[k % len(crowds)]
         some, few = min(crowd, M), min(max(crowd // 2, 3), n)
         yield _drawn(near_rays, some, batch, rng), _drawn(near_features, few, batch, rng)
-
-
-def _nearest(points: Floats) -> Indices:
-    """Indices (n, n) of points, from each of them to its farthest."""
-    return np.argsort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)
 
 
 def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -> Indices:
@@ -272,27 +238,28 @@ def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -
     return np.stack([first, *nearest[first, chosen]])
 
 
-def _perspective(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
-    """Rays that meet in one centre."""
-    detections, corners = triples
+def _perspective(
+    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+) -> Floats:
+    """Three rays that meet in one centre."""
     between = rays.directions @ rays.directions.T
     squared = ((features[corners[FIRST]] - features[corners[SECOND]]) ** 2).sum(axis=-1)
     distances, which = depths(between[detections[FIRST], detections[SECOND]], squared)
     # smaller than the error in the image, nothing is told apart
-    largest = np.sqrt(squared.max(axis=0))[which]
-    near = largest > reach * rays.slope * distances.min(axis=0)
+    near = np.sqrt(squared.max(axis=0))[which] > reach * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
     directions = gathered(rays.directions, detections[:, which])
     world = rays.origins[0][:, None] + directions * distances[:, None]
     return align_triples(gathered(features, corners[:, which]), world)
 
 
-def _orthographic(features: Floats, reach: float, rays: Rays, triples: Triples) -> Floats:
+def _orthographic(
+    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+) -> Floats:
     """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    detections, corners = triples
     body, seen = gathered(features, corners), gathered(rays.origins, detections)
     tolerance = 2 * reach * rays.offset
     length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))

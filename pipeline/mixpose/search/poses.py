@@ -1,0 +1,328 @@
+"""Many poses at once: what they explain, how they descend, and those of all orientations.
+
+Detections of a camera are drawn once as disks of labels into a plane across its rays, where the
+projection is a matrix whatever the lens, so that one look-up per predicted feature says which
+detection it meets.  Features that fall on the same detection count once: counting features would
+favour poses that gather them all on one blob.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import Body
+from mixpose.judgement import odds_of, paid_by_count
+from mixpose.matching import Matches, crowding
+from mixpose.objective import MatchedObjective, View, matched_objective, project_body
+from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import from_parts, perturb, transform
+from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
+from mixpose.sensors import Rays
+
+
+class LabelImage(NamedTuple):
+    """Disks around the M detections of one camera, as large as errors of detections may be."""
+
+    projection: Floats  # (3, 4) from the world to columns and rows of cells, homogeneous
+    eye: Floats  # (4,) centre of projection, or the way to it from everywhere, homogeneous
+    # (rows, columns) detection 1 to M; in the lower eight bits 255 at a detection, 0 at its rim.
+    # Most are empty, and take no memory; the outermost are for certain
+    cells: NDArray[np.int32]
+
+
+def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) -> LabelImage:
+    """Draw the detections of a camera."""
+    middle = rays.directions.mean(axis=0)
+    middle /= np.linalg.norm(middle)
+    side = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
+    side /= np.linalg.norm(side)
+    axes, centre = np.array([side, np.cross(middle, side), middle]), rays.origins[0]
+    to_plane, eye = np.column_stack([axes, -axes @ centre]), np.append(centre, 1.0)
+    if not rays.central:
+        to_plane[2], eye = [0.0, 0.0, 0.0, 1.0], np.append(-middle, 0.0)
+    unit = rays.slope if rays.central else rays.offset
+    points = rays.origins + rays.directions
+    plane = points @ to_plane[:, :3].T + to_plane[:, 3]
+    # how many px a unit of the plane is at each detection, whatever the lens
+    _, J, _ = sensor.view.sensor.linearise(points)
+    per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * plane[:, 2] * unit
+    radii = problem.reach(sensor) / np.where(per_unit > 0, per_unit, 1.0)
+    # at 84° from the middle a ray misses the plane
+    inside = plane[:, 2] > min(0.1, 0.5 * plane[:, 2].max())
+    places, radii = (plane[:, :2] / plane[:, 2:] / unit)[inside], radii[inside]
+    lower, extent = places.min(axis=0), np.ptp(places, axis=0)
+    # four cells a radius: the rim is off by an eighth of it; 16 million at most
+    step = max(np.median(radii) / 4, np.sqrt(np.prod(extent) / 2**24))
+    margin = radii.max() + 2 * step
+    columns, rows = (np.ceil((extent + 2 * margin) / step) + 1).astype(int)
+    shift = (margin - lower) / step
+    (u, v), radii = (places / step + shift).T[..., None], radii[:, None] / step
+    around = np.arange(-np.ceil(radii.max()), np.ceil(radii.max()) + 1)
+    column, row = (np.floor(middle).astype(np.intp) + around.astype(np.intp) for middle in (u, v))
+    du, dv = (u - column - 0.5) / radii, (v - row - 0.5) / radii
+    near = 1 - np.sqrt(dv[:, :, None] ** 2 + du[:, None] ** 2)
+    label, iv, iu = np.nonzero(near > 0)
+    value = (near[label, iv, iu] * 255).astype(np.int32)
+    order = np.argsort(value, kind="stable")  # where disks overlap the nearest is drawn last
+    label, iv, iu, value = (part[order] for part in (label, iv, iu, value))
+    cells = np.zeros((rows, columns), dtype=np.int32)
+    cells[row[label, iv], column[label, iu]] = ((label + 1) << 8) + value
+    to_cells = np.diag([1 / (unit * step), 1 / (unit * step), 1.0])
+    to_cells[:2, 2] = shift
+    return LabelImage(to_cells @ to_plane, eye, cells)
+
+
+def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tuple[Floats, Floats]:
+    """Distinct detections (L, H) of each camera that poses (H, 4, 4) explain, and how nearly (H,).
+
+    That is nearness, 0 to 1, summed over features, for ranking equals.
+    """
+    counts, near = np.zeros((len(images), len(poses))), np.zeros(len(poses))
+    size = max(2**17 // len(body), 1)  # so many numbers stay in the cache
+    for part in (slice(k, k + size) for k in range(0, len(poses), size)):
+        axes = np.ascontiguousarray(poses[part, :3].transpose(1, 0, 2))
+        world = axes[..., :3] @ body.means.T + axes[..., 3:]
+        shape, world = world.shape[1:], world.reshape(3, -1)
+        for k, image in enumerate(images):
+            u, v, depth = image.projection[:, :3] @ world + image.projection[:, 3:]
+            scale = 1.0 / np.maximum(depth, 1e-300)
+            rows, columns = image.cells.shape
+            column = np.clip(u * scale, 0.0, columns - 1.0).astype(np.int32)
+            row = np.clip(v * scale, 0.0, rows - 1.0).astype(np.int32)
+            met = np.take(image.cells, row * columns + column)
+            if body.normals is not None:
+                outward = (axes[..., :3] @ body.normals.T).reshape(3, -1)
+                towards = image.eye[:3, None] - image.eye[3] * world
+                met = np.where((outward * towards).sum(axis=0) > 0, met, 0)
+            met = met.reshape(shape)
+            labels = np.sort(met >> 8, axis=1)
+            labels[:, 1:] *= labels[:, 1:] != labels[:, :-1]
+            counts[k, part] = np.count_nonzero(labels, axis=1)
+            near[part] += (met & 255).sum(axis=1) / 256
+    return counts, near
+
+
+def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
+    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count, and shares of the body met.
+
+    All sensors are cameras.
+    """
+    body, free, rules = problem.body, problem.free, problem.rules
+    matches = _matches_of(problem, poses)
+    met = matches.met * matches.dimensions
+    # of each sensor: what one that is covered meets by chance tells nothing of the others
+    spare = met * np.maximum(1 - free.sum() / np.maximum(met.sum(axis=1), 1.0), 0.0)[:, None]
+    squares, errors = np.where(spare > 0, matches.squares, 0.0), rules.noise.errors
+    degrees = errors.typical_degrees
+    variances = (degrees * errors.typical**2 + squares) / (degrees + spare)
+    odds = odds_of(matches, variances, np.full(len(poses), 2 * body.radius), rules.detection)
+    shares = matches.met / np.maximum(matches.expected, 1.0)
+    return paid_by_count(odds, matches, free), shares.mean(axis=1)
+
+
+def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
+    """Detections that sensors have where they are predicted to see the features of poses."""
+    sensors, rules = problem.detections, problem.rules.association
+    projection = project_body(tuple(one.view.sensor for one in sensors), problem.body)
+    sigmas = np.array([one.sigma for one in sensors])
+    at = projection.project(poses)
+    y, J = at.y.swapaxes(0, 1), at.J.swapaxes(0, 1)
+    seen, faced = at.seen.swapaxes(0, 1), at.faced.swapaxes(0, 1)
+    shares, offsets, crowd = np.zeros(seen.shape), np.zeros(y.shape), np.zeros(seen.shape[:2])
+    boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
+    lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)
+    for k, (sensor, sigma) in enumerate(zip(sensors, sigmas, strict=True)):
+        points, smallest = sensor.points, rules.min_region * sigma
+        pose, feature, detection = _pairs(y[:, k], seen[:, k], points, problem.reach(sensor))
+        shares[pose, k, feature] = 1.0
+        offsets[pose, k, feature] = (points[detection] - y[pose, k, feature]) / sigma
+        crowd[:, k] = crowding(points, lower[:, k], upper[:, k], smallest) * sigma**2
+    nothing = np.zeros(crowd.shape)
+    return Matches(
+        names=tuple(one.view.name for one in sensors),
+        dimensions=projection.dimensions,
+        sigmas=sigmas,
+        weights=seen.astype(np.float64),
+        shares=shares,
+        places=y,
+        offsets=offsets,
+        J=J / sigmas[:, None, None, None],
+        detections=np.full(seen.shape, -1),
+        explained=nothing,
+        unseen=np.count_nonzero(faced & ~seen, axis=2),
+        count=nothing + [len(one.points) for one in sensors],
+        crowd=crowd,
+        unmatched_nearby=nothing,
+        finest=nothing + 1.0,
+    )
+
+
+def _pairs(y: Floats, seen: Mask, points: Floats, reach: float) -> tuple[Indices, Indices, Indices]:
+    """Poses, features and detections (C,) of places (K, N, 2) that are met within reach.
+
+    A detection is met by the nearest of the features to which it is the nearest.
+    """
+    pose, feature = np.nonzero(seen)
+    away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=reach)
+    order = np.argsort(away, kind="stable")[: np.count_nonzero(np.isfinite(away))]
+    _, first = np.unique(pose[order] * len(points) + nearest[order], return_index=True)
+    met = order[first]
+    return pose[met], feature[met], nearest[met]
+
+
+class Stage(NamedTuple):
+    """One blur of a descent: factors of σ_ε per sensor, steps at it, and how many poses go on."""
+
+    factors: tuple[float, ...]
+    steps: int
+    survivors: int
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Refines poses on the blurred observations of all sensors, which are drawn once per blur."""
+
+    views: Sequence[View]
+    body: Body
+    free: Mask  # (6,) directions that may change
+    budget: SearchBudget
+    _objectives: dict[tuple[float, ...], MatchedObjective] = field(default_factory=dict)
+
+    def objective(self, factors: tuple[float, ...] = ()) -> MatchedObjective:
+        """The matched objective with features wider than σ_ε by factors per sensor; none: 1."""
+        key = factors or (1.0,) * len(self.views)
+        if key not in self._objectives:
+            sigmas = [f * one.observation.sigma for f, one in zip(key, self.views, strict=True)]
+            self._objectives[key] = matched_objective(self.views, self.body, sigmas)
+        return self._objectives[key]
+
+    def refine(self, poses: Floats, stages: Sequence[Stage]) -> Floats:
+        """Poses (K, 4, 4) that are left of H after all stages.
+
+        Where they are too many, the best: by the cosine between observed and predicted densities,
+        summed over sensors.
+        """
+        # directions without any curvature stay
+        for factors, steps, survivors in stages if len(poses) else ():
+            objective = self.objective(factors)
+            if steps:
+                options = NewtonOptions(steps, damping=1e-3, unchecked=True)
+                poses = ascend(objective, poses, self._moved, self.free, options).states
+            if len(poses) > survivors:
+                # of shares k/n, not of their squares: what counts is how many features are met
+                values = np.sqrt(objective.shares(poses, whole=True)).sum(axis=0)
+                poses = poses[np.argsort(-values, kind="stable")]
+            poses = poses[unlike(self.body, poses, self.budget.alike / 5)[:survivors]]
+        return poses
+
+    def _moved(self, poses: Floats, twists: Floats) -> Floats:
+        """Poses (H, 4, 4) moved by twists (H, 6), not farther than the linear model holds: 20°."""
+        shift, turn = np.linalg.norm(twists.reshape(-1, 2, 3), axis=2).T
+        longest = np.maximum(turn, 0.175 / max(self.body.radius, 1e-12) * shift)
+        return perturb(poses, twists * np.minimum(1.0, 0.35 / np.maximum(longest, 1e-12))[:, None])
+
+
+def unlike(body: Body, poses: Floats, cell: float) -> Indices:
+    """Indices, ascending, of poses (H, 4, 4) that do not put the body where an earlier one does.
+
+    Of very many, about: places of features are the same within cells whose side is a share `cell`
+    of the body's radius.
+    """
+    corners = body.means[[0, len(body) // 2, -1]]
+    places = transform(poses, corners).reshape(len(poses), corners.size)
+    cells = np.round(places / (cell * body.radius)).astype(np.int64)
+    keys = cells @ np.random.default_rng(0).integers(1, 2**40, cells.shape[1])
+    return np.sort(np.unique(keys, return_index=True)[1])
+
+
+def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage]]:
+    """Poses (H, 4, 4) of all orientations, and how to descend from them."""
+    budget, T_reference, free = problem.budget, problem.T_reference, problem.free
+    rotations = spread_turns(free[3:], budget.orientation_step) @ T_reference[:3, :3]
+    places = _centres(problem)[:, None] - rotations @ problem.body.means.mean(axis=0)
+    poses = from_parts(rotations, np.where(free[:3], places, T_reference[:3, 3]))
+    # a turn by a step moves features by so much of their spread
+    blurs = [budget.orientation_step * one.moments[1] / one.sigma for one in problem.detections]
+    stages = [
+        Stage(tuple(max(blur, 1.0) ** power for blur in blurs), steps, survivors)
+        for power, steps, survivors in budget.orientation_stages
+    ]
+    return poses.reshape(-1, 4, 4), stages
+
+
+def spread_turns(free: Mask, step: float) -> Floats:
+    """Turns (count, 3, 3) about the free world axes (3,), about `step` radians apart."""
+    if free.all():  # a super-Fibonacci spiral (Alexa, Low-Discrepancy Sampling of SO(3), CVPR 2022)
+        count = int(np.ceil(np.pi**2 * 1.5 / step**3))
+        s = np.arange(count) + 0.5
+        r, R = np.sqrt(s / count), np.sqrt(1 - s / count)
+        alpha, beta = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168756204288118041
+        quaternions = [r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)]
+        return np.asarray(Rotation.from_quat(np.stack(quaternions, axis=1)).as_matrix())
+    steps = int(np.ceil(2 * np.pi / step))
+    angles = -np.pi + 2 * np.pi * np.arange(steps) / steps
+    axes = [angles if is_free else np.zeros(1) for is_free in free]
+    vectors = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    vectors = vectors[np.linalg.norm(vectors, axis=1) <= np.pi + 1e-9]
+    return np.asarray(Rotation.from_rotvec(vectors).as_matrix())
+
+
+def _centres(problem: SearchProblem) -> Floats:
+    """Places (C, 3) of the body's centre at which all sensors see the middle of what they see."""
+    radius, middles = problem.body.radius, Sum(tuple(map(_Middle, problem.detections)))
+
+    def moved(places: Floats, steps: Floats) -> Floats:
+        length = np.linalg.norm(steps, axis=1, keepdims=True)
+        return np.asarray(places + steps * np.minimum(1.0, 5 * radius / np.maximum(length, 1e-30)))
+
+    options = NewtonOptions(12, damping=1e-6, unchecked=True)
+    places = ascend(middles, _starts(problem), moved, problem.free[:3], options).states
+    off, kept = np.sqrt(-2 * middles.linearise(places).value), list[int]()
+    for k in np.argsort(off, kind="stable").tolist():
+        apart = np.linalg.norm(places[k] - places[kept], axis=1)
+        if off[k] < off.min() + radius and (apart > 0.2 * radius).all():
+            kept.append(k)
+    return np.asarray(places[kept[: problem.budget.sample // 2]])
+
+
+def _starts(problem: SearchProblem) -> Floats:
+    """Places (S, 3) to start from: on rays, as far as the body looks large, and about ranges."""
+    body, centre = problem.body, problem.body.means.mean(axis=0)
+    size = float(np.sqrt(((body.nodes.points - centre) ** 2).sum(axis=1).mean()))
+    held = transform(problem.T_reference, centre[None])[0]
+    starts = [] if problem.free.all() else [held]
+    for one in problem.detections:
+        mean, spread = one.moments
+        rays = one.view.sensor.rays(mean[None])
+        if rays is None:
+            source = one.view.sensor.towards(np.zeros(3))
+            starts += [source + sign * mean[0] * axis for sign in (1, -1) for axis in np.eye(3)]
+        elif len(rays):
+            # a body as large as its features' spread is seen
+            across = max(spread, one.sigma) * rays.slope
+            far = np.sqrt(2 / 3) * size / across if rays.central else 0.0
+            starts.append(rays.origins[0] + far * rays.directions[0])
+    return np.where(problem.free[:3], np.array(starts).reshape(-1, 3), held)
+
+
+@dataclass(frozen=True)
+class _Middle:
+    """Minus half the squared distance of a place from where a sensor sees the middle."""
+
+    seen: SensorDetections
+
+    def linearise(self, places: Floats) -> Quadratic:
+        """Second-order models at places (H, 3), of lengths: the sensor's unit is taken off."""
+        y, J, _ = self.seen.view.sensor.linearise(places)
+        scale = np.sqrt(np.maximum((J * J).mean(axis=1).sum(axis=1), 1e-30))[:, None]
+        J, residual = J / scale[..., None], (self.seen.moments[0] - y) / scale
+        pull, C = np.einsum("hmk,hm->hk", J, residual), np.einsum("hmk,hml->hkl", J, J)
+        return Quadratic(-0.5 * (residual**2).sum(axis=1), pull, C)
