@@ -49,7 +49,7 @@ def evidence(
     information: Floats = KNOWN,
     detection: DetectionModel = BY_VOLUME,
 ) -> float:
-    prior = Prior(log_density, np.ones(6))
+    prior = log_density, np.ones(6)
     return odds_at([one], information, prior, 1.0, detection)
 
 
@@ -120,7 +120,7 @@ def odds_by_volume(
     found: list[Seen], *, in_space: bool = True, spreads: Floats | None = None
 ) -> float:
     detection = DetectionModel(by_count=False, in_space=in_space)
-    prior = Prior(0.0, np.ones(6))
+    prior = 0.0, np.ones(6)
     return odds_at(found, KNOWN, prior, 200.0, detection, spreads)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import DetectionModel, JudgementRules, NoiseModel, Prior, judge
+from mixpose.judgement import DetectionModel, JudgementRules, NoiseModel, judge
 from mixpose.matching import AssociationRules, ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.rigid import perturb, transform
@@ -56,7 +56,7 @@ def spread_out(camera: PinholeCamera, count: int, away_from: Floats) -> Floats:
 def test_the_evidence_of_the_search_is_that_of_the_judgement(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
-    never = Prior(-1e9, np.ones(6))  # by volume: so that by count is cheaper
+    never = (-1e9, np.ones(6))  # by volume: so that by count is cheaper
     for hidden, false in ((0, 0), (2, 6)):
         views = detect(pinhole_cameras, EIGHT, TRUTH, noise=0.3, hidden=hidden, false=false)
         poses = perturb(TRUTH, np.array([np.zeros(6), [0.3, -0.2, 0.2, 0.002, 0.0, -0.003]]))

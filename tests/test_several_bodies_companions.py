@@ -11,7 +11,6 @@ import pytest
 from bodies_in_view import CAMERAS, OTHER, TOOL, at, body, off, scene_of, views_of
 
 from mixpose.density import Observation
-from mixpose.judgement import Prior
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.tracking import Companion, Rules, Scene, Track
@@ -99,15 +98,15 @@ def test_what_was_beside_is_a_mean_and_a_spread_that_narrows_with_the_frames() -
 
 
 def test_what_lets_expect_a_pose_is_shared_between_its_own_track_and_another_body() -> None:
-    own, near = Prior(-20.0, np.ones(6)), Prior(-8.0, np.full(6, 0.1))
+    own, near = (-20.0, np.ones(6)), (-8.0, np.full(6, 0.1))
     fresh = either(own, near, 0, Rules().motion)
-    assert fresh.log_density == pytest.approx(-8.0 + np.log(0.5), abs=1e-4)
-    assert (fresh.spread == 0.1).all()
+    assert fresh[0] == pytest.approx(-8.0 + np.log(0.5), abs=1e-4)
+    assert (fresh[1] == 0.1).all()
     # after a hundred frames without the body half of what was left is left of 0.98^100
     faded = either(own, near, 100, Rules().motion)
-    assert faded.log_density == pytest.approx(-8.0 + np.log(0.5 * 0.98**100), abs=1e-4)
+    assert faded[0] == pytest.approx(-8.0 + np.log(0.5 * 0.98**100), abs=1e-4)
     gone = either(own, near, 2000, Rules().motion)
-    assert gone.log_density == pytest.approx(-20.0, abs=1e-6)
+    assert gone[0] == pytest.approx(-20.0, abs=1e-6)
 
 
 def test_a_pose_that_is_sure_for_doubtful_ones_before_it_alone_is_in_doubt() -> None:

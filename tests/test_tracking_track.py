@@ -16,7 +16,6 @@ from mixpose.fit import EstimatorOptions
 from mixpose.judgement import (
     AcceptanceRules,
     DetectionModel,
-    Prior,
     flat_prior,
     judge,
 )
@@ -53,8 +52,7 @@ def followed(track: Track, places: list[Floats], frame: int, time_s: float) -> T
 def prior_near(T: Floats, misses: int = 0, body: Body = EIGHT) -> tuple[float, Floats]:
     track = Track((branch(),), frame=0, misses=misses)
     data = Tracker.create(body, EstimatorOptions()).data(track, 1, None, [])
-    prior = replace(data, predictions=[Branch(TRUTH, 1.0, NARROW)]).prior(T)
-    return prior.log_density, prior.spread
+    return replace(data, predictions=[Branch(TRUTH, 1.0, NARROW)]).prior(T)
 
 
 def test_a_body_that_moves_is_predicted_where_its_velocity_takes_it() -> None:
@@ -88,8 +86,8 @@ def test_a_pose_far_from_every_prediction_is_a_surprise_that_grows_with_the_wait
     flat = flat_prior(EIGHT, ALL_FREE, MODEL)
     for misses, surprise in ((0, 0.02), (4, 0.1)):
         log_density, spread = prior_near(elsewhere, misses)
-        assert log_density == pytest.approx(np.log(surprise) + flat.log_density)
-        np.testing.assert_allclose(spread, flat.spread)
+        assert log_density == pytest.approx(np.log(surprise) + flat[0])
+        np.testing.assert_allclose(spread, flat[1])
 
 
 def test_at_a_prediction_directions_that_are_open_are_as_uncertain_as_predicted() -> None:
@@ -121,7 +119,7 @@ def test_one_detection_where_a_feature_is_predicted_is_no_pose(
 ) -> None:
     y = pinhole_cameras[0].project(transform(TRUTH, EIGHT.means))[0]
     views = [view_of("0", pinhole_cameras[0], y[:1])]
-    prior = Prior(*prior_near(TRUTH))
+    prior = prior_near(TRUTH)
     judged = judge(matched_objective(views, EIGHT, [1.5]), TRUTH, ALL_FREE, prior=prior)
     # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
     assert judged.log_evidence < 7 * np.log(0.25) + 10

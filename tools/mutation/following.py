@@ -28,8 +28,8 @@ _PREDICTION = (
     Mutant(
         "tracking-prior-as-wide-as-the-world",
         "tracking/frame.py",
-        "return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])",
-        "return Prior(float(np.logaddexp.reduce(terms)), anywhere.spread)",
+        "return float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))]",
+        "return float(np.logaddexp.reduce(terms)), anywhere[1]",
         "a pose near its prediction that meets one feature has high evidence",
         (_TRACK,),
     ),
@@ -253,7 +253,7 @@ _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-open-directions-unbounded",
         "tracking/likelihood.py",
-        "information += np.diag(1 / frame.anywhere.spread[free] ** 2)",
+        "information += np.diag(1 / frame.anywhere[1][free] ** 2)",
         "information += 0",
         "directions that ranges leave open have no bound",
         (_RANGES,),

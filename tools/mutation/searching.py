@@ -236,8 +236,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-never-in-doubt",
         "tracking/proposers.py",
-        "if convinces(*given) or not is_sure(*given):",
-        "if convinces(*given):",
+        "if not is_sure(best, frame.free, rules.acceptance):",
+        "if False:",
         "where a prediction fails nothing else is tried",
         (_STARTS,),
     ),

@@ -18,7 +18,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.special import gammaln
@@ -30,13 +30,9 @@ from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
 from mixpose.records import Floats, Indices, Mask, SensorReport
 
-
-class Prior(NamedTuple):
-    """What is known of a pose before its frame."""
-
-    log_density: float  # of its probability, per length and radian of each free direction
-    spread: Floats  # (6,) how uncertain it is; matters where the data leave a direction open
-
+Prior: TypeAlias = tuple[float, Floats]
+"""What is known of a pose before its frame: log of its density, per length and radian of each free
+direction, and how uncertain it is (6,), which matters where the data leave a direction open."""
 
 Case: TypeAlias = tuple[
     MatchedObjective, Floats, RememberedNoise, Prior | None, Matches | None, NoiseEstimate | None
@@ -214,7 +210,7 @@ def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
     turns = int(free[3:].sum())
     rotations = 8 * np.pi**2 if turns == 3 else (2 * np.pi) ** turns
     volume = room ** int(free[:3].sum()) * rotations / len(body.symmetries)
-    return Prior(-float(np.log(volume)), np.repeat([room, np.pi], 3))
+    return -float(np.log(volume)), np.repeat([room, np.pi], 3)
 
 
 def log_evidence(

@@ -66,7 +66,8 @@ def is_known(data: Frame, judged: ScoredPose) -> bool:
         return True
     if not data.track.known or data.track.misses:
         return False
-    return bool((data.prior(judged.T_world_object).spread < data.anywhere.spread).all())
+    _, spread = data.prior(judged.T_world_object)
+    return bool((spread < data.anywhere[1]).all())
 
 
 def is_reflection(data: Frame, judged: ScoredPose) -> bool:
@@ -118,7 +119,7 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
 
 def _is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
-    gained = data.prior(judged.T_world_object).log_density - data.anywhere.log_density
+    gained = data.prior(judged.T_world_object)[0] - data.anywhere[0]
     return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
 
 

@@ -95,14 +95,14 @@ class Frame:
         if not some:
             return anywhere
         surprise = min(rules.surprise * (1 + misses), 1.0)
-        terms, spreads = [np.log(surprise) + anywhere.log_density], [anywhere.spread]
+        terms, spreads = [np.log(surprise) + anywhere[0]], [anywhere[1]]
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
             weight = max((1 - surprise) * one.weight, 1e-12)
             terms.append(np.log(weight) + one.log_density(T, self.free, rules))
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
-        return Prior(float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))])
+        return float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))]
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

@@ -112,9 +112,9 @@ class MatchedLikelihood:
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:
     """Whether all sensors gave single ranges, of a body of few points."""
     return (
-        len(body.nodes.points) == len(body) <= rules.max_features
-        and all(view.sensor.dimension == 1 for view in views)
-        and all(isinstance(view.observation.pattern, PointPattern) for view in views)
+        all(view.sensor.dimension == 1 for view in views)
+        and all(view.observation.points is not None for view in views)
+        and len(body.nodes.points) == len(body) <= rules.max_features
     )
 
 
@@ -266,13 +266,13 @@ class AssociationLikelihood:
         remembered = model.noise.memory * before.of(("",)) + [[squares], [degrees]]
         # a direction that all of it leaves open is as uncertain as anywhere
         information = self._definite(self._posterior(start, self._noise).linearise(T[None]))
-        information += np.diag(1 / frame.anywhere.spread[free] ** 2)
+        information += np.diag(1 / frame.anywhere[1][free] ** 2)
         covariance = np.zeros((6, 6))
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
         degrees = rules.ranges.stated_degrees + float(before.total[1])
         covariance *= model.noise.enlargement(count, degrees)
-        log_density = frame.prior(T).log_density
+        log_density, _ = frame.prior(T)
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,

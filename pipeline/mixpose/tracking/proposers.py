@@ -49,9 +49,10 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     if not ranked:
         return True
     track, rules, best = frame.track, frame.rules, ranked[0]
-    given = best, frame.free, rules.acceptance
-    if convinces(*given) or not is_sure(*given):
-        return not convinces(*given)
+    if convinces(best, frame.free, rules.acceptance):
+        return False
+    if not is_sure(best, frame.free, rules.acceptance):
+        return True
     if track.believed < rules.proposals.believed or track.misses or track.doubted:
         return True
     before = sum(met for met, _ in track.tallies.values())
@@ -204,10 +205,10 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     # the value grows as the square of the features met
     values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
     fewer = met * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
-    here = frame.prior(T).log_density
+    here, _ = frame.prior(T)
     for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
         moved = _moves_alike(frame, T) if alike[k].is_step else None
-        against = here - frame.prior(poses[1 + k] if moved is None else moved).log_density
+        against = here - frame.prior(poses[1 + k] if moved is None else moved)[0]
         least = 1 + max(against, 0.0) / np.log(rules.acceptance.rival)
         if fewer[k] < rules.look_alikes.fewer * least:
             yield Start(poses[1 + k], frame.close, T_moved=moved)

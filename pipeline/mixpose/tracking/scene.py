@@ -128,7 +128,7 @@ def identify(
     # by body (rows) and pose; in the last column none, which says nothing
     likely = np.zeros((len(known), len(poses) + 1))
     for row, one in zip(likely, data, strict=True):
-        row[:-1] = [one.prior(pose.T_world_object).log_density for pose in poses]
+        row[:-1] = [one.prior(pose.T_world_object)[0] for pose in poses]
     rows, columns = linear_sum_assignment(likely[:, :-1], maximize=True)
     pose_of = {known[i]: int(j) for i, j in zip(rows, columns, strict=True)}
     spare = [j for j in range(len(poses)) if j not in pose_of.values()]

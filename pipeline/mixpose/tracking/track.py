@@ -180,6 +180,5 @@ def predict(
 def either(own: Prior, beside: Prior, misses: int, rules: MotionRules) -> Prior:
     """What a body's own track lets expect of a pose, or another body, the less the more misses."""
     share = rules.beside * (1 - rules.surprise) ** misses
-    mine, theirs = own.log_density + np.log(1 - share), beside.log_density + np.log(share)
-    spread = own.spread if mine > theirs else beside.spread
-    return Prior(float(np.logaddexp(mine, theirs)), spread)
+    mine, theirs = own[0] + np.log(1 - share), beside[0] + np.log(share)
+    return float(np.logaddexp(mine, theirs)), own[1] if mine > theirs else beside[1]
