@@ -159,6 +159,7 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         detections=np.full(at.seen.shape, -1).swapaxes(0, 1),
         explained=nothing,
         unseen=np.count_nonzero(at.faced & ~at.seen, axis=2).T,
+        merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
         crowd=np.stack(crowd, axis=1),
         unmatched_nearby=nothing,

@@ -14,7 +14,6 @@ import numpy as np
 
 from mixpose.fit import Fit, blur_schedule, fit_near
 from mixpose.judgement import RememberedNoise, ScoredPose, judge, nearest_alike
-from mixpose.matching import Matches
 from mixpose.objective import NormalPrior
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
 from mixpose.records import Floats
@@ -40,7 +39,6 @@ class Start:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
-    matches: Matches | None = None  # at the pose, where two features share a detection
 
 
 class MatchedLikelihood:
@@ -56,7 +54,7 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
         uncertainty = start.uncertainty
         if uncertainty is None:
-            return Fit(start.T_world_object, matches=start.matches)
+            return Fit(start.T_world_object)
         frame, known = self.frame.without(start.left_out), self.frame.begun
         if known is not None and known.fit and start.prediction is frame.predictions[0]:
             return known.fit
