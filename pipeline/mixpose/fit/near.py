@@ -48,6 +48,7 @@ SearchName: TypeAlias = Literal["thorough", "live"]
 
 # what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
 SHARP = NewtonOptions(40, 1e-6, remaining=5e-7, value_error=value_error(STEPS_PER_SIGMA))
+COARSE = replace(SHARP, iterations=10, tolerance=1e-3)
 FINE = NewtonOptions(40, 1e-8, value_error=value_error(FINE_STEPS))
 
 
@@ -150,15 +151,15 @@ def fit_near(
     rules: FitRules = FitRules(),
 ) -> Fit:
     """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
-    free, coarse = free_mask(options), replace(SHARP, iterations=10, tolerance=1e-3)
-    sigmas, levels = [view.observation.sigma for view in views], list[list[float]]()
+    free, levels = free_mask(options), list[list[float]]()
+    sigmas = [view.observation.sigma for view in views]
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
         states, spread = T_start[None], np.where(free, uncertainty, 0.0)
         for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
             levels.append(level)
             at = build_objective(options.objective, views, body, samples, level, states[0])
-            states = ascend(at, states, perturb, free, coarse).states
+            states = ascend(at, states, perturb, free, COARSE).states
         end = last or build_objective(options.objective, views, body, samples, sigmas, states[0])
         return ascend(end, states, perturb, free, newton)
 
