@@ -68,6 +68,7 @@ def matches_of(*sensors: Seen) -> Matches:
         detections=np.where(arrays["shares"] > 0, np.arange(most), -1),
         explained=of_each("explained"),
         unseen=of_each("unseen"),
+        merged=np.zeros(len(sensors), dtype=np.intp),
         count=np.array([n if one.count is None else one.count for one, n in counts]),
         crowd=of_each("crowd") * sigmas**dimensions,
         unmatched_nearby=of_each("unmatched_nearby"),

@@ -61,6 +61,7 @@ SHOWN_BY = {
     "no merged_pair": "fast",
     "no narrowed": "flat, one camera",
     "no without_sensor": "a knocked camera",
+    "nothing merged": "fast",
     "misses free": "1 pinhole 5/0/5",
     "unseen free": "1 pinhole 8/2/5",
     "clutter even": "1 pinhole 5/0/5",

@@ -41,6 +41,7 @@ def test_a_detection_is_that_of_one_feature() -> None:
     found = met([(10.0, 10.0)], (10.0, 10.0), (12.0, 10.0))
     assert found.shares.tolist() == [[1.0, 0.0]]
     assert found.detections.tolist() == [[0, -1]]
+    assert found.merged.tolist() == [0]
 
 
 def test_features_side_by_side_meet_the_nearest_detection_each() -> None:
@@ -57,6 +58,18 @@ def test_a_feature_that_may_be_off_is_met_as_far_as_it_may_be() -> None:
     wide = (4.0 / 1.55) ** 2 - VARIANCE
     assert met(spots, place, off=np.sqrt(0.98 * wide)).shares.tolist() == [[0.0]]
     assert met(spots, place, off=np.sqrt(1.02 * wide)).shares.tolist() == [[1.0]]
+
+
+def test_two_features_that_share_a_detection_count_as_one_and_a_third_is_missed() -> None:
+    # the detection is nearer to the middle of the first two than to either; the middle of the
+    # second and the third would be met as well, had the second not its partner already
+    found = met([(0.7, 0.3)], (0.0, 0.0), (1.0, 0.0), (1.4, 0.6))
+    assert found.shares.tolist() == [[0.5, 0.5, 0.0]]
+    assert found.detections.tolist() == [[0, 0, -1]]
+    assert found.merged.tolist() == [1]
+    np.testing.assert_allclose(SIGMA * found.offsets[0, :2], [[0.2, 0.3]] * 2, atol=1e-9)
+    # it moves as their middle does
+    np.testing.assert_allclose(found.J[0, 0], found.J[0, 1], atol=1e-12)
 
 
 def mixture(centres: Floats, y: Floats) -> Floats:

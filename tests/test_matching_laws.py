@@ -23,10 +23,13 @@ RULES = AssociationRules()
 PER_POSE = [one.name for one in fields(Matches)][3:]
 
 
-def matched(views: list[View], poses: Floats, body: Body = EIGHT) -> Matches:
+def matched(
+    views: list[View], poses: Floats, body: Body = EIGHT, *, merged: bool = True
+) -> Matches:
     objective = matched_objective(views, body, [view.observation.sigma for view in views])
+    rules = replace(RULES, merged=merged)
     narrowest = ErrorRules().narrowest
-    return Matches.stacked([associate(objective, T, RULES, narrowest) for T in poses])
+    return Matches.stacked([associate(objective, T, rules, narrowest) for T in poses])
 
 
 def assert_same(a: Matches, b: Matches) -> None:
@@ -132,13 +135,15 @@ def test_offsets_and_jacobians_are_in_standard_deviations_of_the_sensor(mixed: l
         y = view.sensor.project(world)[0]
         np.testing.assert_allclose(found.places[k, :, :m], y, atol=1e-6)
         shift = (view.sensor.project(moved)[0] - y) / found.sigmas[k]
-        there = (found.J[k] @ twist)[:, :m]  # to second order
-        np.testing.assert_allclose(there, shift, atol=0.01 * np.abs(shift).max())
+        # pairs that share a detection move as their middle; of the others to second order
+        alone = np.array([list(found.detections[k]).count(j) < 2 for j in found.detections[k]])
+        there = (found.J[k] @ twist)[:, :m]
+        np.testing.assert_allclose(there[alone], shift[alone], atol=0.01 * np.abs(shift).max())
         pattern = view.observation.pattern
         assert isinstance(pattern, PointPattern)
-        met = found.detections[k] >= 0
-        off = (pattern.points[found.detections[k, met]] - y[met]) / found.sigmas[k]
-        np.testing.assert_allclose(found.offsets[k, met, :m], off, atol=1e-6)
+        single = (found.detections[k] >= 0) & alone
+        off = (pattern.points[found.detections[k, single]] - y[single]) / found.sigmas[k]
+        np.testing.assert_allclose(found.offsets[k, single, :m], off, atol=1e-6)
 
 
 def test_rows_are_those_of_least_squares_by_the_shares(mixed: list[View]) -> None:
@@ -171,6 +176,32 @@ def test_what_a_sensor_has_adds_up_over_its_features() -> None:
     assert matches_of(replace(seen, shares=np.zeros(4))).rms == [None]
 
 
+def test_two_features_that_share_a_detection_are_met_as_one_in_each_pose(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    camera = pinhole_cameras[0]
+    y = camera.project(transform(TRUTH, EIGHT.means))[0]
+    first, second = 0, int(np.argsort(np.linalg.norm(y - y[0], axis=1))[1])
+    # a σ_ε so large that the two look near to each other
+    views = detect([camera], EIGHT, TRUTH)
+    pattern = views[0].observation.pattern
+    assert isinstance(pattern, PointPattern)
+    wide = 2 * float(np.linalg.norm(y[first] - y[second]))
+    merged = np.vstack([np.delete(y, [first, second], axis=0), y[[first, second]].mean(axis=0)])
+    observation = replace(
+        views[0].observation, pattern=PointPattern(merged, np.ones(7)), sigma=wide / 4
+    )
+    found = matched([replace(views[0], observation=observation)], np.array([TRUTH, TRUTH]))
+    pair = [first, second]
+    assert found.merged.tolist() == [[1], [1]]
+    assert found.shares[:, 0, pair].tolist() == [[0.5, 0.5]] * 2
+    assert (found.detections[:, 0, pair] == 6).all()
+    np.testing.assert_allclose(found.offsets[:, 0, pair], 0.0, atol=1e-9)
+    # the Jacobian is that of their middle, which is the mean of theirs
+    both = matched(detect([camera], EIGHT, TRUTH, sigma=wide / 4), TRUTH[None]).J[0, 0, pair]
+    np.testing.assert_allclose(found.J[0, 0, pair], [both.mean(axis=0)] * 2, rtol=1e-9)
+
+
 def nearest_by_hand(points: Floats, y: Floats, reach: float) -> list[int]:
     """By which detection each feature is met: the nearest pair of all, then of those left."""
     met = [-1] * len(y)
@@ -189,7 +220,7 @@ def test_features_meet_the_nearest_detections_that_no_nearer_feature_takes(
     # σ_ε of 6: every detection is within reach of some features, and features of some detections
     views = crowded([*pinhole_cameras, *range_sensors], seed=seed, sigma=6.0)
     poses = poses_around(4, seed)
-    found = matched(views, poses)
+    found = matched(views, poses, merged=False)
     reach, contested = 1.5518 * np.sqrt(2) * 6.0, 0  # √(−2 ln 0.3) deviations of C
     for h, pose in enumerate(poses):
         for k, view in enumerate(views):

@@ -11,13 +11,12 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, fit_near
 from mixpose.judgement import ScoredPose, judge
-from mixpose.matching import AssociationRules, ErrorRules
+from mixpose.matching import ErrorRules
 from mixpose.objective import View, matched_objective
 from mixpose.records import Estimate, PointPattern
-from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform, twist_between
+from mixpose.rigid import from_parts, perturb, rotation_angle_deg, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.proposers import _paired
 
 Floats = NDArray[np.float64]
 
@@ -76,31 +75,17 @@ def test_a_pair_counts_as_one_feature_and_its_middle_is_met() -> None:
     T = in_line(1, 2, 3.0)
     y = seen(T)
     merged = np.vstack([np.delete(y, [1, 2], axis=0), y[1:3].mean(axis=0)])
-    matches, reach = judged_at(T, [view_of(merged)]).matches, AssociationRules().reach_squared
-    assert np.count_nonzero(matches.shares[0]) == 5
-    paired = _paired(matches, reach)
-    assert paired is not None
-    assert paired.shares[0].tolist() == [1.0, 0.5, 0.5, 1.0, 1.0, 1.0]
-    assert paired.squared.max() < 1e-6
-    # it moves as their middle does
-    middle = (matches.J[0, 1] + matches.J[0, 2]) / 2
-    np.testing.assert_allclose(paired.J[0, 1:3], [middle] * 2, atol=1e-12)
-    # where all are seen there is none
-    assert _paired(judged_at(T, [view_of(y)]).matches, reach) is None
-
-
-def test_a_hidden_feature_beside_a_seen_one_leaves_the_pose_within_its_deviations() -> None:
-    T = in_line(1, 2, 3.0)
-    points = np.delete(seen(T), 1, axis=0)
-    matches = judged_at(T, [view_of(points)]).matches
-    assert matches.detections.tolist() == [[0, -1, 1, 2, 3, 4]]
+    matches = judged_at(T, [view_of(merged)]).matches
+    assert matches.merged.tolist() == [1]
     assert matches.met == pytest.approx([5.0])
-    # the two may be a pair as well
-    estimate = estimated(points, T)
-    assert estimate.T_world_object is not None
-    assert estimate.covariance is not None
-    off = twist_between(T, estimate.T_world_object)
-    assert off @ np.linalg.solve(estimate.covariance, off) < 2.0
+    assert matches.squared.max() < 1e-6
+
+
+def test_a_hidden_feature_beside_a_seen_one_is_no_pair() -> None:
+    T = in_line(1, 2, 3.0)
+    matches = judged_at(T, [view_of(np.delete(seen(T), 1, axis=0))]).matches
+    assert matches.merged.tolist() == [0]
+    assert matches.met == pytest.approx([5.0])
 
 
 def test_a_false_detection_beside_a_hidden_feature_does_not_pull(

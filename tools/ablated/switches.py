@@ -114,6 +114,7 @@ SWITCHES = (
     Switch("no merged_pair", without_refinement(merged_pair)),
     Switch("no narrowed", without_refinement(narrowed)),
     Switch("no without_sensor", without_refinement(without_sensor)),
+    Switch("nothing merged", ruled("judgement.association", merged=False)),
     Switch("misses free", free_misses),
     Switch("unseen free", ruled("judgement.detection", log_unseen=FREE)),
     Switch("clutter even", ruled("judgement.association", crowded=False)),

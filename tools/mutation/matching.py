@@ -58,6 +58,27 @@ _MET = (
         "features take the detection of their neighbour",
     ),
     Mutant(
+        "matching-hidden-beside-seen-is-a-pair",
+        "matching/associate.py",
+        "if near[k] and closer[k] < 0:",
+        "if near[k]:",
+        "a hidden feature beside a seen one counts as merged with it",
+    ),
+    Mutant(
+        "matching-merged-detection-counts-twice",
+        "matching/associate.py",
+        "weights[pair] / 2, middle[k]",
+        "weights[pair], middle[k]",
+        "two features that share a detection count as two measurements",
+    ),
+    Mutant(
+        "matching-merged-detection-shared-by-three",
+        "matching/associate.py",
+        "single[k] = False",
+        "single[k] = True",
+        "a third feature takes a detection that two share already",
+    ),
+    Mutant(
         "matching-neighbours-pull-taken-for-misfit",
         "matching/associate.py",
         "pull = sampled[:, 1:] - predicted_gradient",
@@ -101,6 +122,14 @@ _RECORD = (
         "J / sigmas[:, None, None, None]",
         "J / 1.0",
         "covariances depend on the unit of a sensor",
+    ),
+    Mutant(
+        "matching-merged-features-move-as-one",
+        "matching/associate.py",
+        "paired, J = np.nonzero(partner >= 0),",
+        "paired, J = np.nonzero(partner >= 99),",
+        "the middle of two features moves as if it were one of them",
+        ("test_tracking_outliers.py",),
     ),
     Mutant(
         "matching-spread-of-a-body-is-no-reach",

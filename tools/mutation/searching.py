@@ -100,26 +100,10 @@ _PROPOSALS = (
     Mutant(
         "tracking-merged-pairs-never-mended",
         "tracking/proposers.py",
-        "return [] if T is judged.T_world_object else",
-        "return [] if T is not judged.T_world_object else",
+        "return [] if at is judged else",
+        "return [] if at is not judged else",
         "two features seen as one bend the pose",
         (_PROPOSERS,),
-    ),
-    Mutant(
-        "tracking-merged-detection-counts-twice",
-        "tracking/proposers.py",
-        "shares[k, pair] = shares[k, met[j]] / 2",
-        "shares[k, pair] = shares[k, met[j]]",
-        "two features that share a detection count as two measurements",
-        ("test_tracking_outliers.py",),
-    ),
-    Mutant(
-        "tracking-merged-features-move-as-one",
-        "tracking/proposers.py",
-        "= J[k, pair].mean(axis=0), detections",
-        "= J[k, met[j]], detections",
-        "the middle of two features moves as if it were one of them",
-        ("test_tracking_outliers.py",),
     ),
     Mutant(
         "tracking-narrow-fits-begin-wide",

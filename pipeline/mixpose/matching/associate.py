@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING, peak
@@ -28,6 +30,7 @@ class AssociationRules:
     min_share: float = constant(0.3, "of a feature's peak: within 2.2 σ_ε; false ones pass beyond")
     min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
     crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
+    merged: bool = constant(True, "whether two features may share a detection: blobs that touch")
     slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
@@ -50,9 +53,11 @@ def associate(
     if body.spread:  # variances along an axis by which features may be off
         spreads = body.node_spreads(T_world_object)
         reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
+    # shares, offsets in sensor units, detections, and partners of features in merged pairs
+    met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
+    shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    by, offsets = _nearest(y, detections, rules.reach_squared * reach, is_open)
-    shares = np.where(by >= 0, weights, 0.0)
+    _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
@@ -60,6 +65,8 @@ def associate(
         shares[k, of], offsets[k, of, :m] = _residuals(
             *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
         )
+    paired, J = np.nonzero(partner >= 0), J / sigmas[:, None, None, None]
+    J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
@@ -69,10 +76,11 @@ def associate(
         shares=shares,
         places=y,
         offsets=offsets / sigmas[:, None, None],
-        J=J / sigmas[:, None, None, None],
+        J=J,
         detections=by,
         explained=np.minimum(explained, 1.0),
         unseen=(body.nodes.weights * (match.faced[:, 0] & ~seen)).sum(axis=1),
+        merged=np.bincount(paired[0], minlength=len(views)) // 2,
         count=count,
         crowd=crowd,
         unmatched_nearby=unmatched,
@@ -92,14 +100,17 @@ def _detections(views: Sequence[View]) -> Floats:
     return detections
 
 
-def _nearest(
+def _to_nearest(
     y: Floats,
+    weights: Floats,
     detections: Floats,
     reach: Floats,  # (L, n) squared, in sensor units
     is_open: Mask,
-) -> tuple[Indices, Floats]:
-    """By which detection each feature is met (L, n), and its offset; each is taken once."""
-    by, offsets = np.full(is_open.shape, -1), np.zeros(y.shape)
+    merged: bool,
+    met: tuple[Floats, Floats, Indices, Indices],
+) -> None:
+    """Write what the nearest detections meet, each taken once or by a pair of features."""
+    shares, offsets, by, _ = met
     away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
@@ -107,8 +118,37 @@ def _nearest(
     for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
         if by[k, i] < 0 and (k, j) not in taken:
             taken.add((k, j))
-            by[k, i], offsets[k, i] = j, away[k, i, j]
-    return by, offsets
+            shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
+    if merged and len(taken) < len(order):
+        # only a feature near a detection that is taken can share it
+        for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
+            _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
+
+
+def _run_together(
+    y: Floats,
+    weights: Floats,
+    reach: Floats,
+    is_open: Mask,
+    met: Sequence[NDArray[Any]],
+) -> None:
+    """Let two features share a detection that lies nearer to their middle than to either.
+
+    Images that overlap are detected as one.  The two count as one feature in their middle.
+    """
+    shares, offsets, detections, partner = met
+    single = shares > 0
+    for i in np.flatnonzero(is_open & ~single).tolist():
+        places = y + offsets
+        near = single & (((places - y[i]) ** 2).sum(axis=1) <= reach[i])
+        middle = places - (y + y[i]) / 2
+        closer = (middle**2).sum(axis=1) - (offsets**2).sum(axis=1)
+        k = int(np.argmin(np.where(near, closer, np.inf)))
+        if near[k] and closer[k] < 0:
+            pair = [i, k]
+            shares[pair], offsets[pair] = weights[pair] / 2, middle[k]
+            partner[pair], detections[pair] = pair[::-1], detections[k]
+            single[k] = False
 
 
 def _residuals(

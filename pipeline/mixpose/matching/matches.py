@@ -36,11 +36,12 @@ class Matches:
     weights: Floats  # (..., L, N) of the features in view; 0 of the others
     shares: Floats  # (..., L, N) how far each is met, 0 to its weight
     places: Floats  # (..., L, N, 2) where they are predicted, sensor units
-    offsets: Floats  # (..., L, N, 2) observed minus predicted, σ_ε
+    offsets: Floats  # (..., L, N, 2) observed minus predicted, σ_ε; of a merged pair its middle's
     J: Floats  # (..., L, N, 2, 6) Jacobian of the predicted places by the pose, σ_ε
     detections: Indices  # (..., L, N) by which each is met; -1 for none
     explained: Floats  # (..., L) share of the sensor's density that the pose accounts for
     unseen: Floats  # (..., L) weight of the features that face the sensor outside its view
+    merged: Indices  # (..., L) pairs of features that share a detection
     count: Floats  # (..., L) number of detections
     crowd: Floats  # (..., L) of them per m-th power of σ_ε, around the prediction
     unmatched_nearby: Floats  # (..., L) of no feature, about the body, where some feature is missed

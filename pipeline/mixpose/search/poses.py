@@ -158,6 +158,7 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         detections=np.full(seen.shape, -1),
         explained=nothing,
         unseen=np.count_nonzero(faced & ~seen, axis=2),
+        merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
         crowd=crowd,
         unmatched_nearby=nothing,

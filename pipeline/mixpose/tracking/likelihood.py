@@ -21,7 +21,6 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.fit import Fit, blur_schedule, fit_near
 from mixpose.judgement import DetectionModel, RememberedNoise, ScoredPose, judge, nearest_alike
-from mixpose.matching import Matches
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
 from mixpose.records import Floats, Mask, PointPattern
@@ -42,7 +41,6 @@ class Start:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
     T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
     blur: float = 1.0  # in σ_ε, that the fit begins at
-    matches: Matches | None = None  # at the pose, where two features share a detection
 
 
 class MatchedLikelihood:
@@ -58,7 +56,7 @@ class MatchedLikelihood:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
         uncertainty, frame = start.uncertainty, self.frame.without(start.left_out)
         if uncertainty is None:
-            return Fit(start.T_world_object, matches=start.matches)
+            return Fit(start.T_world_object)
         is_first = any(start.prediction is one for one in frame.predictions[:1])
         if self.frame.together and is_first:
             return self.frame.together[0]

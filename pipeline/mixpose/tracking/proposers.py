@@ -264,26 +264,28 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     """Least squares with the middle of two features that run into each other in one detection."""
     if not likelihood.knows_detections:
         return []
-    reach = frame.rules.judgement.association.reach_squared
-    T, paired = judged.T_world_object, _paired(judged.matches, reach)
+    at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
-        if paired is None:
+        if not seen.merged.any():
             break
-        J, offsets = paired.rows()
-        T = perturb(T, gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free))
-        start = Start(T)
-        paired = _paired(likelihood.judge(likelihood.fit(start), start).matches, reach)
-    return [] if T is judged.T_world_object else [Start(T, matches=paired)]
+        J, offsets = seen.rows()
+        step = gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free)
+        start = Start(perturb(at.T_world_object, step))
+        at = likelihood.judge(likelihood.fit(start), start)
+        seen = at.matches
+    return [] if at is judged else [Start(at.T_world_object)]
 
 
-def _paired(seen: Matches, reach: float) -> Matches | None:
+def _paired(seen: Matches, reach: float) -> Matches:
     """In each sensor the feature missed nearest to the detection of another, as one with that.
 
-    `reach` is how far that may be, squared, in variances of C; None where there is no such pair.
+    `reach` is how far that may be, squared, in variances of C.
     """
+    if not seen.missed.any():
+        return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
-    detections = seen.detections.copy()
-    for k in np.flatnonzero((seen.missed > 0) & (seen.met > 0)):
+    merged = seen.merged.copy()
+    for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
         met = np.flatnonzero(seen.detections[k] >= 0)
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
         if not len(met) or not len(lost):
@@ -297,10 +299,9 @@ def _paired(seen: Matches, reach: float) -> Matches | None:
         pair = [lost[i], met[j]]
         shares[k, pair] = shares[k, met[j]] / 2
         offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
-        J[k, pair], detections[k, pair] = J[k, pair].mean(axis=0), detections[k, met[j]]
-    if (shares == seen.shares).all():
-        return None
-    return replace(seen, shares=shares, offsets=offsets, J=J, detections=detections)
+        J[k, pair] = J[k, pair].mean(axis=0)
+        merged[k] = 1
+    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged)
 
 
 def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
