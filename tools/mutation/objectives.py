@@ -91,7 +91,7 @@ _MATCHED = (
     Mutant(
         "objective-sensors-weigh-alike",
         "objective/matched.py",
-        "weights = tops / energies / len(body)",
+        "weights = tops / energies / len(body.features)",
         "weights = np.ones(len(views))",
         "clutter in one sensor takes the weight from its true features",
     ),

@@ -157,11 +157,3 @@ def odd_factor(ratio: float) -> int:
     """Largest odd whole number up to a ratio, at least 1: odd boxes have a central pixel."""
     whole = max(int(ratio + 1e-9), 1)
     return whole if whole % 2 else whole - 1
-
-
-def is_empty(pattern: Pattern) -> bool:
-    """Whether a pattern has no feature at all."""
-    if isinstance(pattern, PointPattern):
-        return len(pattern.points) == 0 or not pattern.weights.sum() > 0
-    # a profile below zero has no density, nor has one that single precision cannot normalise
-    return not pattern.values.max() > 1e-30

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas, remap
-from mixpose.density.blur import DRAWING, FAR, blurred, is_empty, mass, odd_factor, reduced
+from mixpose.density.blur import DRAWING, FAR, blurred, mass, odd_factor, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, PointPattern, Singles
 
 
@@ -234,3 +234,11 @@ def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
     cross = np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells)
     return float((weights @ weights + 2 * cross) * peak(variance, points.shape[1]))
+
+
+def is_empty(pattern: Pattern) -> bool:
+    """Whether a pattern has no feature at all."""
+    if isinstance(pattern, PointPattern):
+        return len(pattern.points) == 0 or not pattern.weights.sum() > 0
+    # a profile below zero has no density, nor has one that single precision cannot normalise
+    return not pattern.values.max() > 1e-30

@@ -212,7 +212,7 @@ def matched_objective(
     tops = peak(variances, projection.dimensions[:, None])
     # ω_l: as many equal features as would give this energy, per feature of the body, so
     # that clutter in one sensor does not take the weight from its true features
-    weights = tops / energies / len(body)
+    weights = tops / energies / len(body.features)
     if shared is None:
         atlas = matched_atlas(observations, sigmas, steps_per_sigma)
     else:

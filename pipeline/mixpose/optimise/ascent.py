@@ -196,7 +196,7 @@ def _steps(
         rest = hessian - options.least_curvature * C + np.diag(~free)
         definite = [dpotrf(one)[1] == 0 for one in rest]
         C = np.where(np.array(definite)[:, None, None], hessian, C)
-    return _many_steps(C, g, damping) if len(g) > 1 else _step(C[0], g[0], damping[0])
+    return _step(C[0], g[0], damping[0]) if len(g) == 1 else _many_steps(C, g, damping)
 
 
 def _step(C: Floats, g: Floats, damping: float) -> tuple[Floats, list[float]]:
@@ -216,7 +216,7 @@ def _many_steps(C: Floats, g: Floats, damping: list[float]) -> tuple[Floats, lis
     """The steps (H, q) of H states, and their gains."""
     diagonal, share = np.einsum("hqq->hq", C), np.array(damping)[:, None]
     top = diagonal.max(axis=1)[:, None]
-    A = C + ((share + 1e-12) * diagonal + top * 1e-12 * share + _TINY)[:, None] * np.eye(len(g[0]))
+    A = C + ((share + 1e-12) * diagonal + top * 1e-12 * share + _TINY)[:, None] * np.eye(g.shape[1])
     steps = np.where(top > 0, np.linalg.solve(A, g[..., None])[..., 0], 0.0)
     gains = (steps * (g - 0.5 * (C @ steps[..., None])[..., 0])).sum(axis=1)
     return steps, gains.tolist()

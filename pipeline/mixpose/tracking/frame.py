@@ -106,8 +106,6 @@ class Frame:
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""
-        if not names:
-            return self
         views, still = (
             [v for v in some if v.name not in names] for some in (self.views, self.still)
         )
@@ -146,8 +144,6 @@ class Frame:
 
 def given(frame: Frame, T_world_object: Floats) -> float:
     """How far features in view may be off by the body's spread, in σ_ε of their sensor."""
-    if not frame.body.spread:
-        return 0.0
     projection = frame.finest.projection
     at = projection.project(T_world_object[None])
     # per coordinate, of which each sensor has two in J

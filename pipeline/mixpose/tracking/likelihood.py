@@ -54,7 +54,9 @@ class MatchedLikelihood:
 
     def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
-        uncertainty, frame = start.uncertainty, self.frame.without(start.left_out)
+        uncertainty, frame = start.uncertainty, self.frame
+        if start.left_out:
+            frame = frame.without(start.left_out)
         if uncertainty is None:
             return Fit(start.T_world_object)
         is_first = any(start.prediction is one for one in frame.predictions[:1])
@@ -62,7 +64,8 @@ class MatchedLikelihood:
             return self.frame.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
-        spread = given(frame, start.T_world_object) if self.knows_detections else 0.0
+        is_bent = self.knows_detections and frame.body.spread
+        spread = given(frame, start.T_world_object) if is_bent else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
             where = seen.views, seen.body, T_start, uncertainty, seen.options, seen.samples

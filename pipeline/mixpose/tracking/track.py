@@ -135,6 +135,10 @@ class Track:
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
 
+    def applied(self, views: Sequence[View], time_s: float | None) -> list[View]:
+        """Views as late as they are known to be at a time."""
+        return self.delays.applied(views, time_s, self.seconds_until(time_s))
+
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s

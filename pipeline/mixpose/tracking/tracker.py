@@ -102,7 +102,7 @@ class Tracker:
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         data = Frame(
-            views=track.delays.applied(seen, time_s, track.seconds_until(time_s)),
+            views=track.applied(seen, time_s),
             body=self.body,
             options=self.options,
             samples=self.samples,
