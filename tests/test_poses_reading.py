@@ -96,6 +96,7 @@ CORRELATED[0, 1] = CORRELATED[1, 0] = 1.5
         ({**MINIMAL, "frame": 1.5}, ":2: frame is 1.5; "),
         ({**MINIMAL, "frame": True}, ":2: frame is True; "),
         ({**MINIMAL, "object": 3}, ":2: object is 3; "),
+        ({**MINIMAL, "sensors": {"a\rb": None}}, r":2: sensors.a\\rb is None; "),
         ({**MINIMAL, "status": "fine"}, ":2: status is 'fine'; .*'ok', 'ambiguous' or 'lost'"),
         ({**MINIMAL, "T_world_object": None}, ":2: T_world_object is null or missing"),
         ({**MINIMAL, "status": "lost"}, ":2: T_world_object is given while status is 'lost'"),

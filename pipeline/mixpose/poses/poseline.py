@@ -175,7 +175,7 @@ def _checked(model: type[_Checked], values: Mapping[str, Any], where: str) -> _C
         return model.model_validate(values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"]))
+        key = ".".join(repr(str(part))[1:-1] for part in first["loc"])  # names of any characters
         if first["type"] == "missing":
             raise RecordingError(f"{where}: {key} is missing") from error
         found = repr(first["input"])
