@@ -97,7 +97,7 @@ class Atlas:
         beside += 0.25
         around = self._sides * beside[:, None]
         around += maps[:, None]
-        u, v = around.astype(np.float32)
+        u, v = around.astype(np.float32).reshape(2, 1, -1)  # rows would be shared among threads
         sampled = self._quarters @ remap(self.values, u, v).reshape(4, -1)
         return np.asarray(sampled.reshape(*y.shape[:-1], 3) * self._scale.units)
 
