@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -138,11 +137,10 @@ def test_a_row_changes_poses_or_what_is_told_of_them(
     assert _told(case, switch.change) != _told(case, all_on)
 
 
-@pytest.mark.skipif("MIXPOSE_RECORDINGS" not in os.environ, reason="no real recordings here")
 @pytest.mark.parametrize("name", SHOWN_BY_REAL)
-def test_a_row_changes_what_is_told_of_real_ranges(name: str) -> None:
+def test_a_row_changes_what_is_told_of_real_ranges(name: str, recordings: Path) -> None:
     (switch,) = (one for one in SWITCHES if one.name == name)
-    (case,) = real_cases(Path(os.environ["MIXPOSE_RECORDINGS"]), [SHOWN_BY_REAL[name]])
+    (case,) = real_cases(recordings, [SHOWN_BY_REAL[name]])
     assert _told(case, switch.change) != _told(case, all_on)
 
 

@@ -90,7 +90,7 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
         return False
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
     live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
-    nothing = replace(data, predictions=(), beside=None, drawn=None, together=None, searches=[])
+    nothing = data.seen_otherwise(predictions=(), beside=None, searches=[])
     alone = replace(nothing, track=track, options=live)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     least = own - rules.search.outdone
@@ -108,7 +108,7 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
         rules = other.rules
         limit = best.log_evidence + float(np.log(rules.acceptance.rival))
         tolerance = tolerance_of(data.body, other.body, rules.look_alikes.alike)
-        seen = replace(other, views=data.views, still=data.still, drawn=None)
+        seen = other.seen_otherwise(views=data.views, still=data.still)
         for part in like_features(data.body, met, other.body, tolerance):
             if len(part.features) == len(met):
                 T = best.T_world_object @ part.T_body_other
@@ -146,4 +146,4 @@ def _evidence(data: Frame, start: Start) -> float:
 def _mirrored(data: Frame, chosen: Mask) -> Frame:
     """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
     near = frozenset(np.flatnonzero(chosen).tolist())
-    return replace(data, body=mirror_image(data.body, near), drawn=None)
+    return data.seen_otherwise(body=mirror_image(data.body, near))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -109,7 +110,11 @@ class Frame:
         views, still = (
             [v for v in some if v.name not in names] for some in (self.views, self.still)
         )
-        return replace(self, views=views, still=still, drawn=None)
+        return self.seen_otherwise(views=views, still=still)
+
+    def seen_otherwise(self, **changes: Any) -> Frame:
+        """With other views or another body, of which nothing is drawn or fitted yet."""
+        return replace(self, drawn=None, together=None, **changes)
 
     def in_motion(self, motion: Motion) -> Frame:
         """The frame as of the common time, of a body that moves."""

@@ -59,9 +59,8 @@ class MatchedLikelihood:
             frame = frame.without(start.left_out)
         if uncertainty is None:
             return Fit(start.T_world_object)
-        is_first = any(start.prediction is one for one in frame.predictions[:1])
-        if self.frame.together and is_first:
-            return self.frame.together[0]
+        if frame.together and start.prediction is frame.predictions[0]:
+            return frame.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         is_bent = self.knows_detections and frame.body.spread
