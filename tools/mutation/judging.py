@@ -127,8 +127,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-choices-cost-nothing",
         "judgement/judge.py",
-        "(ways + assigned + math.log(2))",
-        "math.log(2)",
+        "+ missed - ways +",
+        "+ missed +",
         "among many detections some pose is sure to be found by chance",
     ),
     Mutant(
@@ -169,8 +169,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-points-in-space-anywhere-are-the-feature",
         "judgement/judge.py",
-        "log_rarity + tight - 0.5 * away",
-        "log_rarity + tight",
+        "0.5 * (tight - away)",
+        "0.5 * tight",
         "a false point beside a feature is as good as one at it",
     ),
     Mutant(

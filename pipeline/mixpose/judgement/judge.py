@@ -227,8 +227,9 @@ def log_evidence(
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
-    wide = wide[:, free]
-    inner = information[:, free][..., free] + np.eye(wide.shape[1]) / wide[:, None] ** 2
+    chosen = np.flatnonzero(free)
+    known = np.eye(len(chosen)) / wide[:, chosen, None] ** 2
+    inner = information[:, chosen[:, None], chosen] + known
     laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
     evidence = odds[0] + odds[1] + laplace + log_densities
     if detection.by_count:
@@ -253,17 +254,18 @@ def odds_of(
     gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
-    is_blind = (gained + missed).sum(axis=2, keepdims=True) < detection.log_blind
-    even = found.weights / np.maximum(found.expected, 1.0)[..., None]
-    missed = np.where(is_blind, even * detection.log_blind, missed)
-    gained, shares = np.where(is_blind, 0.0, gained), np.where(is_blind, 0.0, found.shares)
-    missed = missed.sum(axis=1)
+    is_blind = (gained + missed).sum(axis=2) < detection.log_blind
+    shares = found.shares
+    if is_blind.any():
+        even = found.weights / np.maximum(found.expected, 1.0)[..., None]
+        missed = np.where(is_blind[..., None], even * detection.log_blind, missed)
+        gained, shares = (one * ~is_blind[..., None] for one in (gained, shares))
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
-    gained, coordinates = gained.sum(axis=1), (m[:, None] * shares).sum(axis=1)
+    gained, missed, coordinates = gained.sum(axis=1), missed.sum(axis=1), m @ shares
     # a feature that no sensor sees is covered, as if two had missed it: not one by one
     most = 2 * detection.log_missed * found.weights.max(axis=1)
-    missed = np.where((shares > 0).any(axis=1), missed, np.maximum(missed, most))
+    missed = np.where(shares.any(axis=1), missed, np.maximum(missed, most))
     together = np.nonzero(near.sum(axis=1) > 1)
     if detection.in_space and len(together[0]):
         space, share = _in_space(found, roots, crowd, near, together, sizes, spreads)
@@ -301,34 +303,33 @@ def _in_space(
     A clutter point lies where the cameras see it; only that it lies at the feature tells.
     """
     pose, feature = chosen
-    at, sizes, roots = (pose, slice(None), feature), sizes[pose], roots[pose][..., None]
+    at, sizes, roots = (pose, slice(None), feature), sizes[pose, None, None], roots[pose][..., None]
     met, J, r = near[at], found.J[at][..., :3] / roots[..., None], found.offsets[at] / roots
     rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
-    A = np.eye(3) / sizes[:, None, None] ** 2 + rows @ rows.swapaxes(1, 2)
+    A = np.eye(3) / sizes**2 + rows @ rows.swapaxes(1, 2)
     pull = rows @ r.reshape(len(pose), -1, 1)
     place = np.linalg.solve(A, pull)
     share = (met * found.shares[at]).max(axis=1)
     # detections per area, of which each has a depth
     (aa, ab), (_, bb) = (J @ J.swapaxes(2, 3)).transpose(2, 3, 0, 1)
-    across = 0.5 * np.log(np.maximum(aa * bb - ab * ab, 1e-300))
-    rarity = np.log(sizes)[:, None] - np.log(np.maximum(crowd[pose], 1e-300)) - across
+    squared = np.maximum(crowd[pose] ** 2 * (aa * bb - ab * ab), 1e-300)
+    rarity = np.where(met, np.log(sizes[:, 0] / np.sqrt(squared)), -np.inf)
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
         A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads[chosen], A))
         pull = A @ place
     away = (place * pull).sum(axis=(1, 2))
-    tight = 0.5 * np.linalg.slogdet(A / (2 * np.pi))[1]
-    log_rarity = np.where(met, rarity, -np.inf).max(axis=1)
-    return share * np.maximum(log_rarity + tight - 0.5 * away, 0.0), share
+    tight = np.linalg.slogdet(A / (2 * np.pi))[1]
+    return share * np.maximum(rarity.max(axis=1) + 0.5 * (tight - away), 0.0), share
 
 
 def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mask) -> Floats:
     """Evidence (K,) of poses that pay by count: by the ways to fix them by what was observed."""
     gained, missed, coordinates = odds
-    expected, count = found.weights.sum(axis=2), int(free.sum())
-    pins = -(-count // int(found.dimensions.max()))
-    observed = np.maximum((found.count * (expected > 0)).sum(axis=1), pins)
-    features = np.maximum(expected.max(axis=1), pins)
-    ways = gammaln(observed + 1) - gammaln(observed - pins + 1) - math.lgamma(pins + 1)
-    assigned = gammaln(features + 1) - gammaln(features - pins + 1)
+    expected, count = found.expected, np.count_nonzero(free)
+    pins = -(-count // max(found.dimensions.tolist()))
+    observed, features = (found.count * (expected > 0)).sum(axis=1), expected.max(axis=1)
+    # ways to choose detections, and to assign them to features
+    some = np.maximum([observed, features], pins)
+    ways = (gammaln(some + 1) - gammaln(some - pins + 1)).sum(axis=0)
     spare = np.maximum(1.0 - count / np.maximum(coordinates, 1.0), 0.0)
-    return np.asarray(gained * spare + missed - (ways + assigned + math.log(2)))
+    return np.asarray(gained * spare + missed - ways + (math.lgamma(pins + 1) - math.log(2)))

@@ -16,6 +16,7 @@ makes it, something lasts.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -97,14 +98,15 @@ def noise_of(
     what of it lasts from frame to frame and leaves velocities alone; what is remembered; and the
     ratio of residuals to the largest that those before let chance make.
     """
-    count, inner = int(free.sum()), np.ix_(free, free)
+    chosen = np.flatnonzero(free)
+    count, inner = len(chosen), (chosen[:, None], chosen)
     variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
     is_noise = found.squared <= model.errors.outlying**2 * scale[:, None]
     shares, noise = np.where(is_noise, found.shares, 0.0), np.sqrt(scale)
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    J, (fields, kinds) = rows[:, free], _fields_of(found, shares, rows)
+    J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, rows)
     inverse = inverses(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
     drawn = inverse @ (J.T @ fields)
@@ -113,9 +115,12 @@ def noise_of(
     q = fields.shape[1] - 3 * shares.shape[1]
     sizes = noise.repeat(q // len(noise))
     lasting = left[:, :q] / sizes
-    shown = lasting.T @ np.column_stack([lasting, r])
+    shown = np.concatenate([lasting.T @ lasting, (r @ lasting)[:, None]], axis=1)
     biases, mean, second = _lasting(before.biases, found.names, shown, model)
-    rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
+    rest, steady = r, np.zeros((6, 6))
+    if mean.any():
+        rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
+        steady[inner] = moved @ second @ moved.T
     pulls = np.concatenate([rest @ fields[:, :q], r @ fields[:, q:]])
     redundancy = float(shares.sum(axis=1) @ found.dimensions) - count
     own = _normal_equations(rest, redundancy, fields, left, pulls, kinds)
@@ -123,17 +128,16 @@ def noise_of(
     by_kind, of_fields = _variances(moments, own, float(found.met.mean()), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
-    covariance, steady = np.zeros((2, 6, 6))
-    steady[inner] = moved @ second @ moved.T
-    covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    covariance = steady.copy()
+    covariance[inner] += by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
     others = [k for k, name in enumerate(before.names) if name not in found.names]
     names = (*found.names, *(before.names[k] for k in others))
-    sums = np.hstack([sums, before.sums[:, others]])
+    sums = np.concatenate([sums, before.sums[:, others]], axis=1)
     remembered = RememberedNoise(names, sums, moments, biases)
-    return variances, covariance + steady, steady, remembered, ratio
+    return variances, covariance, steady, remembered, ratio
 
 
 def _level(
@@ -175,27 +179,32 @@ def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Float
     L, N = shares.shape
     total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
     away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
-    spread = (shares[..., None] * away * away).sum(axis=(1, 2))
+    spread = (shares[:, None] @ (away * away)).sum(axis=(1, 2))
     size = np.sqrt(spread / (found.dimensions * total[:, 0]))
-    away /= np.maximum(size, 1e-6)[:, None, None]
-    by_feature = np.concatenate([np.ones((L, N, 1)), away], axis=2) * np.sqrt(shares)[..., None]
-    columns, kinds = _columns(tuple(found.dimensions.tolist()), N)
-    of_sensors = by_feature[:, :, None, None, None] * columns[:, None, ..., None]
+    by_feature = np.ones((L, N, 3))
+    by_feature[..., 1:] = away / np.maximum(size, 1e-6)[:, None, None]
+    by_feature *= np.sqrt(shares)[..., None]
+    columns, markers, kinds = _columns(tuple(found.dimensions.tolist()), N)
+    of_sensors = by_feature[:, :, None, None, None] * columns
     # in units of how features move with the body, the root mean square of those in view
-    counts = 3 * np.count_nonzero(found.weights, axis=1) @ found.dimensions
-    moved = np.sqrt((J[:, :3] ** 2).sum() / max(counts, 1))
-    by_place = J[:, :3].reshape(L, N, 2, 1, 3) / max(moved, 1e-6)
-    of_markers = by_place * np.eye(N)[:, None, :, None]
-    return np.hstack([of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)]), kinds
+    by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
+    moved = math.sqrt(float((by_place * by_place).sum()) / max(float(counts), 1.0))
+    of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * markers
+    parts = [of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)]
+    return np.concatenate(parts, axis=1), kinds
 
 
 @lru_cache(maxsize=64)
-def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats]:
-    """Which rows (L, 2) the columns (L, 2) of each sensor are of, and the kinds of all fields."""
+def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats, Floats]:
+    """Which rows columns are of: (L, 1, 2, L, 2, 1) those of sensors, (N, 1, N, 1) of markers.
+
+    And the kinds of all fields.
+    """
     L = len(dimensions)
     axes = np.arange(2) < np.array(dimensions)[:, None]
-    columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)
-    return columns, np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
+    columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)[:, None, ..., None]
+    kinds = np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
+    return columns, np.eye(markers)[:, None, :, None], kinds
 
 
 def _lasting(

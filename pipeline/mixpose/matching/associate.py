@@ -43,13 +43,12 @@ def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
     """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
-    match, views = objective.match(T_world_object[None]), objective.views
+    match, views, sigmas = objective.match(T_world_object[None]), objective.views, objective.sigmas
     dimensions, body = objective.projection.dimensions, objective.projection.body
-    y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
-    sigmas, detections = np.array([view.observation.sigma for view in views]), _detections(views)
-    product = (match.sampled[:, 0, :, 0] * weights).sum(axis=1)
+    y, J, seen, faced, weights, sampled = (part[:, 0] for part in match[:6])
+    product, detections = (sampled[..., 0] * weights).sum(axis=1), _detections(views)
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
-    reach = np.broadcast_to(objective.variances, seen.shape)
+    reach = objective.variances.repeat(y.shape[1], axis=1)
     if body.spread:  # variances along an axis by which features may be off
         spreads = body.node_spreads(T_world_object)
         reach = reach + [in_image(spreads, own[:, :m]) for own, m in zip(J, dimensions.tolist())]
@@ -59,14 +58,16 @@ def associate(
     is_open = seen & (product > 0)[:, None]
     _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
     is_grid = [view.observation.cell is not None for view in views]
-    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist():
+    for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m] = _residuals(
-            *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
+            *mixture, sampled[k, of, : 1 + m], amplitude, rules, all(is_grid)
         )
-    paired, J = np.nonzero(partner >= 0), J / sigmas[:, None, None, None]
-    J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
+    J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
+    if merged.any():
+        paired = np.nonzero(partner >= 0)
+        J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
@@ -79,8 +80,8 @@ def associate(
         J=J,
         detections=by,
         explained=np.minimum(explained, 1.0),
-        unseen=(body.nodes.weights * (match.faced[:, 0] & ~seen)).sum(axis=1),
-        merged=np.bincount(paired[0], minlength=len(views)) // 2,
+        unseen=(faced & ~seen) @ body.nodes.weights,
+        merged=merged,
         count=count,
         crowd=crowd,
         unmatched_nearby=unmatched,
@@ -114,7 +115,7 @@ def _to_nearest(
     away = detections[:, None] - y[:, :, None]
     squared = (away * away).sum(axis=3)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
-    order, taken = np.argsort(squared[pairs], kind="stable"), set[tuple[int, int]]()
+    order, taken = squared[pairs].argsort(kind="stable"), set[tuple[int, int]]()
     for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
         if by[k, i] < 0 and (k, j) not in taken:
             taken.add((k, j))
@@ -197,15 +198,14 @@ def _surroundings(
     density, those of no feature, and the finest blur.
     """
     observations = [view.observation for view in objective.views]
-    sigmas = np.array([one.sigma for one in observations])
-    is_flat = objective.projection.dimensions == 1
+    sigmas, is_flat = objective.sigmas, objective.projection.dimensions == 1
     in_view = np.where(seen[..., None], y, np.nan)
     lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
     size, middle = upper - lower, (lower + upper) / 2
     smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
-    no_box = np.full_like(upper, np.nan)
-    crowd = crowding(detections, lower, upper if rules.crowded else no_box, smallest) * sigmas**2
-    count = np.count_nonzero(~np.isnan(detections[..., 0]), axis=1).astype(np.float64)
+    around = upper if rules.crowded else np.full_like(upper, np.nan)
+    crowd = crowding(detections, lower, around, smallest) * sigmas**2
+    count = np.array([float(one.cells) for one in observations])
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
     if missing.any():
@@ -227,11 +227,11 @@ def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | fl
     """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,): of all, or
     in boxes (..., m) where they are denser; a side counts as `smallest` at least.
     """
-    number = np.count_nonzero(points[..., 0] == points[..., 0], axis=-1)
+    number = (points[..., 0] == points[..., 0]).sum(axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)
     sides = np.fmax(upper - lower, smallest)
     away = np.abs(points - ((lower + upper) / 2)[..., None, :])
-    inside = np.count_nonzero((away <= sides[..., None, :] / 2).all(axis=-1), axis=-1)
+    inside = (away <= sides[..., None, :] / 2).all(axis=-1).sum(axis=-1)
     overall = number / np.fmax(extent, smallest).prod(axis=-1)
     return np.asarray(np.maximum(overall, inside / sides.prod(axis=-1)))
 

@@ -121,7 +121,7 @@ class Matches:
     @cached_property
     def met_by(self) -> Indices:
         """By how many sensors each feature is met (..., N)."""
-        return np.asarray(np.count_nonzero(self.shares, axis=-2))
+        return np.asarray((self.shares > 0).sum(axis=-2))
 
     @property
     def rms(self) -> list[float | None]:
@@ -251,10 +251,9 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
 
     In that the typical variance counts as `typical` degrees of freedom.
     """
-    squares, degrees = sums
-    total_squares, total_degrees = sums.sum(axis=1).tolist()
-    most = total_degrees + typical
-    common = (total_squares + typical * rules.typical**2) / max(most, 1e-12)
+    squares, degrees = sums.tolist()
+    most = sum(degrees) + typical
+    common = (sum(squares) + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
-    variances = (squares + pull * common) / np.maximum(degrees + pull, 1e-12)
-    return np.asarray(np.maximum(variances, LEAST_VARIANCE))
+    drawn = [(s + pull * common) / max(d + pull, 1e-12) for s, d in zip(squares, degrees)]
+    return np.maximum(drawn, LEAST_VARIANCE)
