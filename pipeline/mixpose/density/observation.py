@@ -7,6 +7,7 @@ paper's observation density, and C, g blurred once more by σ, whose samples are
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -122,7 +123,7 @@ class Observation:
         """Number of cells, or of detections."""
         return self._amounts.size
 
-    @property
+    @cached_property
     def weight(self) -> float:
         """Sum of all weights or values."""
         return float(self._amounts.sum())
@@ -172,7 +173,7 @@ class Observation:
     def blur(self, sigma: float, *, matched: bool = False) -> float:
         """Blur of the pattern that gives features a standard deviation, once or for C."""
         variance = (2 if matched else 1) * sigma**2 - self.intrinsic**2
-        return float(np.sqrt(max(variance, 0.0)))
+        return math.sqrt(max(variance, 0.0))
 
     def energy(self, sigma: float) -> float:
         """⟨g, g⟩ at the given standard deviation of a feature, over the whole pattern."""
@@ -229,11 +230,11 @@ def all_pairs(count: int) -> Indices:
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
-    pairs = close_pairs(points[None], np.array([variance]))
-    away = points[pairs[:, 0]] - points[pairs[:, 1]]
-    bells = np.exp(-0.5 * (away * away).sum(axis=1) / variance)
-    cross = np.sum(weights[pairs[:, 0]] * weights[pairs[:, 1]] * bells)
-    return float((weights @ weights + 2 * cross) * peak(variance, points.shape[1]))
+    i, j = close_pairs(points[None], np.array([variance])).T
+    away = points[i] - points[j]
+    bells = np.exp((away * away).sum(axis=1) * (-0.5 / variance))
+    overlap = float(weights @ weights) + 2 * float((weights[i] * weights[j]) @ bells)
+    return overlap * float(peak(variance, points.shape[1]))
 
 
 def is_empty(pattern: Pattern) -> bool:

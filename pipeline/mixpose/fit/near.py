@@ -226,9 +226,8 @@ def _to_the_noise(
     rules: FitRules,
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
-    sigmas = np.array([view.observation.sigma for view in finest.views])
-    blurs, count, first = np.full(len(sigmas), blur), int(free.sum()), ascent
-    likeliest, best = -np.inf, None
+    sigmas, count, first = finest.sigmas, np.count_nonzero(free), ascent
+    blurs, likeliest, best = np.full(len(sigmas), blur), -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
         if beside:
@@ -243,11 +242,12 @@ def _to_the_noise(
         narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
-        if best is None:
+        if best is None and not is_end:
             # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
             alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-            if is_end or (alike and _moved(matches, free, end, variances) < rules.moved**2):
-                return fit
+            is_end = alike and _moved(matches, free, end, variances) < rules.moved**2
+        if best is None and is_end:
+            return fit
         likelihood = log_likelihood(narrow, matches, count, errors)
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit

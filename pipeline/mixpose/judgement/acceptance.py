@@ -61,7 +61,7 @@ class Verdict:
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:
     """Whether what is met fixes a pose in its free directions (6,)."""
-    return pose.measurements >= int(free.sum())
+    return pose.measurements >= np.count_nonzero(free)
 
 
 def is_possible(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
@@ -80,7 +80,7 @@ def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
     return bool(
         is_fixed(pose, free)
         and pose.log_evidence > rules.sure
-        and turn < np.radians(rules.widest_turn_deg)
+        and turn < math.radians(rules.widest_turn_deg)
         and met >= min(rules.agreeing * in_view, rules.enough)
     )
 
@@ -108,7 +108,7 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
     clear = max(rivals, default=0.0) < rules.rival
     if clear := clear and is_sure(best, free, rules):
         # nor is a turn unknown (π²/3 rad²), as about the line that all features met lie on
-        clear = bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < np.pi**2 / 3)
+        clear = bool(best.covariance[3:, 3:].trace() < math.pi**2 / 3)
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
@@ -126,7 +126,7 @@ def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules
     rest = float(np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in others)]))
     return (
         first.coverage >= rules.doubtful_coverage
-        and first.measurements >= int(free.sum()) + rules.spare
+        and first.measurements >= np.count_nonzero(free) + rules.spare
         and first.log_evidence > max(rules.doubtful, rest + rules.standing_out)
     )
 
@@ -220,18 +220,16 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
     """Of the poses that look the same, the one turned least against a reference, or the world."""
     if len(body.symmetries) == 1:
         return T_world_object
-    alike, reference = T_world_object @ body.symmetries, np.eye(4)
-    reference = reference if T_reference is None else T_reference
+    R = T_world_object[:3, :3]
+    turned = R if T_reference is None else T_reference[:3, :3].T @ R
     # the angle grows as the trace of the difference falls
-    nearest = int(np.argmax(np.einsum("ij,kij->k", reference[:3, :3], alike[:, :3, :3])))
+    nearest = int((body.symmetries[:, :3, :3] * turned.T).sum(axis=(1, 2)).argmax())
     # the very same, where it is that: what was worked out for it holds
-    return T_world_object if nearest == body.identity else np.asarray(alike[nearest])
+    return T_world_object if nearest == body.identity else T_world_object @ body.symmetries[nearest]
 
 
 def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
     """Share of belief of each pose among its rivals; even where none meets anything."""
-    logs = np.array([one.log_evidence for one in judged])
-    if not np.isfinite(logs).any():
-        return [1.0 / len(judged)] * len(judged) if judged else []
-    weights = np.exp(logs - logs.max())
-    return list((weights / weights.sum()).tolist())
+    top = max([one.log_evidence for one in judged], default=0.0)
+    odds = [math.exp(one.log_evidence - top) if top > -math.inf else 1.0 for one in judged]
+    return [one / sum(odds) for one in odds]

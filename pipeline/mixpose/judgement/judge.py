@@ -93,7 +93,7 @@ class ScoredPose:
     @cached_property
     def coverage(self) -> float:
         """Mean share of the body's features in view that are met."""
-        return float(self.used.coverage.mean())
+        return float(self.used.coverage.sum()) / len(self.used.names)
 
     @cached_property
     def measurements(self) -> float:
@@ -109,19 +109,24 @@ class ScoredPose:
     @cached_property
     def score(self) -> float:
         """Mean cosine between predicted and observed densities, 0 to 1."""
-        return float(np.sqrt(self.used.explained).mean())
+        return float(np.sqrt(self.used.explained).sum()) / len(self.used.names)
 
     @property
     def is_unlike(self) -> bool:
         """Whether its residuals are larger than chance makes them."""
         return self.residual_ratio > 1
 
-    @property
-    def sensors(self) -> dict[str, SensorReport]:
-        """How each sensor took part."""
-        out, rows = self.left_out, zip(self.matches.explained.tolist(), self.matches.rms)
-        by_name = zip(self.matches.names, rows)
-        return {name: SensorReport(name not in out, *row, out.get(name)) for name, row in by_name}
+    def reports(
+        self, residuals: Mapping[str, Mapping[str, float | None]]
+    ) -> dict[str, SensorReport]:
+        """How each sensor took part, with residuals of features by sensor."""
+        seen, out, nothing = self.matches, self.left_out, dict[str, float | None]()
+        return {
+            name: SensorReport(
+                name not in out, share, rms, out.get(name), residuals.get(name, nothing)
+            )
+            for name, share, rms in zip(seen.names, seen.explained.tolist(), seen.rms)
+        }
 
 
 def taken_part(matches: Matches, left_out: Mapping[str, str]) -> Matches:
@@ -207,10 +212,10 @@ def _evidence(
 def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
     """Nothing is known: anywhere within some radii of the body, turned in any way."""
     room = detection.room * body.radius
-    turns = int(free[3:].sum())
-    rotations = 8 * np.pi**2 if turns == 3 else (2 * np.pi) ** turns
-    volume = room ** int(free[:3].sum()) * rotations / len(body.symmetries)
-    return -float(np.log(volume)), np.repeat([room, np.pi], 3)
+    shifts, turns = np.count_nonzero(free[:3]), np.count_nonzero(free[3:])
+    rotations = 8 * math.pi**2 if turns == 3 else (2 * math.pi) ** turns
+    volume = room**shifts * rotations / len(body.symmetries)
+    return -math.log(volume), np.array([room] * 3 + [math.pi] * 3)
 
 
 def log_evidence(

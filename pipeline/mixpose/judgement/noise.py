@@ -125,7 +125,7 @@ def noise_of(
     redundancy = float(shares.sum(axis=1) @ found.dimensions) - count
     own = _normal_equations(rest, redundancy, fields, left, pulls, kinds)
     moments = model.memory * before.moments + own
-    by_kind, of_fields = _variances(moments, own, float(found.met.mean()), model)
+    by_kind, of_fields = _variances(moments, own, float(found.met.sum()) / len(found.names), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
     covariance = steady.copy()

@@ -56,9 +56,9 @@ def overlaps(
     away = y[:, :, i] - y[:, :, j]
     squared = away * away
     exponents = (squared[..., 0] + squared[..., 1]) * (-0.5 / variances)[..., None]
-    overlap = exponents > -DRAWING.negligible
-    if not overlap.any():
+    if not exponents.max(initial=-np.inf) > -DRAWING.negligible:
         return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
+    overlap = exponents > -DRAWING.negligible
     near = np.flatnonzero(overlap.any(axis=(0, 1)))
     products = (weights[:, :, i] * weights[:, :, j])[..., near]
     bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]

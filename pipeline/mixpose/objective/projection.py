@@ -82,7 +82,7 @@ class BodyProjection:
         for points, weights, one in zip(self._points, self._weights, bodies):
             nodes, n = one.nodes, len(one.nodes.points)
             points[:], points[:n], weights[:n] = nodes.points[0], nodes.points, nodes.weights
-        self._normals, self._radii = body.node_normals, body.node_radii
+        self._normals, self._radii = body.node_normals, None if is_bare(body) else body.node_radii
         self._batch = side_by_side(sensors)
 
     def project(self, poses: Floats) -> Match:
@@ -90,7 +90,7 @@ class BodyProjection:
         H, n, L = len(poses), self._points.shape[-2], len(self.sensors)
         arms = self._points @ poses[:, :3, :3].swapaxes(1, 2)
         world = (arms + poses[:, None, :3, 3]).reshape(-1, 3)
-        if self._radii is None or not self._radii.any():
+        if self._radii is None:
             y, by_world, visible = self._batch.linearise(world)
         else:
             y, by_world, visible = self._of_disks(poses, world, np.tile(self._radii, H)[:, None])
@@ -143,7 +143,12 @@ def project_body(sensors: tuple[Sensor, ...], *bodies: Body) -> BodyProjection:
 
 def can_be_together(body: Body) -> bool:
     """Whether a body has bare points only: no normals, and no size of markers."""
-    return body.normals is None and (body.node_radii is None or not body.node_radii.any())
+    return body.normals is None and is_bare(body)
+
+
+def is_bare(body: Body) -> bool:
+    """Whether its markers have no size."""
+    return body.node_radii is None or not body.node_radii.any()
 
 
 def in_image(spreads: Floats, J: Floats) -> Floats:

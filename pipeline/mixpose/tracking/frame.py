@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -96,14 +97,14 @@ class Frame:
         if not some:
             return anywhere
         surprise = min(rules.surprise * (1 + misses), 1.0)
-        terms, spreads = [np.log(surprise) + anywhere[0]], [anywhere[1]]
+        terms, spreads = [math.log(surprise) + anywhere[0]], [anywhere[1]]
         for one in some:
             T = nearest_alike(T_world_object, self.body, one.T_world_object)
             weight = max((1 - surprise) * one.weight, 1e-12)
-            terms.append(np.log(weight) + one.log_density(T, self.free, rules))
+            terms.append(math.log(weight) + one.log_density(T, self.free, rules))
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
-        return float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))]
+        return float(np.logaddexp.reduce(terms)), spreads[terms.index(max(terms))]
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""
@@ -157,8 +158,11 @@ def given(frame: Frame, T_world_object: Floats) -> float:
     return float(np.sqrt((variances / np.square(frame.sigmas)[:, None]).max()))
 
 
-def follow(frame: Frame, found: Sequence[Branch]) -> Track:
-    """The track after a frame with poses, the best first: how each goes on, as far as they tell."""
+def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
+    """The track after a frame with poses, the best first: how each goes on, as far as they tell.
+
+    With what else is `known` after it, as in `Track`.
+    """
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
     steady, branches = per_kind(body, rules.steady), list[Branch]()
@@ -191,4 +195,5 @@ def follow(frame: Frame, found: Sequence[Branch]) -> Track:
         misses=0,
         walk=walk,
         search=Track.search,
+        **known,
     )

@@ -78,7 +78,7 @@ class DelayEvidence:
                 known = replace(view, unsure=late.deviation, estimated=late.seconds)
                 applied[k] = replace(known, delay=view.delay + late.seconds)
         # a clock that differs by ten standard deviations is not the same: none is late then
-        longest = min(10 * UNKNOWN_S, np.inf if elapsed is None else max(elapsed, 0.0))
+        longest = 10 * UNKNOWN_S if elapsed is None else min(10 * UNKNOWN_S, max(elapsed, 0.0))
         if all(abs(view.delay) <= longest for view in applied):
             return applied
         return [replace(view, delay=0.0) for view in applied]
@@ -154,6 +154,8 @@ class Track:
 
     def nearest(self, T_world_object: Floats, body: Body) -> Branch | None:
         """The branch that a pose goes on from: the nearest."""
+        if len(self.branches) == 1:
+            return self.branches[0]
         scale = np.repeat([body.radius, 1.0], 3)
 
         def away(branch: Branch) -> float:

@@ -155,14 +155,9 @@ class Tracker:
         """The estimate of a frame, with reports of the first pose, believed or not."""
         body, best = self.body, verdict.best
         shown = best or next(iter(ranked), None)
-        reports = dict.fromkeys(data.sensors, SensorReport(False))
-        reports |= shown.sensors if shown else {}
         used = shown.used if shown and len(body.nodes.points) == len(body) else None
-        if used:
-            off = (used.sigmas[:, None] * np.sqrt(used.squared)).tolist()
-            for name, row, k, in_view in zip(used.names, off, used.shares > 0, used.weights > 0):
-                residuals = {body.labels[i]: row[i] if k[i] else None for i in in_view.nonzero()[0]}
-                reports[name] = replace(reports[name], residuals=residuals)
+        reports = dict.fromkeys(data.sensors, SensorReport(False))
+        reports |= shown.reports(_residuals(used, body) if used else {}) if shown else {}
         rivals = verdict.kept if verdict.status == "ambiguous" else ()
         return Estimate(
             frame=data.frame,
@@ -240,25 +235,38 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     for one, weight in verdict.kept:
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
-        momentary = np.diagonal(one.covariance - one.persistent)
-        deviation = np.sqrt(momentary) if data.is_timed else None
+        momentary = one.covariance - one.persistent
+        deviation = np.sqrt(momentary.diagonal()) if data.is_timed else None
         spread = one.spread if data.options.fuse else None
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
-    met, in_view = (np.count_nonzero(one, axis=1) for one in (used.shares, used.weights))
-    agreeing = (met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)).sum() > 1
+    counts = [(one > 0).sum(axis=1).tolist() for one in (used.shares, used.weights)]
+    tallies = list(zip(*counts, strict=True))
+    share = data.rules.acceptance.agreeing
+    agreeing = sum(met >= share * max(in_view, 1) for met, in_view in tallies) > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
-    return replace(
-        follow(data, found),
+    return follow(
+        data,
+        found,
         residuals=best.noise if is_ok else track.residuals,
-        tallies=dict(zip(used.names, zip(met.tolist(), in_view.tolist()))),
+        tallies=dict(zip(used.names, tallies)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
-        agreed=track.agreed or bool(agreeing),
+        agreed=track.agreed or agreeing,
         known=is_known(data, best),
         believed=track.believed + is_ok,
         doubted=not is_ok,
     )
+
+
+def _residuals(used: Matches, body: Body) -> dict[str, dict[str, float | None]]:
+    """How far off each sensor met the features in view; None for those that it missed."""
+    off = used.sigmas[:, None] * np.sqrt(used.squared)
+    rows = zip(off.tolist(), used.shares.tolist(), used.weights.tolist(), strict=True)
+    return {
+        name: {label: r if s else None for label, r, s, w in zip(body.labels, *row) if w}
+        for name, row in zip(used.names, rows, strict=True)
+    }
 
 
 def _offsets(used: Matches) -> dict[str, Offsets]:
