@@ -13,6 +13,8 @@ Rotations themselves are `scipy.spatial.transform.Rotation`.
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike
@@ -118,7 +120,13 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
     if R_difference.ndim == 2:
         twist = np.empty(6)
         twist[:3] = T_to[:3, 3] - T_from[:3, 3]
-        twist[3:] = cv2.Rodrigues(R_difference)[0][:, 0]
+        (a, b, c), (d, e, f), (g, h, i) = R_difference.tolist()
+        twist[3:] = axis = h - f, c - g, d - b  # as long as twice the sine of the angle
+        if (cosine := a + e + i - 1) > 0:  # twice that of an angle below 90°
+            length = math.hypot(*axis)
+            twist[3:] *= math.atan2(length, cosine) / length if length else 0.5
+        else:
+            twist[3:] = cv2.Rodrigues(R_difference)[0][:, 0]
         return twist
     if R_difference.shape == (1, 3, 3):
         return twist_between(T_from.reshape(4, 4), T_to.reshape(4, 4))[None]

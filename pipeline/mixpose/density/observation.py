@@ -187,8 +187,8 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(self.pattern, PointPattern):
-            weights = self.pattern.weights / self.weight
-            return self_overlap(self.pattern.points, weights, 2 * sigma**2)
+            overlap = self_overlap(self.pattern.points, self.pattern.weights, 2 * sigma**2)
+            return overlap / self.weight**2
         lower, upper = self.extent
         g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)

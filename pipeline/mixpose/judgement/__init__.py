@@ -29,6 +29,6 @@ from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,
     RememberedNoise as RememberedNoise,
     expected_covariance as expected_covariance,
-    inverses as inverses,
+    inverted as inverted,
     invert_information as invert_information,
 )

@@ -25,7 +25,7 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverses, noise_of
+from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverted, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
 from mixpose.records import Floats, Indices, Mask, SensorReport
@@ -205,7 +205,8 @@ def _evidence(
         information, at_all = information_of(seen, variances, spreads), spreads.any(axis=(1, 2, 3))
         both = np.logaddexp(evidence, log_evidence(*given, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)
-        bent[np.ix_(at_all, free, free)] = inverses(information[:, free][..., free])[at_all]
+        for k in np.flatnonzero(at_all).tolist():
+            bent[k][np.ix_(free, free)] = inverted(information[k][np.ix_(free, free)])
     return evidence, bent
 
 

@@ -23,6 +23,7 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
+from scipy.linalg.lapack import dposv
 from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
@@ -107,7 +108,7 @@ def noise_of(
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
     J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, rows)
-    inverse = inverses(J.T @ J)
+    inverse = inverted(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
     drawn = inverse @ (J.T @ fields)
     left = fields - J @ drawn
@@ -220,7 +221,8 @@ def _lasting(
     biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
     A, v = shown[:, :-1], shown[:, -1]
     if model.bias:
-        S = np.linalg.inv(A + np.eye(len(v)) / model.bias**2)
+        unity = np.eye(len(v))
+        _, S, _ = dposv(A + unity / model.bias**2, unity)
         mean, degrees = S @ v, float((S * A).sum())
         if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
             return biases, mean, S + np.outer(mean, mean)
@@ -267,18 +269,21 @@ def _variances(
     return variances, once**2 / np.maximum(squared, least)
 
 
-def inverses(information: Floats) -> Floats:
-    """Inverses of information matrices (..., k, k).
+def inverted(information: Floats) -> Floats:
+    """The inverse of an information matrix (k, k).
 
     Directions that the data leave open get the variance that their information says: large, and
     at most what float64 can invert.
     """
-    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(axis1=-2, axis2=-1), 1e-18))
-    both = scale[..., :, None] * scale[..., None, :]
-    values, vectors = np.linalg.eigh(information * both)
-    # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
-    halves = vectors / np.sqrt(np.maximum(values, 1e-14))[..., None, :]
-    return np.asarray(halves @ halves.swapaxes(-2, -1) * both)
+    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-18))
+    both = scale[:, None] * scale
+    factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
+    if failure or min(factor.diagonal().tolist(), default=1.0) < 1e-5:
+        values, vectors = np.linalg.eigh(information * both)
+        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+        halves = vectors / np.sqrt(np.maximum(values, 1e-14))
+        inverse = halves @ halves.T
+    return np.asarray(inverse * both)
 
 
 def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
@@ -301,7 +306,7 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
 def invert_information(information: Floats, free: Mask) -> Floats:
     """Covariance (6, 6) of the free directions; a direction without information is infinite."""
     inner, covariance = np.ix_(free, free), np.zeros((6, 6))
-    covariance[inner] = inverses(information[inner])
+    covariance[inner] = inverted(information[inner])
     # so much larger than if all other directions were known
     inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
     unknown = inflation > 1e9

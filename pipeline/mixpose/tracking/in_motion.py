@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mixpose.fit import Fit
-from mixpose.judgement import ScoredPose, inverses, nearest_alike
+from mixpose.judgement import ScoredPose, inverted, nearest_alike
 from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
@@ -64,7 +64,7 @@ class Offsets(NamedTuple):
         prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
         known = np.zeros(len(prior))
         known[:count] = (expected.velocity - velocity)[free] / fast
-        covariance = inverses(design.T @ design / variance + prior.T @ prior)
+        covariance = inverted(design.T @ design / variance + prior.T @ prior)
         x = covariance @ (design.T @ self.offsets / variance + prior.T @ known)
         return x, covariance, self.offsets - design @ x
 
@@ -121,7 +121,7 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     if not np.isfinite(scale) or scale <= 0:
         return judged
     _, together, _ = met.least_squares(motion.velocity, expected, free, scale)
-    extra = together[: len(alone), : len(alone)] - scale * inverses(alone)
+    extra = together[: len(alone), : len(alone)] - scale * inverted(alone)
     values, vectors = np.linalg.eigh((extra + extra.T) / 2)
     covariance[inner] += (vectors * np.maximum(values, 0.0)) @ vectors.T
     return replace(judged, covariance=covariance)
