@@ -310,7 +310,7 @@ def _in_space(
     """
     pose, feature = chosen
     at, sizes, roots = (pose, slice(None), feature), sizes[pose, None, None], roots[pose][..., None]
-    met, J, r = near[at], found.J[at][..., :3] / roots[..., None], found.offsets[at] / roots
+    met, J, r = near[at], found.J[..., :3][at] / roots[..., None], found.offsets[at] / roots
     rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
     A = np.eye(3) / sizes**2 + rows @ rows.swapaxes(1, 2)
     pull = rows @ r.reshape(len(pose), -1, 1)

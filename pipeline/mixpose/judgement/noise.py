@@ -275,10 +275,12 @@ def inverted(information: Floats) -> Floats:
     Directions that the data leave open get the variance that their information says: large, and
     at most what float64 can invert.
     """
+    if not information.size:
+        return information
     scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-18))
     both = scale[:, None] * scale
     factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
-    if failure or min(factor.diagonal().tolist(), default=1.0) < 1e-5:
+    if failure or min(factor.diagonal().tolist()) < 1e-5:
         values, vectors = np.linalg.eigh(information * both)
         # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
         halves = vectors / np.sqrt(np.maximum(values, 1e-14))

@@ -85,7 +85,7 @@ def associate(
         count=count,
         crowd=crowd,
         unmatched_nearby=unmatched,
-        finest=np.minimum(np.maximum(narrowest, finest), 1.0),
+        finest=np.fmin(np.maximum(narrowest, finest), 1.0),
         by_calibration=_by_calibration(objective, T_world_object),
     )
 
@@ -213,7 +213,7 @@ def _surroundings(
         near = np.abs(detections - middle[:, None]) <= half[:, None]
         beside = np.count_nonzero(near.all(axis=2), axis=1) - shares.sum(axis=1)
         unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
-    finest = np.where(seen.any(axis=1), size.max(axis=1) / (DRAWING.widest * sigmas), 1.0)
+    finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
     for k, one in enumerate(observations):
         if one.cell is not None:  # as many equal features as would give the energy of grey values
             near, far = (corner / one.sigma for corner in one.extent)

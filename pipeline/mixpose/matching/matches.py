@@ -209,23 +209,27 @@ def _seen_at(
     blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
-    squared, m = matches.squared, matches.dimensions
-    weights = matches.shares * welsch(squared, blurs)
-    coordinates = m * weights.sum(axis=1) + 1e-12
-    q = (weights * squared).sum(axis=1) / coordinates
-    # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
-    factor = 1 / (1 - np.minimum(0.5 * q / (blurs * blurs), 0.5))
-    # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
-    degrees = factor ** (m / 2) * coordinates
-    most = float(degrees.sum())
+    weights = matches.shares * welsch(matches.squared, blurs)
+    sums = weights.sum(axis=1).tolist(), (weights * matches.squared).sum(axis=1).tolist()
+    coordinates, squares, degrees = [], [], []
+    for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):
+        coordinates.append(m * weight + 1e-12)
+        q = square / coordinates[-1]
+        # at most twice what is seen: wider than the blur, offsets do not tell how wide they are
+        factor = 1 / (1 - min(0.5 * q / blur**2, 0.5))
+        # normal offsets weigh (1 + s²/2σ²)^(-m/2) on average
+        degrees.append(factor ** (m / 2) * coordinates[-1])
+        squares.append(factor * q * degrees[-1])
     # shares do not add up to whole ones: half a degree of freedom is none
-    left = 1 - free / most if most - free > 0.5 else 0.0
-    own = np.array([factor * q * degrees if left else 0.0 * q, degrees * left])
+    most = sum(degrees)
+    is_enough = most - free > 0.5
+    left = 1 - free / most if is_enough else 0.0
+    own = np.array([squares, degrees]) * [[float(is_enough)], [left]]
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
     # half way to all sensors': what calibrations err by is in no sensor's own noise
-    wide = (wide + float(wide @ coordinates) / float(coordinates.sum())) / 2
+    wide = (wide + float(wide @ coordinates) / sum(coordinates)) / 2
     return own, variances, _blurs(wide, matches, rules), before
 
 

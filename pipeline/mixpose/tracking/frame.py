@@ -181,7 +181,7 @@ def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
                 change = moved / 2 if last is None else moved - last * elapsed
                 # of one frame, where it was seen over several
                 change = np.abs(change / (1 + track.misses)).reshape(2, 3)
-                uncertainty = np.maximum(np.repeat(change.max(axis=1), 3), steady)
+                uncertainty = np.maximum(change.max(axis=1).repeat(3), steady)
             if deviation is not None and parent.course and elapsed <= rules.longest_s:
                 course = parent.course.followed(moved, deviation, elapsed)
         if deviation is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -65,7 +66,7 @@ class MotionRules:
 
 def per_kind(body: Body, scale: Scale) -> Floats:
     """Lengths, in radii of a body, and angles for all directions alike (6,)."""
-    return np.repeat([scale[0] * body.radius, np.radians(scale[1])], 3)
+    return np.array([scale[0] * body.radius] * 3 + [math.radians(scale[1])] * 3)
 
 
 @dataclass(frozen=True)
