@@ -109,10 +109,9 @@ class Atlas:
             around = np.rint(index)
             middles = around.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(middles) // len(index))
-            room, numbers = self._drawn(sensors, middles, *self._near(sensors, middles))
-            columns, side = room.shape[2], self._side
-            shifts = (_middles_of(numbers, columns, side) - middles).reshape(index.shape)
-            values = room.reshape(-1, columns * side, 3)
+            room = self._drawn(sensors, middles, *self._near(sensors, middles))
+            places, width = _middles_of_drawn(len(middles), self._side), room.shape[2] * self._side
+            shifts, values = (places - middles).reshape(index.shape), room.reshape(-1, width, 3)
             self._own = around, shifts, values
         index += shifts
         self.values = values
@@ -139,24 +138,24 @@ class Atlas:
 
     def _drawn(
         self, sensors: Indices, middles: Floats, of: Indices, which: Indices
-    ) -> tuple[Singles, Indices]:
+    ) -> Singles:
         """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
 
-        And their numbers (P,), row by row.  Those of a column are drawn at once.  Columns are
-        short, so that places are rounded to 6e-5 cells.
+        Those of a column are drawn at once.  Columns are short, so that places are rounded to 6e-5
+        cells.
         """
         count, side, most = len(middles), self._side, _TOGETHER
-        numbers, columns = np.arange(count), max(-(-count // most), 1)
+        columns = max(-(-count // most), 1)
         room = np.empty((min(count, most), side, columns, 3 * side), dtype=np.float32)
         for k in range(columns):
             some = slice(k * most, min((k + 1) * most, count))
             a, b = of.searchsorted([some.start, some.stop]).tolist()
             tiles = room[: some.stop - some.start, :, k]
             self._draw(tiles, sensors[some], middles[some], of[a:b] - some.start, which[a:b])
-            for i in numbers[some].tolist():
-                if sensors[i] in self._grids:
-                    tiles[i - some.start] = self._of_grid(int(sensors[i]), middles[i])
-        return room, numbers % most * columns + numbers // most
+            for sensor in self._grids:
+                for i in np.flatnonzero(sensors[some] == sensor).tolist():
+                    tiles[i] = self._of_grid(sensor, middles[some][i])
+        return room
 
     def _draw(
         self, tiles: Singles, sensors: Indices, middles: Floats, of: Indices, which: Indices
@@ -170,8 +169,7 @@ class Atlas:
         place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
         begin = (self._q[which] - middles[of]) * (1 / scale.sigma)
-        cells = (np.arange(side, dtype=np.float32) - 0.5 * (side - 1)) * (1 / scale.sigma)
-        away = begin.astype(np.float32)[..., None] - cells.astype(np.float32)
+        away = begin.astype(np.float32)[..., None] - _cells(side, scale.sigma)
         bells = np.exp(np.float32(-0.5) * away * away)
         if scale.is_flat is not None:  # rows that are all alike
             flat = scale.is_flat[sensors[of]]
@@ -197,8 +195,8 @@ class Atlas:
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         of = np.searchsorted(filled, of)
-        room, numbers = self._drawn(sensors[filled], middles[filled], of, which)
-        return filled, room[numbers // room.shape[2], :, numbers % room.shape[2]]
+        room, numbers = self._drawn(sensors[filled], middles[filled], of, which), np.arange(len(filled))
+        return filled, room[numbers % _TOGETHER, :, numbers // _TOGETHER]
 
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
         """A tile (side, 3 side) of grey values or a profile."""
@@ -320,6 +318,19 @@ class Pages:
 def _middles_of(numbers: Indices, columns: int, side: int) -> Floats:
     """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
     return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
+
+
+@lru_cache(maxsize=64)
+def _cells(side: int, sigma: float) -> Singles:
+    """Where the cells along a tile are, from its middle, in standard deviations."""
+    return ((np.arange(side) - 0.5 * (side - 1)) / sigma).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def _middles_of_drawn(count: int, side: int) -> Floats:
+    """The same of tiles that are drawn, column by column."""
+    columns, place = max(-(-count // _TOGETHER), 1), np.arange(count)
+    return _middles_of(place % _TOGETHER * columns + place // _TOGETHER, columns, side)
 
 
 def _count(lower: Floats, upper: Floats, page: int) -> float:

@@ -129,16 +129,17 @@ def noise_of(
     by_kind, of_fields = _variances(moments, own, float(found.met.sum()) / len(found.names), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
-    covariance = steady.copy()
-    covariance[inner] += by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    covariance = np.zeros((6, 6))
+    covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
     others = [k for k, name in enumerate(before.names) if name not in found.names]
-    names = (*found.names, *(before.names[k] for k in others))
-    sums = np.concatenate([sums, before.sums[:, others]], axis=1)
+    names = found.names + tuple([before.names[k] for k in others])
+    if others:
+        sums = np.concatenate([sums, before.sums[:, others]], axis=1)
     remembered = RememberedNoise(names, sums, moments, biases)
-    return variances, covariance, steady, remembered, ratio
+    return variances, covariance + steady, steady, remembered, ratio
 
 
 def _level(
