@@ -36,7 +36,7 @@ def test_judgement_tells_hidden_from_met(pinhole_cameras: list[PinholeCamera]) -
     judged = judge(matched_objective(views, EIGHT, [1.5, 1.5]), TRUTH, ALL_FREE)
     assert judged.measurements == pytest.approx(24, abs=0.4)
     assert judged.coverage == pytest.approx(6 / 8, abs=0.02)
-    for report in judged.sensors.values():
+    for report in judged.reports({}).values():
         # six of eight features met, six of eight detections explained: (6/8)²
         assert report.explained == pytest.approx((6 / 8) ** 2, abs=0.02)
         assert report.rms == pytest.approx(0.0, abs=0.05)

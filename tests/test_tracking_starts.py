@@ -308,7 +308,7 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
     data, two = data_of(tracker, views), data_of(tracker, views[:2])
     left_out = likelihood_of(data).judge(fit, Start(TRUTH, left_out={"2": "bumped"}))
     alone = likelihood_of(two).judge(fit, Start(TRUTH))
-    assert left_out.sensors["2"].used is False
+    assert left_out.reports({})["2"].used is False
     assert left_out.measurements == pytest.approx(alone.measurements)
 
 

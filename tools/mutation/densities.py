@@ -130,8 +130,8 @@ _BLUR = (
     Mutant(
         "density-pairs-overlap-once",
         "density/observation.py",
-        "+ 2 * cross)",
-        "+ cross)",
+        "+ 2 * (weights[i]",
+        "+ (weights[i]",
         "detections side by side have too little energy",
     ),
     Mutant(

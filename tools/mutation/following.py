@@ -28,7 +28,7 @@ _PREDICTION = (
     Mutant(
         "tracking-prior-as-wide-as-the-world",
         "tracking/frame.py",
-        "return float(np.logaddexp.reduce(terms)), spreads[int(np.argmax(terms))]",
+        "return float(np.logaddexp.reduce(terms)), spreads[terms.index(max(terms))]",
         "return float(np.logaddexp.reduce(terms)), anywhere[1]",
         "a pose near its prediction that meets one feature has high evidence",
         (_TRACK,),
@@ -108,7 +108,7 @@ _PREDICTION = (
     Mutant(
         "tracking-sudden-motion-goes-unnoticed",
         "tracking/frame.py",
-        "np.maximum(np.repeat(change.max(axis=1), 3), steady)",
+        "np.maximum(change.max(axis=1).repeat(3), steady)",
         "steady",
         "a body that changes its speed is expected as surely as a steady one",
         (_TRACK,),

@@ -207,14 +207,14 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-open-turns-are-sure",
         "judgement/acceptance.py",
-        "bool(np.linalg.eigvalsh(best.covariance[3:, 3:]).max() < np.pi**2 / 3)",
+        "bool(best.covariance[3:, 3:].trace() < math.pi**2 / 3)",
         "True",
         "the turn about a line of features is called sure",
     ),
     Mutant(
         "judgement-wide-turns-are-sure",
         "judgement/acceptance.py",
-        "turn < np.radians(rules.widest_turn_deg)",
+        "turn < math.radians(rules.widest_turn_deg)",
         "turn < np.inf",
         "ranges that leave the turn open are called sure",
         ("test_tracking_ranges.py",),
@@ -229,8 +229,8 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-stands-out-by-one-feature",
         "judgement/acceptance.py",
-        "int(free.sum()) + rules.spare",
-        "int(free.sum()) + 2",
+        "np.count_nonzero(free) + rules.spare",
+        "np.count_nonzero(free) + 2",
         "of one feature more than fixes a pose chance makes enough",
     ),
     Mutant(
@@ -250,7 +250,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-too-few-coordinates-fix-a-pose",
         "judgement/acceptance.py",
-        "return pose.measurements >= int(free.sum())",
+        "return bool(pose.measurements >= np.count_nonzero(free))",
         "return True",
         "a pose is told that the data do not fix",
     ),
@@ -310,15 +310,15 @@ _JUDGE = (
     Mutant(
         "judgement-most-turned-twin",
         "judgement/acceptance.py",
-        "nearest = int(np.argmax(",
-        "nearest = int(np.argmin(",
+        "sum(axis=(1, 2)).argmax())",
+        "sum(axis=(1, 2)).argmin())",
         "of poses that look the same the farthest is told",
     ),
     Mutant(
         "judgement-all-poses-believed-alike",
         "judgement/acceptance.py",
-        "weights = np.exp(logs - logs.max())",
-        "weights = np.ones(len(logs))",
+        "math.exp(one.log_evidence - top) if",
+        "1.0 if",
         "evidence does not tell poses apart",
     ),
 )

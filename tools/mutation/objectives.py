@@ -67,8 +67,8 @@ _KERNEL = (
     Mutant(
         "objective-neighbours-taken-for-apart",
         "objective/matched.py",
-        "if not overlap.any():",
-        "if not overlap.all():",
+        "exponents.max(initial=-np.inf)",
+        "exponents.min(initial=0.0)",
         "a body with some features close together is fitted as if they were apart",
     ),
     Mutant(
@@ -98,8 +98,8 @@ _MATCHED = (
     Mutant(
         "objective-out-of-the-picture-is-free",
         "objective/matched.py",
-        "(norm + self.tops * (hidden**2).sum(axis=2))",
-        "(norm + 0.0 * (hidden**2).sum(axis=2))",
+        "(norm + self.tops * np.vecdot(hidden, hidden))",
+        "(norm + 0.0 * np.vecdot(hidden, hidden))",
         "a pose gains by moving features that meet nothing out of the picture",
     ),
     Mutant(

@@ -63,7 +63,7 @@ class Atlas:
         self.values: Singles = np.zeros((0, 0, 3), dtype=np.float32)
         self._grids: dict[int, tuple[GridPattern, float, float]] = {}
         self._corners: dict[int, Floats] = {}  # (2, 2) of grids, in cells
-        q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], np.zeros(len(patterns), dtype=np.intp)
+        q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], [0] * len(patterns)
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
                 small, left = reduced(pattern, scale.widths[k])
@@ -136,9 +136,7 @@ class Atlas:
         order = np.lexsort((pairs["j"], pairs["i"]))
         return pairs["i"][order], pairs["j"][order]
 
-    def _drawn(
-        self, sensors: Indices, middles: Floats, of: Indices, which: Indices
-    ) -> Singles:
+    def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
         """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
 
         Those of a column are drawn at once.  Columns are short, so that places are rounded to 6e-5
@@ -169,7 +167,8 @@ class Atlas:
         place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
         begin = (self._q[which] - middles[of]) * (1 / scale.sigma)
-        away = begin.astype(np.float32)[..., None] - _cells(side, scale.sigma)
+        cells = (np.arange(side) - 0.5 * (side - 1)) * (1 / scale.sigma)
+        away = begin.astype(np.float32)[..., None] - cells.astype(np.float32)
         bells = np.exp(np.float32(-0.5) * away * away)
         if scale.is_flat is not None:  # rows that are all alike
             flat = scale.is_flat[sensors[of]]
@@ -195,7 +194,10 @@ class Atlas:
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         of = np.searchsorted(filled, of)
-        room, numbers = self._drawn(sensors[filled], middles[filled], of, which), np.arange(len(filled))
+        room, numbers = (
+            self._drawn(sensors[filled], middles[filled], of, which),
+            np.arange(len(filled)),
+        )
         return filled, room[numbers % _TOGETHER, :, numbers // _TOGETHER]
 
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
@@ -318,12 +320,6 @@ class Pages:
 def _middles_of(numbers: Indices, columns: int, side: int) -> Floats:
     """Where in an array the middles (K, 2) of tiles are that lie there by numbers, row by row."""
     return np.array([numbers % columns, numbers // columns]).T * side + 0.5 * (side - 1)
-
-
-@lru_cache(maxsize=64)
-def _cells(side: int, sigma: float) -> Singles:
-    """Where the cells along a tile are, from its middle, in standard deviations."""
-    return ((np.arange(side) - 0.5 * (side - 1)) / sigma).astype(np.float32)
 
 
 @lru_cache(maxsize=64)

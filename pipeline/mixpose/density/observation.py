@@ -232,8 +232,8 @@ def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
     i, j = close_pairs(points[None], np.array([variance])).T
     away = points[i] - points[j]
-    bells = np.exp((away * away).sum(axis=1) * (-0.5 / variance))
-    overlap = float(weights @ weights) + 2 * float((weights[i] * weights[j]) @ bells)
+    bells = np.exp(np.vecdot(away, away) * (-0.5 / variance))
+    overlap = float(weights @ weights + 2 * (weights[i] * weights[j]) @ bells)
     return overlap * float(peak(variance, points.shape[1]))
 
 

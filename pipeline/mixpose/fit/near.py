@@ -226,7 +226,7 @@ def _to_the_noise(
     rules: FitRules,
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
-    sigmas, count, first = finest.sigmas, np.count_nonzero(free), ascent
+    sigmas, count, first = finest.sigmas, int(free.sum()), ascent
     blurs, likeliest, best = np.full(len(sigmas), blur), -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)

@@ -61,7 +61,7 @@ class Verdict:
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:
     """Whether what is met fixes a pose in its free directions (6,)."""
-    return pose.measurements >= np.count_nonzero(free)
+    return bool(pose.measurements >= np.count_nonzero(free))
 
 
 def is_possible(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
@@ -124,7 +124,7 @@ def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules
     """
     first, *others = ranked
     rest = float(np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in others)]))
-    return (
+    return bool(
         first.coverage >= rules.doubtful_coverage
         and first.measurements >= np.count_nonzero(free) + rules.spare
         and first.log_evidence > max(rules.doubtful, rest + rules.standing_out)
@@ -180,7 +180,7 @@ def contradict(
         return False
     # one meets most of the body; the other misses it, and sees as much beside it, or, where the
     # two never agreed, anywhere
-    least, most = np.argsort(used.coverage, kind="stable").tolist()
+    least, most = sorted(range(2), key=used.coverage.tolist().__getitem__)
     if used.coverage[least] < rules.agreeing <= used.coverage[most]:
         beside, needed = used.unmatched_nearby[least], used.missed[least]
         if not agreed:

@@ -120,12 +120,10 @@ class ScoredPose:
         self, residuals: Mapping[str, Mapping[str, float | None]]
     ) -> dict[str, SensorReport]:
         """How each sensor took part, with residuals of features by sensor."""
-        seen, out, nothing = self.matches, self.left_out, dict[str, float | None]()
+        out, rows = self.left_out, zip(self.matches.explained.tolist(), self.matches.rms)
         return {
-            name: SensorReport(
-                name not in out, share, rms, out.get(name), residuals.get(name, nothing)
-            )
-            for name, share, rms in zip(seen.names, seen.explained.tolist(), seen.rms)
+            name: SensorReport(name not in out, *row, out.get(name), residuals.get(name, {}))
+            for name, row in zip(self.matches.names, rows)
         }
 
 
@@ -165,10 +163,11 @@ def judge_together(
         whole.append(matches or associate(objective, T, rules.association, narrowest))
         part = taken_part(whole[-1], left_out)
         noises.append(noise_of(part, free, before, rules.noise, noise))
-    used = np.array([name not in left_out for name in whole[0].names])
-    variances, seen = np.ones((len(whole), len(used))), Matches.stacked(whole)
-    variances[:, used] = [noise[0] for noise in noises]
+    variances, seen = np.array([noise[0] for noise in noises]), Matches.stacked(whole)
     if left_out:
+        used = np.array([name not in left_out for name in whole[0].names])
+        measured, variances = variances, np.ones((len(whole), len(used)))
+        variances[:, used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
     evidence, bent = _evidence(cases, seen, variances, free, rules.detection)
     return [

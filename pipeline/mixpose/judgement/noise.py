@@ -118,7 +118,7 @@ def noise_of(
     lasting = left[:, :q] / sizes
     shown = np.concatenate([lasting.T @ lasting, (r @ lasting)[:, None]], axis=1)
     biases, mean, second = _lasting(before.biases, found.names, shown, model)
-    rest, steady = r, np.zeros((6, 6))
+    rest, (covariance, steady) = r, np.zeros((2, 6, 6))
     if mean.any():
         rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
         steady[inner] = moved @ second @ moved.T
@@ -129,7 +129,6 @@ def noise_of(
     by_kind, of_fields = _variances(moments, own, float(found.met.sum()) / len(found.names), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
-    covariance = np.zeros((6, 6))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
@@ -181,7 +180,7 @@ def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Float
     L, N = shares.shape
     total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
     away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
-    spread = (shares[:, None] @ (away * away)).sum(axis=(1, 2))
+    spread = np.vecdot(shares, np.vecdot(away, away))
     size = np.sqrt(spread / (found.dimensions * total[:, 0]))
     by_feature = np.ones((L, N, 3))
     by_feature[..., 1:] = away / np.maximum(size, 1e-6)[:, None, None]
@@ -190,10 +189,10 @@ def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Float
     of_sensors = by_feature[:, :, None, None, None] * columns
     # in units of how features move with the body, the root mean square of those in view
     by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
-    moved = math.sqrt(float((by_place * by_place).sum()) / max(float(counts), 1.0))
+    moved = math.sqrt(float(np.vecdot(by_place, by_place).sum()) / max(float(counts), 1.0))
     of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * markers
-    parts = [of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)]
-    return np.concatenate(parts, axis=1), kinds
+    both = of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)
+    return np.concatenate(both, axis=1), kinds
 
 
 @lru_cache(maxsize=64)
@@ -222,8 +221,7 @@ def _lasting(
     biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
     A, v = shown[:, :-1], shown[:, -1]
     if model.bias:
-        unity = np.eye(len(v))
-        _, S, _ = dposv(A + unity / model.bias**2, unity)
+        S = inverted(A + np.eye(len(v)) / model.bias**2)
         mean, degrees = S @ v, float((S * A).sum())
         if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
             return biases, mean, S + np.outer(mean, mean)

@@ -45,8 +45,8 @@ def associate(
     """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
     match, views, sigmas = objective.match(T_world_object[None]), objective.views, objective.sigmas
     dimensions, body = objective.projection.dimensions, objective.projection.body
-    y, J, seen, faced, weights, sampled = (part[:, 0] for part in match[:6])
-    product, detections = (sampled[..., 0] * weights).sum(axis=1), _detections(views)
+    y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
+    product, detections = np.vecdot(match.sampled[:, 0, :, 0], weights), _detections(views)
     explained = np.maximum(product, 0.0) ** 2 / (objective.energies[:, 0] * match.norm[:, 0])
     reach = objective.variances.repeat(y.shape[1], axis=1)
     if body.spread:  # variances along an axis by which features may be off
@@ -62,7 +62,7 @@ def associate(
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
         mixture = y[k, of, :m], weights[k, of], float(objective.variances[k, 0])
         shares[k, of], offsets[k, of, :m] = _residuals(
-            *mixture, sampled[k, of, : 1 + m], amplitude, rules, all(is_grid)
+            *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
         )
     J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
     if merged.any():
@@ -80,7 +80,7 @@ def associate(
         J=J,
         detections=by,
         explained=np.minimum(explained, 1.0),
-        unseen=(faced & ~seen) @ body.nodes.weights,
+        unseen=(match.faced[:, 0] & ~seen) @ body.nodes.weights,
         merged=merged,
         count=count,
         crowd=crowd,
@@ -113,7 +113,7 @@ def _to_nearest(
     """Write what the nearest detections meet, each taken once or by a pair of features."""
     shares, offsets, by, _ = met
     away = detections[:, None] - y[:, :, None]
-    squared = (away * away).sum(axis=3)
+    squared = np.vecdot(away, away)
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
     order, taken = squared[pairs].argsort(kind="stable"), set[tuple[int, int]]()
     for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):

@@ -86,7 +86,7 @@ class Matches:
     @cached_property
     def squared(self) -> Floats:
         """Squared offsets (..., L, N), σ_ε²."""
-        return np.asarray((self.offsets * self.offsets).sum(axis=-1))
+        return np.asarray(np.vecdot(self.offsets, self.offsets))
 
     @cached_property
     def met(self) -> Floats:
@@ -116,7 +116,7 @@ class Matches:
     @cached_property
     def squares(self) -> Floats:
         """Sum of the squared offsets (..., L), σ_ε²."""
-        return np.asarray((self.shares * self.squared).sum(axis=-1))
+        return np.asarray(np.vecdot(self.shares, self.squared))
 
     @cached_property
     def met_by(self) -> Indices:
@@ -210,7 +210,7 @@ def _seen_at(
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
     weights = matches.shares * welsch(matches.squared, blurs)
-    sums = weights.sum(axis=1).tolist(), (weights * matches.squared).sum(axis=1).tolist()
+    sums = weights.sum(axis=1).tolist(), np.vecdot(weights, matches.squared).tolist()
     coordinates, squares, degrees = [], [], []
     for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):
         coordinates.append(m * weight + 1e-12)

@@ -47,15 +47,14 @@ def overlaps(
 
     `variances` and `tops` (L, 1) are v, and the peak of a Gaussian of that variance.
     """
-    norm, n = tops * (weights * weights).sum(axis=2), y.shape[2]
+    norm, n = tops * np.vecdot(weights, weights), y.shape[2]
     if n * n <= DRAWING.few_pairs:
         pairs = all_pairs(n)
     else:
         pairs = close_pairs(y.reshape(-1, n, 2), variances.repeat(y.shape[1]))
     i, j = pairs.T
     away = y[:, :, i] - y[:, :, j]
-    squared = away * away
-    exponents = (squared[..., 0] + squared[..., 1]) * (-0.5 / variances)[..., None]
+    exponents = np.vecdot(away, away) * (-0.5 / variances)[..., None]
     if not exponents.max(initial=-np.inf) > -DRAWING.negligible:
         return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
     overlap = exponents > -DRAWING.negligible
@@ -75,7 +74,7 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     C = match.sampled[..., 0] * match.weights
     pull = (match.sampled[..., 1:] * match.weights[..., None]).reshape(L, H, 1, 2 * n)
     rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
-    product = C.sum(axis=2)
+    product = np.vecdot(match.sampled[..., 0], match.weights)
     amplitude = product / match.norm
     strength = 2 * scales * amplitude
     value = (scales * product * amplitude).sum(axis=0)
@@ -146,11 +145,11 @@ class MatchedObjective:
         """
         parts = [np.zeros((len(self.views), 0))]
         for match in map(self.match, self._blocks(poses)):
-            product, norm = (match.sampled[..., 0] * match.weights).sum(axis=2), match.norm
+            product, norm = np.vecdot(match.sampled[..., 0], match.weights), match.norm
             own = self.weights / self.energies * product**2 / norm
             if whole:
                 hidden = np.where(match.seen, 0.0, self.projection.body.nodes.weights)
-                own = own * (norm / (norm + self.tops * (hidden**2).sum(axis=2)))
+                own = own * (norm / (norm + self.tops * np.vecdot(hidden, hidden)))
             parts.append(own)
         return np.concatenate(parts, axis=1)
 

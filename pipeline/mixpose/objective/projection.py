@@ -82,7 +82,8 @@ class BodyProjection:
         for points, weights, one in zip(self._points, self._weights, bodies):
             nodes, n = one.nodes, len(one.nodes.points)
             points[:], points[:n], weights[:n] = nodes.points[0], nodes.points, nodes.weights
-        self._normals, self._radii = body.node_normals, None if is_bare(body) else body.node_radii
+        self._normals, radii = body.node_normals, body.node_radii
+        self._radii = radii if radii is not None and radii.any() else None
         self._batch = side_by_side(sensors)
 
     def project(self, poses: Floats) -> Match:
@@ -96,8 +97,9 @@ class BodyProjection:
             y, by_world, visible = self._of_disks(poses, world, np.tile(self._radii, H)[:, None])
         J = pose_jacobian(by_world, arms.reshape(-1, 3)).reshape(L, H, n, 2, 6)
         seen = visible.reshape(L, H, n)
-        faced = np.ones(seen.shape, dtype=np.bool_)
-        if self._normals is not None:
+        if self._normals is None:
+            faced = ~np.zeros(seen.shape, dtype=np.bool_)
+        else:
             points = world.reshape(H, n, 3)
             faced = np.array([facing(one, poses, points, self._normals) for one in self.sensors])
             seen &= faced
@@ -143,12 +145,7 @@ def project_body(sensors: tuple[Sensor, ...], *bodies: Body) -> BodyProjection:
 
 def can_be_together(body: Body) -> bool:
     """Whether a body has bare points only: no normals, and no size of markers."""
-    return body.normals is None and is_bare(body)
-
-
-def is_bare(body: Body) -> bool:
-    """Whether its markers have no size."""
-    return body.node_radii is None or not body.node_radii.any()
+    return body.normals is None and (body.node_radii is None or not body.node_radii.any())
 
 
 def in_image(spreads: Floats, J: Floats) -> Floats:

@@ -45,7 +45,7 @@ class Branch:
             return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
         n = rules.known_from  # from a step or two: errors are Student's
         peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
-        tails = 0.5 * (n + 1) * float(np.log1p(scaled * scaled / n).sum())
+        tails = 0.5 * (n + 1) * sum(math.log1p(one * one / n) for one in scaled.tolist())
         return count * peak - tails - volume
 
 
