@@ -31,7 +31,7 @@ from mixpose.records import (
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.sensors import doubted
 from mixpose.threads import one_blas_thread
-from mixpose.tracking import UNKNOWN_S, Scene, Track, Tracker, WindowedScene
+from mixpose.tracking import DelayEvidence, Scene, Track, Tracker, WindowedScene
 
 if TYPE_CHECKING:
     from mixpose.body import Body
@@ -285,7 +285,7 @@ def _view(
         observation,
         _delay(frame_set, frame) + told,
         setup.readout,
-        UNKNOWN_S if setup.delay == "estimate" else None,
+        DelayEvidence.unknown_s if setup.delay == "estimate" else None,
         doubts=doubted(setup.sensor, error) if error else (),
     )
 

@@ -27,7 +27,6 @@ from scipy.spatial import cKDTree
 from mixpose.density.blur import DRAWING, FAR, blurred, mass, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
-_RIM = 3  # cells along a tile beside those looked up, which a spline reaches: one before, two after
 # tiles that are drawn at once: they have room for as many detections each
 _TOGETHER = math.isqrt(DRAWING.few_pairs)
 
@@ -81,7 +80,7 @@ class Atlas:
         self._own: tuple[Floats, Floats, Singles] = np.zeros(0), np.zeros(0), self.values
         if self._grids:  # the larger the plane, the larger its pages
             self.tile = self.pages.page
-        self._side, self._reach = self.tile + _RIM, 0.5 * self.tile + scale.reach
+        self._side, self._reach = self.tile + DRAWING.rim, 0.5 * self.tile + scale.reach
 
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
@@ -139,8 +138,7 @@ class Atlas:
     def _drawn(self, sensors: Indices, middles: Floats, of: Indices, which: Indices) -> Singles:
         """Tiles around places (P, 2) in cells, by pairs of `_near`: (rows, side, columns, 3 side).
 
-        Those of a column are drawn at once.  Columns are short, so that places are rounded to 6e-5
-        cells.
+        Those of a column are drawn at once; it is short: places are rounded to 6e-5 cells.
         """
         count, side, most = len(middles), self._side, _TOGETHER
         columns = max(-(-count // most), 1)
@@ -234,7 +232,7 @@ class _Scale(NamedTuple):
         units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
         is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
         per_unit = np.array(across)[:, None, None]
-        reach = DRAWING.reach * n + _RIM - 1
+        reach = DRAWING.reach * n + DRAWING.rim - 1
         return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)
 
 
@@ -263,7 +261,7 @@ class Pages:
         # nothing, negative where nothing was looked up yet
         self.table = np.full(sensors * self._count, -1, dtype=np.int32)
         self._first = self._count * np.arange(sensors)[:, None, None]
-        side = page + _RIM
+        side = page + DRAWING.rim
         columns = min(len(self.table) * side // DRAWING.side + 1, DRAWING.side // side)
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1

@@ -28,6 +28,7 @@ class DrawingRules:
     fine_steps: float = constant(
         48.0, "the same at σ_ε for grey values, which have no detection noise: places are 2e-7 off"
     )
+    rim: int = constant(3, "cells along a tile that splines reach beside it: one before, two after")
     reach: float = constant(
         4.25,
         "from a detection to where it is drawn: what is farther draws it by less than 1e-3 σ_ε",
@@ -59,9 +60,14 @@ class DrawingRules:
         """Extent of features over the narrowest blur that the pages of a plane hold."""
         return math.sqrt(2 * self.held) * self.tile / self.steps_per_sigma
 
+    @property
+    def far(self) -> float:
+        """Outside any array, and `cv2.remap` can tell 32 parts of it as integers."""
+        return -32.0 * self.side
+
 
 DRAWING = DrawingRules()
-FAR = -32.0 * DRAWING.side  # outside any array, and cv2.remap can tell 32 parts of it as integers
+FAR = DRAWING.far
 
 
 def blurred(

@@ -116,8 +116,7 @@ def noise_of(
     q = fields.shape[1] - 3 * shares.shape[1]
     sizes = noise.repeat(q // len(noise))
     lasting = left[:, :q] / sizes
-    shown = np.concatenate([lasting.T @ lasting, (r @ lasting)[:, None]], axis=1)
-    biases, mean, second = _lasting(before.biases, found.names, shown, model)
+    biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r, np.zeros((2, 6, 6))
     if mean.any():
         rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
@@ -135,10 +134,14 @@ def noise_of(
         covariance[inner] += pulled @ pulled.T
     others = [k for k, name in enumerate(before.names) if name not in found.names]
     names = found.names + tuple([before.names[k] for k in others])
-    if others:
-        sums = np.concatenate([sums, before.sums[:, others]], axis=1)
-    remembered = RememberedNoise(names, sums, moments, biases)
-    return variances, covariance + steady, steady, remembered, ratio
+    sums = np.concatenate([sums, before.sums[:, others]], axis=1) if others else sums
+    return (
+        variances,
+        covariance + steady,
+        steady,
+        RememberedNoise(names, sums, moments, biases),
+        ratio,
+    )
 
 
 def _level(
@@ -197,10 +200,7 @@ def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Float
 
 @lru_cache(maxsize=64)
 def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats, Floats]:
-    """Which rows columns are of: (L, 1, 2, L, 2, 1) those of sensors, (N, 1, N, 1) of markers.
-
-    And the kinds of all fields.
-    """
+    """Which rows columns are of, of sensors and of markers, and the kinds of all fields."""
     L = len(dimensions)
     axes = np.arange(2) < np.array(dimensions)[:, None]
     columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)[:, None, ..., None]
@@ -209,12 +209,13 @@ def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats,
 
 
 def _lasting(
-    before: Biases, names: tuple[str, ...], shown: Floats, model: NoiseModel
+    before: Biases, names: tuple[str, ...], fields: Floats, r: Floats, model: NoiseModel
 ) -> tuple[Biases, Floats, Floats]:
-    """Sums [A | v] with those (q, q + 1) of a frame, and what they show of fields that last.
+    """Sums [A | v] with those of a frame, of fields (R, q), and what they show of those that last.
 
     Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
     """
+    shown = np.concatenate([fields.T @ fields, (r @ fields)[:, None]], axis=1)
     if names in before and before[names].shape == shown.shape:
         shown = model.bias_memory * before[names] + shown
     others = [(own, sums) for own, sums in before.items() if own != names]

@@ -11,7 +11,7 @@ from mixpose.tracking.scene import (
     is_convincing as is_convincing,
 )
 from mixpose.tracking.track import (
-    UNKNOWN_S as UNKNOWN_S,
+    DelayEvidence as DelayEvidence,
     Branch as Branch,
     Companion as Companion,
     Track as Track,

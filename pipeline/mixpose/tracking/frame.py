@@ -159,10 +159,7 @@ def given(frame: Frame, T_world_object: Floats) -> float:
 
 
 def follow(frame: Frame, found: Sequence[Branch], **known: Any) -> Track:
-    """The track after a frame with poses, the best first: how each goes on, as far as they tell.
-
-    With what else is `known` after it, as in `Track`.
-    """
+    """The track after a frame with poses, the best first, and with what else is `known` by then."""
     track, body, rules = frame.track, frame.body, frame.rules.motion
     elapsed, walk = track.elapsed(frame.frame, frame.time_s), track.walk
     steady, branches = per_kind(body, rules.steady), list[Branch]()

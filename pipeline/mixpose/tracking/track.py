@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.constants import constant
 from mixpose.judgement import Prior, RememberedNoise, nearest_alike
 from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
@@ -17,8 +18,6 @@ from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Course, MotionRules, RandomWalk, per_kind
 from mixpose.tracking.static_clutter import StaticClutter
-
-UNKNOWN_S = 0.1  # standard deviation of a delay of which nothing is known
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,12 @@ class DelayEvidence:
     names: tuple[str, ...] = ()  # the others
     information: Floats = field(default_factory=lambda: np.zeros((0, 0)))  # (n, n), s⁻²
     vector: Floats = field(default_factory=lambda: np.zeros(0))  # (n,), s⁻¹
+    unknown_s: float = constant(0.1, "standard deviation of a delay of which nothing is known")
 
     @cached_property
     def seconds(self) -> Mapping[str, DelaySeen]:
         """How late each sensor is, as far as it is known, and how surely."""
-        inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / UNKNOWN_S**2)
+        inverted = np.linalg.inv(self.information + np.eye(len(self.names)) / self.unknown_s**2)
         late, deviations = inverted @ self.vector, np.sqrt(inverted.diagonal())
         return dict(zip(self.names, map(DelaySeen, late.tolist(), deviations.tolist())))
 
@@ -74,11 +74,11 @@ class DelayEvidence:
         applied = list(views)
         for k, view in enumerate(views):
             if view.unsure is not None:
-                late = self.seconds.get(view.name, DelaySeen(0.0, UNKNOWN_S))
+                late = self.seconds.get(view.name, DelaySeen(0.0, self.unknown_s))
                 known = replace(view, unsure=late.deviation, estimated=late.seconds)
                 applied[k] = replace(known, delay=view.delay + late.seconds)
         # a clock that differs by ten standard deviations is not the same: none is late then
-        longest = 10 * UNKNOWN_S if elapsed is None else min(10 * UNKNOWN_S, max(elapsed, 0.0))
+        longest = min(10 * self.unknown_s, math.inf if elapsed is None else max(elapsed, 0.0))
         if all(abs(view.delay) <= longest for view in applied):
             return applied
         return [replace(view, delay=0.0) for view in applied]

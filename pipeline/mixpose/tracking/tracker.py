@@ -240,10 +240,9 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         spread = one.spread if data.options.fuse else None
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
-    counts = [(one > 0).sum(axis=1).tolist() for one in (used.shares, used.weights)]
-    tallies = list(zip(*counts, strict=True))
-    share = data.rules.acceptance.agreeing
-    agreeing = sum(met >= share * max(in_view, 1) for met, in_view in tallies) > 1
+    counts, least = (used.shares > 0, used.weights > 0), data.rules.acceptance.agreeing
+    tallies = list(zip(*[one.sum(axis=1).tolist() for one in counts], strict=True))
+    agreeing = sum(met >= least * max(in_view, 1) for met, in_view in tallies) > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     return follow(
