@@ -226,8 +226,9 @@ def _to_the_noise(
     rules: FitRules,
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
-    sigmas, count, first = finest.sigmas, int(free.sum()), ascent
-    blurs, likeliest, best = np.full(len(sigmas), blur), -np.inf, None
+    sigmas = np.array([view.observation.sigma for view in finest.views])
+    blurs, count, first = np.full(len(sigmas), blur), int(free.sum()), ascent
+    likeliest, best = -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
         if beside:

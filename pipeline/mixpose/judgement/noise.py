@@ -114,8 +114,7 @@ def noise_of(
     left = fields - J @ drawn
     # those of the sensors may last
     q = fields.shape[1] - 3 * shares.shape[1]
-    sizes = noise.repeat(q // len(noise))
-    lasting = left[:, :q] / sizes
+    lasting = left[:, :q] / (sizes := noise.repeat(q // len(noise)))
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r, np.zeros((2, 6, 6))
     if mean.any():
@@ -135,13 +134,8 @@ def noise_of(
     others = [k for k, name in enumerate(before.names) if name not in found.names]
     names = found.names + tuple([before.names[k] for k in others])
     sums = np.concatenate([sums, before.sums[:, others]], axis=1) if others else sums
-    return (
-        variances,
-        covariance + steady,
-        steady,
-        RememberedNoise(names, sums, moments, biases),
-        ratio,
-    )
+    remembered = RememberedNoise(names, sums, moments, biases)
+    return variances, covariance + steady, steady, remembered, ratio
 
 
 def _level(

@@ -43,7 +43,8 @@ def associate(
     objective: MatchedObjective, T_world_object: Floats, rules: AssociationRules, narrowest: float
 ) -> Matches:
     """Compare what a pose (4, 4) predicts with what sensors observed; `narrowest` blur in σ_ε."""
-    match, views, sigmas = objective.match(T_world_object[None]), objective.views, objective.sigmas
+    match, views = objective.match(T_world_object[None]), objective.views
+    sigmas = np.array([view.observation.sigma for view in views])
     dimensions, body = objective.projection.dimensions, objective.projection.body
     y, seen, weights, J = match.y[:, 0], match.seen[:, 0], match.weights[:, 0], match.J[:, 0]
     product, detections = np.vecdot(match.sampled[:, 0, :, 0], weights), _detections(views)
@@ -198,14 +199,15 @@ def _surroundings(
     density, those of no feature, and the finest blur.
     """
     observations = [view.observation for view in objective.views]
-    sigmas, is_flat = objective.sigmas, objective.projection.dimensions == 1
+    sigmas = np.array([one.sigma for one in observations])
+    is_flat = objective.projection.dimensions == 1
     in_view = np.where(seen[..., None], y, np.nan)
     lower, upper = np.fmin.reduce(in_view, axis=1), np.fmax.reduce(in_view, axis=1)
     size, middle = upper - lower, (lower + upper) / 2
     smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     crowd = crowding(detections, lower, around, smallest) * sigmas**2
-    count = np.array([float(one.cells) for one in observations])
+    count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
     if missing.any():

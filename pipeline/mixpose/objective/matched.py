@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -126,11 +125,6 @@ class MatchedObjective:
     weights: Floats  # (L, 1) ω_l; (L, K)
     # where several bodies were looked up at once: the body's pose, and what it has there
     at_hand: tuple[Floats, Match] | None = None
-
-    @cached_property
-    def sigmas(self) -> Floats:
-        """σ_ε of each sensor (L,), in sensor units."""
-        return np.array([view.observation.sigma for view in self.views])
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
