@@ -157,3 +157,102 @@ def test_what_only_starts_work_imports_nothing_heavy(module: str) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+CORE = ("density", "objective", "optimise", "fit", "judgement", "matching", "search", "tracking")
+CODE = [
+    (str(path.relative_to(ROOT)), node)
+    for room in CORE
+    for path in sorted((ROOT / room).glob("*.py"))
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+]
+FUNCTIONS = [
+    (f"{path}:{node.name}", node) for path, node in CODE if isinstance(node, ast.FunctionDef)
+]
+
+
+def called(node: ast.AST) -> set[str]:
+    """Names of the functions and methods that are called anywhere in a part of the code."""
+    functions = [one.func for one in ast.walk(node) if isinstance(one, ast.Call)]
+    return {
+        one.attr if isinstance(one, ast.Attribute) else getattr(one, "id", "") for one in functions
+    }
+
+
+def is_determinant(node: ast.AST) -> bool:
+    """Whether this is a difference of two products, as a coordinate of a cross product is."""
+    if not (isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub)):
+        return False
+    sides = (node.left, node.right)
+    return all(isinstance(one, ast.BinOp) and isinstance(one.op, ast.Mult) for one in sides)
+
+
+def test_one_function_differentiates_a_projection_by_the_pose() -> None:
+    # a turn moves points by a cross product, called by name or written out
+    across = {
+        name
+        for name, node in FUNCTIONS
+        if "cross" in called(node) or sum(map(is_determinant, ast.walk(node))) >= 3
+    }
+    assert across == {
+        "objective/projection.py:pose_jacobian",
+        "search/poses.py:label_image",  # axes of a plane
+        "search/three_points.py:cross",  # triangles and conics
+        "search/three_points.py:_shape",
+        "search/three_points.py:depths",
+        "search/three_points.py:_cofactors",
+        "search/three_points.py:_halves",
+        "tracking/motion.py:expected",  # turns per second, of the logarithm of a turn
+        "tracking/motion.py:followed",
+    }
+    chained = {name for name, node in FUNCTIONS if "pose_jacobian" in called(node)}
+    assert chained == {"objective/projection.py:project", "objective/paper.py:_model"}
+
+
+def test_one_function_climbs() -> None:
+    loops = [
+        (name, one)
+        for name, node in FUNCTIONS
+        for one in ast.walk(node)
+        if isinstance(one, ast.For | ast.While)
+    ]
+    solvers = {"solve", "lstsq", "inv", "pinv", "dposv", "cho_solve", "cholesky"}
+    assert {name for name, loop in loops if called(loop) & solvers} == {
+        "fit/near.py:_moved",  # how far narrower blurs would lead, where no step is taken
+        "objective/terms.py:_model",  # by sensor: amplitudes that are best at a pose
+        "objective/terms.py:_mixtures",
+    }
+    # poses that go on by steps of `ascend`, and that of each branch by its velocity
+    assert {name for name, loop in loops if "perturb" in called(loop)} == {
+        "tracking/in_motion.py:fit_in_motion",
+        "tracking/proposers.py:merged_pair",
+        "tracking/track.py:predict",
+    }
+    for name, loop in loops:
+        if "perturb" in called(loop) and not name.endswith("predict"):
+            assert "least_squares" in called(loop)
+    # of SciPy's only assignments, and sums of variances
+    optimisers = {
+        f"{getattr(node, 'module', '')} {alias.name}"
+        for _, node in CODE
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for alias in node.names
+        if "optimize" in f"{getattr(node, 'module', '')} {alias.name}"
+    }
+    assert optimisers == {"scipy.optimize linear_sum_assignment", "scipy.optimize nnls"}
+
+
+def test_one_record_says_which_feature_is_met_by_which_detection() -> None:
+    classes = {
+        f"{path}:{node.name}": {
+            one.target.id
+            for one in node.body
+            if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)
+        }
+        for path, node in CODE
+        if isinstance(node, ast.ClassDef)
+    }
+    record = classes.pop("matching/matches.py:Matches")
+    told = {"shares", "offsets", "detections", "met", "missed", "residuals", "squared"}
+    assert len(record & told) == 3
+    assert {name for name, fields in classes.items() if len(fields & told) > 1} == set()

@@ -10,7 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from mixpose.objective import NormalPrior
-from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
+from mixpose.optimise import (
+    Ascent,
+    LinearResiduals,
+    NewtonOptions,
+    Quadratic,
+    Sum,
+    Term,
+    ascend,
+    least_squares,
+)
 from mixpose.rigid import perturb, twist_between
 
 Floats = NDArray[np.float64]
@@ -224,3 +233,16 @@ def test_a_hessian_that_is_not_definite_does_not_lead_to_the_valley_between_two_
     ascent = climbed(Function(hills), np.array([0.1]), np.array([-0.7]), free=ONE)
     assert ascent.converged.all()
     assert ascent.states[:, 0] == pytest.approx([1.0, -1.0], abs=1e-5)
+
+
+def test_least_squares_are_climbed_in_one_step() -> None:
+    rng = np.random.default_rng(0)
+    J, residuals = rng.standard_normal((12, 4)), rng.standard_normal(12)
+    known, free = LinearResiduals(np.eye(4) / 0.3, np.full(4, 0.1)), np.array([1, 1, 0, 1], bool)
+    step = least_squares(LinearResiduals(J, residuals), known).states[0]
+    both = np.vstack([J, known.J]), np.append(residuals, known.residuals)
+    # the damping of what has no curvature, a part in 1e12
+    assert np.allclose(step, np.linalg.lstsq(*both)[0], rtol=1e-9)
+    held = least_squares(LinearResiduals(J, residuals), free=free).states[0]
+    assert held[2] == 0
+    assert np.allclose(held[free], np.linalg.lstsq(J[:, free], residuals)[0], rtol=1e-9)

@@ -9,12 +9,11 @@ import pytest
 from detections import TRUTH, detect, view_of
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import Body, PointFeature, thickness
 from mixpose.fit import EstimatorOptions
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.doubt import _is_flat
 
 Floats = NDArray[np.float64]
 
@@ -111,6 +110,6 @@ def test_a_body_in_a_plane_is_its_own_mirror_image() -> None:
         return Body("plane", tuple(PointFeature(point) for point in points))
 
     # what rounding leaves is 1e-15 of its size; a marker 10 um before it is worth a look
-    assert _is_flat(body(places))
-    assert not _is_flat(body(places + 0.01 * np.eye(7)[:, :1] * along[2]))
-    assert _is_flat(body(places[:2]))
+    assert thickness(body(places)) < 1e-6
+    assert thickness(body(places + 0.01 * np.eye(7)[:, :1] * along[2])) > 1e-6
+    assert thickness(body(places[:2])) < 1e-6

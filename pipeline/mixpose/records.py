@@ -72,6 +72,11 @@ class PointPattern:
         """Smallest and largest sensor coordinates (m,); of one point at least."""
         return self.points.min(axis=0), self.points.max(axis=0)
 
+    @property
+    def spots(self) -> tuple[Floats, Floats]:
+        """Places (K, m) where anything is, and how much of it (K,)."""
+        return self.points, self.weights
+
 
 @dataclass(frozen=True)
 class GridPattern:
@@ -101,6 +106,14 @@ class GridPattern:
         """Sensor coordinates (m,) of the first grid point and of the last."""
         size = np.array(self.values.shape[::-1])[: self.dimension]
         return self.origin, np.asarray(self.origin + (size - 1) * self.step)
+
+    @property
+    def spots(self) -> tuple[Floats, Floats]:
+        """Places (K, m) where anything is, from a tenth of the most, and how much of it (K,)."""
+        rows, columns = np.nonzero(self.values > 0.1 * self.values.max())
+        steps = np.stack([columns, rows], axis=1)[:, : self.dimension]
+        weights = self.values[rows, columns].astype(np.float64)
+        return self.origin + self.step * steps, weights
 
 
 Pattern: TypeAlias = PointPattern | GridPattern

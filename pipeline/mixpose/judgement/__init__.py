@@ -15,6 +15,7 @@ from mixpose.judgement.acceptance import (
     nearest_alike as nearest_alike,
 )
 from mixpose.judgement.judge import (
+    Case as Case,
     DetectionModel as DetectionModel,
     JudgementRules as JudgementRules,
     Prior as Prior,

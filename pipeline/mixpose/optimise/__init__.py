@@ -8,3 +8,8 @@ from mixpose.optimise.ascent import (
     Term as Term,
     ascend as ascend,
 )
+from mixpose.optimise.squares import (
+    LinearResiduals as LinearResiduals,
+    least_squares as least_squares,
+    squares_of as squares_of,
+)

@@ -216,9 +216,8 @@ def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Flo
         a, b = np.nonzero(off <= allowed + allowed[:, None])
         apart = (a < b) & (ray[a] != ray[b]) & (feature[a] != feature[b])
         a, b = a[apart], b[apart]
-        if len(a) > most:
-            best = np.argpartition(off[a, b], most)[:most]
-            a, b = a[best], b[best]
+        best = np.argsort(off[a, b], kind="stable")[:most]
+        a, b = a[best], b[best]
         body.append(features[np.stack([np.full(len(a), i), feature[a], feature[b]])])
         point = np.broadcast_to(points.points[p], (len(a), 3))
         world.append(np.stack([point, places[a], places[b]]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from mixpose.body import Body
 from mixpose.judgement import odds_of, paid_by_count
 from mixpose.matching import Matches, crowding
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
-from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend
+from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
@@ -52,7 +52,7 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     points = rays.origins + rays.directions
     plane = points @ to_plane[:, :3].T + to_plane[:, 3]
     # how many px a unit of the plane is at each detection, whatever the lens
-    _, J, _ = sensor.view.sensor.linearise(points)
+    J = sensor.view.sensor.linearise(points)[1]
     per_unit = np.sqrt(np.abs(np.linalg.det(J @ axes[:2].T))) * plane[:, 2] * unit
     radii = problem.reach(sensor) / np.where(per_unit > 0, per_unit, 1.0)
     # at 84° from the middle a ray misses the plane
@@ -117,13 +117,13 @@ def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
     """
     body, free, rules = problem.body, problem.free, problem.rules
     matches = _matches_of(problem, poses)
-    met = matches.met * matches.dimensions
+    met = matches.measurements
     # of each sensor: what one that is covered meets by chance tells nothing of the others
     spare = met * np.maximum(1 - free.sum() / np.maximum(met.sum(axis=1), 1.0), 0.0)[:, None]
     squares, errors = np.where(spare > 0, matches.squares, 0.0), rules.noise.errors
-    degrees = errors.typical_degrees
+    degrees, size = errors.typical_degrees, np.full(len(poses), 2 * body.radius)
     variances = (degrees * errors.typical**2 + squares) / (degrees + spare)
-    odds = odds_of(matches, variances, np.full(len(poses), 2 * body.radius), rules.detection)
+    odds = odds_of(matches, variances, size, rules.detection)
     shares = matches.met / np.maximum(matches.expected, 1.0)
     return paid_by_count(odds, matches, free), shares.mean(axis=1)
 
@@ -132,8 +132,7 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     """Detections that sensors have where they are predicted to see the features of poses."""
     sensors, rules = problem.detections, problem.rules.association
     projection = project_body(tuple(one.view.sensor for one in sensors), problem.body)
-    sigmas = np.array([one.sigma for one in sensors])
-    at = projection.project(poses)
+    sigmas, at = np.array([one.sigma for one in sensors]), projection.project(poses)
     y, J = at.y.swapaxes(0, 1), at.J.swapaxes(0, 1)
     seen, faced = at.seen.swapaxes(0, 1), at.faced.swapaxes(0, 1)
     shares, offsets, crowd = np.zeros(seen.shape), np.zeros(y.shape), np.zeros(seen.shape[:2])
@@ -179,12 +178,8 @@ def _pairs(y: Floats, seen: Mask, points: Floats, reach: float) -> tuple[Indices
     return pose[met], feature[met], nearest[met]
 
 
-class Stage(NamedTuple):
-    """One blur of a descent: factors of σ_ε per sensor, steps at it, and how many poses go on."""
-
-    factors: tuple[float, ...]
-    steps: int
-    survivors: int
+Stage: TypeAlias = tuple[tuple[float, ...], int, int]
+"""One blur of a descent: factors of σ_ε per sensor, steps at it, and how many poses go on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +248,7 @@ def from_spread_orientations(problem: SearchProblem) -> tuple[Floats, list[Stage
     # a turn by a step moves features by so much of their spread
     blurs = [budget.orientation_step * one.moments[1] / one.sigma for one in problem.detections]
     stages = [
-        Stage(tuple(max(blur, 1.0) ** power for blur in blurs), steps, survivors)
+        (tuple(max(blur, 1.0) ** power for blur in blurs), steps, survivors)
         for power, steps, survivors in budget.orientation_stages
     ]
     return poses.reshape(-1, 4, 4), stages
@@ -267,9 +262,8 @@ def spread_turns(free: Mask, step: float) -> Floats:
         r, R = np.sqrt(s / count), np.sqrt(1 - s / count)
         alpha, beta = 2 * np.pi * s / np.sqrt(2.0), 2 * np.pi * s / 1.533751168756204288118041
         quaternions = [r * np.sin(alpha), r * np.cos(alpha), R * np.sin(beta), R * np.cos(beta)]
-        return np.asarray(Rotation.from_quat(np.stack(quaternions, axis=1)).as_matrix())
-    steps = int(np.ceil(2 * np.pi / step))
-    angles = -np.pi + 2 * np.pi * np.arange(steps) / steps
+        return np.asarray(Rotation.from_quat(np.transpose(quaternions)).as_matrix())
+    angles = np.linspace(-np.pi, np.pi, int(np.ceil(2 * np.pi / step)), endpoint=False)
     axes = [angles if is_free else np.zeros(1) for is_free in free]
     vectors = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     vectors = vectors[np.linalg.norm(vectors, axis=1) <= np.pi + 1e-9]
@@ -286,18 +280,16 @@ def _centres(problem: SearchProblem) -> Floats:
 
     options = NewtonOptions(12, damping=1e-6, unchecked=True)
     places = ascend(middles, _starts(problem), moved, problem.free[:3], options).states
-    off, kept = np.sqrt(-2 * middles.linearise(places).value), list[int]()
-    for k in np.argsort(off, kind="stable").tolist():
-        apart = np.linalg.norm(places[k] - places[kept], axis=1)
-        if off[k] < off.min() + radius and (apart > 0.2 * radius).all():
-            kept.append(k)
-    return np.asarray(places[kept[: problem.budget.sample // 2]])
+    off = np.sqrt(-2 * middles.linearise(places).value)
+    near = places[np.argsort(off, kind="stable")[: np.count_nonzero(off < off.min() + radius)]]
+    distinct = unlike(problem.body, from_parts(np.eye(3), near), 0.2)
+    return np.asarray(near[distinct[: problem.budget.sample // 2]])
 
 
 def _starts(problem: SearchProblem) -> Floats:
     """Places (S, 3) to start from: on rays, as far as the body looks large, and about ranges."""
-    body, centre = problem.body, problem.body.means.mean(axis=0)
-    size = float(np.sqrt(((body.nodes.points - centre) ** 2).sum(axis=1).mean()))
+    centre = problem.body.means.mean(axis=0)
+    size = float(np.sqrt(((problem.body.nodes.points - centre) ** 2).sum(axis=1).mean()))
     held = transform(problem.T_reference, centre[None])[0]
     starts = [] if problem.free.all() else [held]
     for one in problem.detections:
@@ -324,6 +316,4 @@ class _Middle:
         """Second-order models at places (H, 3), of lengths: the sensor's unit is taken off."""
         y, J, _ = self.seen.view.sensor.linearise(places)
         scale = np.sqrt(np.maximum((J * J).mean(axis=1).sum(axis=1), 1e-30))[:, None]
-        J, residual = J / scale[..., None], (self.seen.moments[0] - y) / scale
-        pull, C = np.einsum("hmk,hm->hk", J, residual), np.einsum("hmk,hml->hkl", J, J)
-        return Quadratic(-0.5 * (residual**2).sum(axis=1), pull, C)
+        return squares_of((self.seen.moments[0] - y) / scale, J / scale[..., None])

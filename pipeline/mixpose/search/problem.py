@@ -27,6 +27,7 @@ class SearchBudget:
     """Limits and thresholds of one search."""
 
     max_guesses: float = constant(np.inf, "of one search; not its time, so that results repeat")
+    max_guesses_live: int = constant(2000, "of a live frame; the last batch is finished")
     sample: int = constant(8, "features or detections that stand for all; of others a multiple")
     shortlist: int = constant(150, "guesses refined; fewer for bodies of more than 8 features")
     max_triples: int = constant(40_000, "of points, all of the most promising: they take 0.1 s")
@@ -69,13 +70,17 @@ class SearchBudget:
         """Evidence that no fit saves: fits gain 3 nats or, of a board in motion, 12."""
         return -self.outdone - self.beyond_doubt
 
+    def limited(self) -> SearchBudget:
+        """The same for a frame of a live stream, which comes back to what is left."""
+        return replace(self, max_guesses=self.max_guesses_live, shortlist=3 * self.sample)
+
     def refined(self, features: int) -> int:
         """Guesses refined of a body: as many features in all, but a quarter of the guesses."""
         return max(self.shortlist * self.sample // max(features, self.sample), self.shortlist // 4)
 
 
 THOROUGH = SearchBudget()
-LIVE = SearchBudget(max_guesses=2000, shortlist=24)  # of a frame; the last batch is finished
+LIVE = THOROUGH.limited()
 
 
 @dataclass(frozen=True)
@@ -97,14 +102,7 @@ class SensorDetections:
     @cached_property
     def moments(self) -> tuple[Floats, float]:
         """Mean (m,) of what the sensor saw, and root mean square distance from it."""
-        pattern = self.view.observation.pattern
-        if isinstance(pattern, PointPattern):
-            places, weights = pattern.points, pattern.weights
-        else:
-            rows, columns = np.nonzero(pattern.values > 0.1 * pattern.values.max())
-            steps = np.stack([columns, rows], axis=1)[:, : pattern.dimension]
-            places = pattern.origin + pattern.step * steps
-            weights = pattern.values[rows, columns].astype(np.float64)
+        places, weights = self.view.observation.pattern.spots
         mean = weights @ places / weights.sum()
         variance = weights @ ((places - mean) ** 2).sum(axis=1) / weights.sum()
         return mean, float(np.sqrt(variance))
@@ -115,16 +113,17 @@ def sensor_detections(views: Sequence[View], body: Body) -> list[SensorDetection
     sensors = []
     for view in views:
         seen, pattern = view.observation, view.observation.pattern
+        if seen.is_empty:
+            continue
         points = np.zeros((0, seen.dimension))
-        if isinstance(pattern, PointPattern):
+        if not isinstance(pattern, GridPattern):
             points = pattern.points[pattern.weights > 0]
-        elif seen.dimension == 2 and is_pointlike(body) and not seen.is_empty:
+        elif seen.dimension == 2 and is_pointlike(body):
             points = peaks(pattern, seen.sigma)
         if len(points):
             seen = Observation(PointPattern(points, np.ones(len(points))), seen.sigma)
-        if not seen.is_empty:
-            even = replace(view, observation=seen)
-            sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
+        even = replace(view, observation=seen)
+        sensors.append(SensorDetections(even, points, view.sensor.rays(points)))
     return sensors
 
 
@@ -144,9 +143,9 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     )
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
-    rows, columns = np.nonzero((blurred >= highest) & (blurred > 0.1 * blurred.max()))
-    order = np.argsort(-blurred[rows, columns], kind="stable")[: 8 * THOROUGH.sample]
-    places = np.stack([rows[order], columns[order]])
+    places = np.array(np.nonzero((blurred >= highest) & (blurred > 0.1 * blurred.max())))
+    order = np.argsort(-blurred[tuple(places)], kind="stable")
+    places = places[:, order[: 8 * THOROUGH.sample]]
     inner = np.clip(places, 1, np.array(blurred.shape)[:, None] - 2)
     # tops of parabolas through three neighbours, within half a step
     around = np.array([[-1], [0], [1]])

@@ -101,18 +101,18 @@ class _Search:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
         self._images = [label_image(problem, *camera) for camera in cameras]
-        self._explainable = sum(min(len(rays), len(self._body)) for _, rays in cameras)
+        most = sum(min(len(rays), len(self._body)) for _, rays in cameras)
+        self._enough = self._budget.sufficient * most  # detections explained
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
         are_cameras = all(one.rays is not None for one in problem.detections)
         self._by_evidence = bool(self._images) and are_cameras
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
         few = sparse(self._body, 4 * self._budget.sample)
-        self._descent = Descent(views, self._body, problem.free, self._budget)
-        self._quick_descent = Descent(views, few, problem.free, self._budget)
+        self._descent = Descent(views, few, problem.free, self._budget)
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
-        most = self._budget.shortlist
-        self._stages = [Stage((blur,) * len(views), steps, most) for blur, steps in plan]
+        length = self._budget.shortlist
+        self._stages = [((blur,) * len(views), steps, length) for blur, steps in plan]
         self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((2, 0))
         self.cost = Counter(made=0)
 
@@ -132,7 +132,7 @@ class _Search:
                 break
         no_more = self._by_evidence and self.cost["made"]
         if self._coverage() < budget.sufficient and not no_more:
-            self._keep(self._descent.refine(*from_spread_orientations(self._problem)))
+            self._refine(*from_spread_orientations(self._problem))
         return after
 
     def candidates(self) -> list[Candidate]:
@@ -154,8 +154,6 @@ class _Search:
         few = sparse(body, 2 * budget.sample)
         poses, ranks, best, checked, done = np.zeros((0, 4, 4)), np.zeros(0), 0.0, 0.0, skipped
         for make in islice(generator, skipped, None):
-            if self.cost["made"] >= most:
-                break
             done += 1
             more = self._problem.allowed(make())
             self.cost["made"] += len(more)
@@ -177,8 +175,10 @@ class _Search:
                     rivals = slice(3, 3 + 2 * budget.sample)
                     poses, ranks = poses[rivals], ranks[rivals]
                     break
+            if self.cost["made"] >= most:
+                break
         # detections that are missed cost four nats each
-        self._refine(poses[ranks > best - budget.outdone / 4])
+        self._refine(poses[ranks > best - budget.outdone / 4], self._stages)
         return done
 
     def _count(self, body: Body, poses: Floats) -> Floats:
@@ -188,12 +188,12 @@ class _Search:
 
     def _are_enough(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras, refined, leave no need for others."""
-        doubtful = explained < self._budget.sufficient * self._explainable
+        doubtful = explained < self._enough
         if not self._confirm or (
             doubtful and self._judge(guesses)[0].max() < self._budget.hopeless
         ):
             return False
-        self._refine(guesses)
+        self._refine(guesses, self._stages)
         return self._is_found()
 
     def _is_found(self) -> bool:
@@ -208,8 +208,7 @@ class _Search:
         if ranks[0] <= budget.beyond_doubt and lead <= budget.outdone:
             return False
         explained = int(self._count(self._body, self._poses[:1])[0])
-        enough = self._coverage() >= budget.sufficient
-        return enough or explained >= budget.sufficient * self._explainable
+        return self._coverage() >= budget.sufficient or explained >= self._enough
 
     def _coverage(self) -> float:
         """Mean share of the features that the sensors meet at the best pose."""
@@ -226,13 +225,10 @@ class _Search:
                 images = np.append(images, transform(pose @ self._body.symmetries, means), axis=0)
         return kept
 
-    def _refine(self, guesses: Floats) -> None:
+    def _refine(self, guesses: Floats, stages: Sequence[Stage]) -> None:
         """Keep what guesses lead to from less to less blur."""
         self.cost["refined"] += len(guesses)
-        self._keep(self._quick_descent.refine(guesses, self._stages))
-
-    def _keep(self, poses: Floats) -> None:
-        if len(poses):
+        if len(poses := self._descent.refine(guesses, stages)):
             judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
             best = np.argsort(-judged[0], kind="stable")
             self._poses, self._judged = np.append(self._poses, poses, axis=0)[best], judged[:, best]

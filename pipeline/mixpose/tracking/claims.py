@@ -11,15 +11,12 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask
-
-FREE, MERGED = -1, -2  # owners of what is nobody's so far, and of two bodies' features in one spot
 
 Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
 
@@ -34,7 +31,7 @@ class Claims:
     views: tuple[View, ...]  # of L sensors
     places: Floats  # (D, 3)
     begins: Indices  # (L + 1,), where the detections of each sensor begin
-    owners: Indices  # (D,), the number of a body, FREE or MERGED
+    owners: Indices  # (D,), the number of a body; -1: nobody's so far; -2: two bodies' in one spot
 
     @classmethod
     def none(cls, views: Sequence[View]) -> Claims:
@@ -43,11 +40,11 @@ class Claims:
         points = [np.zeros((0, 2)) if one.points is None else one.points for one in seen]
         begins = np.cumsum([0, *map(len, points)])
         of = [places_of(k, points[k] / one.sigma) for k, one in enumerate(seen)]
-        return cls(tuple(views), np.concatenate(of), begins, np.full(begins[-1], FREE))
+        return cls(tuple(views), np.concatenate(of), begins, np.full(begins[-1], -1))
 
     def left(self, k: int) -> Mask:
         """What others leave for body k (D,)."""
-        return np.asarray((self.owners == FREE) | (self.owners == k))
+        return np.asarray((self.owners == -1) | (self.owners == k))
 
     def part(self, left: Mask) -> list[View]:
         """The views with some of their detections (D,)."""
@@ -66,21 +63,14 @@ class Claims:
         return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])
 
     def expected(self, places: Mapping[int, Floats], gate: float) -> Claims:
-        """Each detection is that of the feature, `gate` σ_ε off at most, that it is expected of.
+        """Each detection is that of the nearest feature, `gate` σ_ε off at most.
 
-        `places` (n, 3) of features are by body; all are assigned at once, as near as can be.
+        `places` (n, 3), where features are expected, are by body.
         """
-        if not places:
-            return self
-        whose = np.repeat(list(places), [len(some) for some in places.values()])
-        at, owners = np.concatenate(list(places.values())), self.owners.copy()
-        for sensor in np.unique(at[:, 2]):
-            rows, columns = (np.flatnonzero(some[:, 2] == sensor) for some in (self.places, at))
-            squared = np.minimum(cdist(self.places[rows], at[columns], "sqeuclidean"), gate**2)
-            i, j = linear_sum_assignment(squared)
-            near = squared[i, j] < gate**2
-            owners[rows[i[near]]] = whose[columns[j[near]]]
-        return replace(self, owners=owners)
+        whose = np.array([-1, *(k for k, some in places.items() for _ in some)], dtype=np.intp)
+        away = cdist(self.places, np.concatenate([self.places[:0], *places.values()]))
+        nearest = np.insert(away, 0, gate, axis=1).argmin(axis=1)
+        return replace(self, owners=whose[nearest])
 
     def met_by(self, pose: ScoredPose, left: Mask) -> Met:
         """What a pose meets of the detections that are left for its body."""
@@ -92,21 +82,17 @@ class Claims:
 
     def taken(self, met: Mapping[int, Met], merged: Sequence[int]) -> Claims:
         """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
-        if not met:
-            return self
-        whose = np.repeat(list(met), [len(numbers) for numbers, _ in met.values()])
-        numbers, squared = map(np.concatenate, zip(*met.values(), strict=True))
-        owners = self.owners.copy()
-        # what is written last stays: the nearest, and of equals the first
-        order = np.argsort(squared, kind="stable")[::-1]
-        owners[numbers[order]] = whose[order]
-        owners[merged] = MERGED
+        owners, nearest = self.owners.copy(), np.full(len(self.owners), np.inf)
+        for k, (numbers, squared) in met.items():
+            nearer = squared < nearest[numbers]
+            owners[numbers[nearer]], nearest[numbers[nearer]] = k, squared[nearer]
+        owners[merged] = -2
         return replace(self, owners=owners)
 
     def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
         """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
-        near: Mask = cdist(self.places[chosen], places).min(axis=1, initial=np.inf) < reach
-        return np.flatnonzero(chosen)[near]
+        away = cdist(self.places[chosen], places).min(axis=1, initial=np.inf)
+        return np.asarray(np.flatnonzero(chosen)[away < reach])
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:

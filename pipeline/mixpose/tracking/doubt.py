@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mixpose.body import Body, like_features, mirror_image, thickness, tolerance_of
+from mixpose.body import like_features, mirror_image, thickness, tolerance_of
 from mixpose.judgement import APART, ScoredPose, Verdict, contradict, decide, is_far_off, is_sure
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
@@ -42,10 +42,9 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
 
 def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
     """Why a sure pose is in doubt; empty if it is not."""
-    rules, track = data.rules, data.track
+    rules, track, noise = data.rules, data.track, data.rules.judgement.noise
     if is_reflection(data, best):
         return MIRRORED
-    noise = rules.judgement.noise
     if contradict(best, track.residuals.total, track.agreed, rules.acceptance, noise):
         return APART
     if has_rivals:
@@ -53,27 +52,30 @@ def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
     if not is_known(data, best):
         return TRIANGLE
     is_alone = len(data.sensors) > 1 and np.count_nonzero(best.matches.met) == 1
-    return ALONE if is_alone and not track.believed and _is_from_doubt(data, best) else ""
+    if track.believed or not is_alone:
+        return ""
+    # a pose that is sure for doubtful ones before it alone errs as they do
+    gained = max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
+    return "" if best.log_evidence - gained > rules.acceptance.sure else ALONE
 
 
 def is_known(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is the body's, by what it meets or by where it was expected."""
-    if (judged.matches.dimensions == 1).any():
-        return True  # ranges are no markers in space
+    are_ranges = (judged.matches.dimensions == 1).any()  # which are no markers in space
     others = np.sort(judged.matches.met_by)[:-3]
     # one sensor of several may meet a marker by chance
-    if not len(others) or others.sum() >= max(len(data.views) / 2, 1):
+    if are_ranges or not len(others) or others.sum() >= max(len(data.views) / 2, 1):
         return True
-    if not data.track.known or data.track.misses:
-        return False
-    _, spread = data.prior(judged.T_world_object)
-    return bool((spread < data.anywhere[1]).all())
+    is_followed = data.track.known and not data.track.misses
+    return is_followed and bool((data.prior(judged.T_world_object)[1] < data.anywhere[1]).all())
 
 
 def is_reflection(data: Frame, judged: ScoredPose) -> bool:
     """Whether the frame shows the body's mirror image rather than the body."""
     rules, seen, T = data.rules, judged.matches, judged.T_world_object
-    if "mirrored" not in rules.look_alikes.kinds or not data.body.is_exact or _is_flat(data.body):
+    # where a turn brings it onto its mirror image no camera tells one side's markers
+    can_be = data.body.is_exact and thickness(data.body) >= 1e-6
+    if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return False
     ahead, met = rules.acceptance.standing_out, seen.met_by
     # of these the mirror image may meet more than the body
@@ -90,12 +92,10 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
         return False
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
     live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
-    nothing = data.seen_otherwise(predictions=(), beside=None, searches=[])
-    alone = replace(nothing, track=track, options=live)
+    alone = data.seen_otherwise(predictions=(), beside=None, searches=[], track=track, options=live)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
-    least = own - rules.search.outdone
-    starts = starts_at(mirror, [one for one in candidates_of(mirror) if one.evidence > least])
-    return any(_evidence(mirror, start) > own + ahead for start in starts)
+    rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
+    return any(_evidence(mirror, start) > own + ahead for start in starts_at(mirror, rivals))
 
 
 def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str:
@@ -115,17 +115,6 @@ def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str
                 if _evidence(seen, Start(T, other.close, left_out=best.left_out)) > limit:
                     return part.reason
     return ""
-
-
-def _is_from_doubt(data: Frame, judged: ScoredPose) -> bool:
-    """Whether a pose is sure for doubtful ones before it alone: it errs as they do."""
-    gained = data.prior(judged.T_world_object)[0] - data.anywhere[0]
-    return judged.log_evidence - max(gained, 0.0) <= data.rules.acceptance.sure
-
-
-def _is_flat(body: Body) -> bool:
-    """Whether a turn brings the body onto its mirror image: no camera tells one side's markers."""
-    return thickness(body) < 1e-6
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:

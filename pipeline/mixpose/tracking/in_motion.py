@@ -17,16 +17,13 @@ import numpy as np
 from mixpose.fit import Fit
 from mixpose.judgement import ScoredPose, inverted, nearest_alike
 from mixpose.matching import LEAST_VARIANCE, Matches, associate, errors_seen, welsch
+from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb
 from mixpose.sensors import Motion, moments
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.motion import Expected
 from mixpose.tracking.track import DelayEvidence
-
-LINEAR = 0.1  # of σ_ε: where a better velocity moves features by less, steps do, without a climb
-SETTLED = 2e-3  # of σ_ε: where it moves them by less, they stay where they are
-SOME_FRAMES = 3  # of so many, one is asked for delays that nobody told: it takes time
 
 
 class Offsets(NamedTuple):
@@ -39,7 +36,7 @@ class Offsets(NamedTuple):
     unsure: tuple[tuple[int, float], ...]  # sensors with estimated delays, standard deviations
     beside: float  # how far features may be off by velocity and delay, in σ_ε
 
-    def by_delay(self, velocity: Floats, sensors: Sequence[int]) -> Floats:
+    def by_delay(self, velocity: Floats, sensors: Sequence[int] | Floats) -> Floats:
         """How the features of some sensors would move with their delays, (K, q) per second."""
         own = self.sensor[:, None] == np.array(sensors, int)
         return np.where(own, (self.rows @ velocity)[:, None], 0.0)
@@ -47,13 +44,12 @@ class Offsets(NamedTuple):
     def least_squares(
         self, velocity: Floats, expected: Expected, free: Mask, variance: float
     ) -> tuple[Floats, Floats, Floats]:
-        """Gauss-Newton step of all unknowns, their covariance, and offsets (K,) that are left.
+        """The step of all unknowns, their covariance, and offsets (K,) that are left.
 
         Unknown are pose, velocity, delays, and in each delay the body's way at another velocity.
         """
         rows, fast = self.rows[:, free], expected.deviation[free]
-        count, late = len(fast), np.array([deviation for _, deviation in self.unsure])
-        sensors = [k for k, _ in self.unsure]
+        count, (sensors, late) = len(fast), np.reshape(self.unsure, (-1, 2)).T
         ways = [rows * (self.sensor == k)[:, None] for k in sensors]
         by_delay = self.by_delay(velocity, sensors)
         design = np.hstack([rows, rows * self.late[:, None], by_delay, *ways])
@@ -64,16 +60,10 @@ class Offsets(NamedTuple):
         prior /= np.concatenate([fast, late, np.outer(late, fast).ravel()])[:, None]
         known = np.zeros(len(prior))
         known[:count] = (expected.velocity - velocity)[free] / fast
-        covariance = inverted(design.T @ design / variance + prior.T @ prior)
-        x = covariance @ (design.T @ self.offsets / variance + prior.T @ known)
-        return x, covariance, self.offsets - design @ x
-
-
-def gauss_newton(J: Floats, offsets: Floats, free: Mask) -> Floats:
-    """Step (6,) of the pose that leaves the least squares of offsets (K,), for J (K, 6)."""
-    step = np.zeros(6)
-    step[free] = np.linalg.lstsq(J[:, free], offsets, rcond=None)[0]
-    return step
+        seen = LinearResiduals(*(part / np.sqrt(variance) for part in (design, self.offsets)))
+        end = least_squares(seen, LinearResiduals(prior, known))
+        x = end.states[0]
+        return x, inverted(end.last.curvature[0]), self.offsets - design @ x
 
 
 def fit_in_motion(
@@ -84,29 +74,27 @@ def fit_in_motion(
     `climb` takes a frame as of the common time, a start, and how far off features may be, in σ_ε.
     """
     motion = frame.expected(T_start, is_there=False).at(T_start)
-    T, moved, count, rules = T_start, np.inf, int(frame.free.sum()), frame.rules.judgement
-    errors = rules.noise.errors
+    T, moved, count, timing = T_start, np.inf, int(frame.free.sum()), frame.rules.timing
+    errors = frame.rules.judgement.noise.errors
     for _ in range(6):
-        seen, expected = frame.in_motion(motion), frame.expected(T)
-        if moved > LINEAR:
-            matches = associate(seen.finest, T, rules.association, errors.narrowest)
-            fit = climb(seen, T, offsets_of(seen, matches, expected).beside)
+        seen = frame.in_motion(motion)
+        if moved > timing.linear:
+            fit = climb(seen, T, offsets_at(seen, T).beside)
             T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
-            expected = frame.expected(T)
-        matches = associate(seen.finest, T, rules.association, errors.narrowest)
-        met = offsets_of(seen, matches, expected)
-        change, variance = np.zeros(6), errors.typical**2
+        met, expected, variance = offsets_at(seen, T), frame.expected(T), errors.typical**2
         for _ in range(2):  # the second time with the variance that the first leaves
             x, _, rest = met.least_squares(motion.velocity, expected, frame.free, variance)
             total = errors.typical_degrees * errors.typical**2 + float(rest @ rest)
             degrees = errors.typical_degrees + max(len(rest) - count, 0)
             variance = max(total / degrees, LEAST_VARIANCE)
+        change = np.zeros(6)
         change[frame.free] = x[count : 2 * count]
         way = met.late * (met.rows @ change)
-        T = np.asarray(perturb(T, gauss_newton(met.rows, met.offsets - way, frame.free)))
+        left = LinearResiduals(met.rows, met.offsets - way)
+        T = perturb(T, least_squares(left, free=frame.free).states[0])
         motion = Motion(T, motion.velocity + change, expected.acceleration)
         moved = float(np.abs(way).max(initial=0.0))
-        if moved < SETTLED:
+        if moved < timing.settled:
             break
     return replace(fit, T_world_object=T, motion=motion)
 
@@ -127,32 +115,38 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
     return replace(judged, covariance=covariance)
 
 
+def offsets_at(frame: Frame, T_world_object: Floats) -> Offsets:
+    """What is met at a pose."""
+    rules, expected = frame.rules.judgement, frame.expected(T_world_object)
+    narrowest = rules.noise.errors.narrowest
+    matches = associate(frame.finest, T_world_object, rules.association, narrowest)
+    return offsets_of(frame, matches, expected)
+
+
 def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:
     """Met features, as they pull: little, where farther off than noise and velocity explain."""
-    names = [view.name for view in frame.views]
-    chosen = [names.index(name) for name in matches.names]
-    views, seen = [(frame.still or frame.views)[k] for k in chosen], matches.weights > 0
-    pairs = zip(views, matches.places, strict=True)
+    views = [view for view in frame.still or frame.views if view.name in matches.names]
+    pairs, seen = zip(views, matches.places, strict=True), matches.weights > 0
     seconds = [moments(view.sensor, y, view.delay, view.readout) for view, y in pairs]
-    late, blurs, beside = np.where(seen, seconds, 0.0), np.ones(len(chosen)), 0.0
+    late, blurs, beside = np.where(seen, seconds, 0.0), np.ones(len(views)), 0.0
     if expected is not None:
         delays = np.array([view.unsure or 0.0 for view in views])[:, None, None]
         speed = np.hypot(expected.velocity, expected.deviation)
         ways = np.hypot(late[..., None] * expected.deviation, delays * speed)
         squares = ((matches.J * ways[:, :, None]) ** 2).sum(axis=(2, 3))
         beside = float(np.sqrt(squares.max(initial=0.0, where=seen)))
-        errors, known = frame.rules.judgement.noise.errors, frame.noise[:, chosen]
-        _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, errors)
+        model = frame.rules.judgement.noise
+        known = model.memory * frame.track.residuals.of(matches.names)
+        _, _, noise, _ = errors_seen(matches, int(frame.free.sum()), known, model.errors)
         # a pose that was climbed to at another velocity is off by as much in all sensors
-        blurs = np.minimum(np.hypot(noise, errors.blur * beside), 1.0)
+        blurs = np.minimum(np.hypot(noise, model.errors.blur * beside), 1.0)
     pull = np.sqrt(matches.shares * welsch(matches.squared, blurs))
     kept = seen[..., None] & (np.arange(2) < matches.dimensions[:, None, None])
-    numbers = np.arange(len(views))[:, None, None]
     return Offsets(
         rows=(matches.J * pull[..., None, None])[kept],
         late=np.broadcast_to(late[..., None], kept.shape)[kept],
         offsets=(matches.offsets * pull[..., None])[kept],
-        sensor=np.broadcast_to(numbers, kept.shape)[kept],
+        sensor=np.nonzero(kept)[0],
         unsure=tuple((k, view.unsure) for k, view in enumerate(views) if view.unsure is not None),
         beside=beside,
     )
@@ -161,18 +155,17 @@ def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None)
 def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     """What is known of delays after a frame with a best pose."""
     before, used = frame.track.delays, best.used
-    is_asked = frame.frame % SOME_FRAMES == 0 or frame.is_timed
+    is_asked = frame.frame % frame.rules.timing.asked == 0 or frame.is_timed
     if len(used.names) < 2 or not frame.track.seconds_until(frame.time_s) or not is_asked:
         return before
-    expected = frame.expected(best.T_world_object)
-    own = {name: k for k, name in enumerate(used.names)}
+    expected, own = frame.expected(best.T_world_object), used.names
     told = (view.name for view in frame.views if view.name in own and view.unsure is None)
     reference = before.reference or next(told, "")
     if not expected.gain.any() or reference not in own:
         return before
     names = (*before.names, *(n for n in own if n != reference and n not in before.names))
     met = offsets_of(frame, used)
-    late = met.by_delay(expected.velocity, [own.get(name, -1) for name in names])
+    late = met.by_delay(expected.velocity, [own.index(n) if n in own else -1 for n in names])
     rest = float(met.offsets @ met.offsets) / max(len(met.offsets) - 6, 1)
     variance = max(rest, LEAST_VARIANCE)
     # what a pose and an unknown change of the velocity explain as well says nothing of delays

@@ -20,7 +20,15 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.fit import Fit, blur_schedule, fit_near
-from mixpose.judgement import DetectionModel, RememberedNoise, ScoredPose, judge, nearest_alike
+from mixpose.judgement import (
+    Case,
+    DetectionModel,
+    RememberedNoise,
+    ScoredPose,
+    judge,
+    judge_together,
+    nearest_alike,
+)
 from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
 from mixpose.records import Floats, Mask, PointPattern
@@ -89,24 +97,21 @@ class MatchedLikelihood:
         frame, motion = self.frame, fit.motion
         if frame.together and fit is frame.together[0]:
             return frame.together[1]
-        T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
         if frame.is_timed:
-            motion = motion or frame.expected(T).at(T)
+            motion = motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
             frame = frame.in_motion(motion)
-        prior = frame.prior(T if start.T_moved is None else start.T_moved)
-        is_seen = T is fit.T_world_object and motion is None and not start.left_out
-        judged = judge(
-            frame.finest,
-            T,
-            frame.free,
-            frame.rules.judgement,
-            before=frame.track.residuals,
-            prior=prior,
-            left_out=start.left_out,
-            matches=fit.matches if is_seen else None,
-            noise=fit.noise if is_seen else None,
-        )
+        case = case_of(frame, fit, start)
+        judged = judge_together([case], frame.free, frame.rules.judgement, start.left_out)[0]
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
+
+
+def case_of(frame: Frame, fit: Fit, start: Start) -> Case:
+    """What a pose that was fitted to a frame is judged by."""
+    T = nearest_alike(fit.T_world_object, frame.body, frame.T_reference)
+    prior = frame.prior(T if start.T_moved is None else start.T_moved)
+    is_seen = T is fit.T_world_object and not (frame.is_timed or start.left_out)
+    seen = (fit.matches, fit.noise) if is_seen else (None, None)
+    return frame.finest, T, frame.track.residuals, prior, *seen
 
 
 def are_associated(views: Sequence[View], body: Body, rules: RangeRules = RangeRules()) -> bool:

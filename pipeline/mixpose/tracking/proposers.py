@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from operator import add
 from typing import TypeAlias
 
@@ -20,12 +21,11 @@ from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolera
 from mixpose.fit import blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, pooled
-from mixpose.objective import matched_objective
+from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats
-from mixpose.rigid import perturb
-from mixpose.search import Candidate, Descent, SearchReport, SearchState, Stage, search_frame
+from mixpose.rigid import perturb, transform
+from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
 from mixpose.tracking.frame import Frame
-from mixpose.tracking.in_motion import gauss_newton
 from mixpose.tracking.likelihood import Likelihood, Start
 
 # from the poses found so far, the most evident first
@@ -46,18 +46,15 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
 
     Once it was followed for some frames, a pose convinces that misses no more all at once.
     """
-    if not ranked:
-        return True
-    track, rules, best = frame.track, frame.rules, ranked[0]
-    if convinces(best, frame.free, rules.acceptance):
+    track, rules = frame.track, frame.rules
+    if ranked and convinces(ranked[0], frame.free, rules.acceptance):
         return False
-    if not is_sure(best, frame.free, rules.acceptance):
+    if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
-    if track.believed < rules.proposals.believed or track.misses or track.doubted:
-        return True
+    is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
     before = sum(met for met, _ in track.tallies.values())
-    met = int(np.count_nonzero(best.used.shares))
-    return len(track.branches) != 1 or met <= rules.acceptance.convincing * before
+    misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
+    return bool(is_new or track.misses or track.doubted or misses_more)
 
 
 def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -66,38 +63,21 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
         return
     first, rules = frame.predictions[0], frame.rules.proposals
     wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
-    starts = starts_around(frame, first.T_world_object, wide)
     narrow, sigmas = wide / rules.narrowing, np.array(frame.sigmas)
-    levels = blur_schedule(frame.views, frame.body, starts[0], narrow)
-    stages = [Stage(tuple(level / sigmas), rules.steps, len(starts)) for level in levels]
+    levels = blur_schedule(frame.views, frame.body, first.T_world_object, narrow)
+    stages = [(tuple(level / sigmas), rules.steps, rules.kept) for level in levels]
+    cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
+    # uniform within √3 standard deviations each way
+    drawn = perturb(first.T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
     descent = Descent(frame.views, frame.body, frame.free, frame.rules.search)
-    poses = descent.refine(np.array(starts), stages)
+    poses = np.concatenate([first.T_world_object[None], drawn])
+    poses = descent.refine(poses, [(stages[0][0], 0, rules.kept), *stages])
     values = descent.objective().value(poses)
     order = np.argsort(-values, kind="stable")
     # those that meet anything, best first
     for T in poses[order[values[order] > frame.rules.fit.near * len(frame.views)]]:
         if is_doubtful(frame, ranked):
             yield Start(T, narrow / rules.narrowing)
-
-
-def starts_around(frame: Frame, T_guess: Floats, uncertainty: Floats) -> list[Floats]:
-    """The most promising poses (4, 4) around a guess, uncertain by (6,), none close to another."""
-    rules = frame.rules.proposals
-    sigmas = blur_schedule(frame.views, frame.body, T_guess, uncertainty / rules.narrowing)[0]
-    cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
-    # uniform within √3 standard deviations each way
-    drawn = (2 * cube - 1) * np.sqrt(3) * uncertainty
-    twists = np.concatenate([np.zeros((1, 6)), drawn])
-    poses = perturb(T_guess, twists)
-    scores = matched_objective(frame.views, frame.body, sigmas).value(poses)
-    kept: list[int] = []
-    scale = np.where(uncertainty > 0, uncertainty / rules.narrowing, np.inf)
-    for k in np.argsort(scores)[::-1].tolist():
-        if all(np.linalg.norm((twists[k] - twists[other]) / scale) > 1.0 for other in kept):
-            kept.append(k)
-        if len(kept) == rules.kept:
-            break
-    return [poses[k] for k in kept]
 
 
 def searched(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
@@ -147,8 +127,7 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    kinds = frame.rules.look_alikes.kinds
-    best = None
+    kinds, best = frame.rules.look_alikes.kinds, None
     # once more, where what is moved is better and meets more
     for _ in range(2 if "congruent" in kinds else 0):
         if ranked and ranked[0] is not best:
@@ -162,16 +141,13 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
     """In words, if one of the rivals is a look-alike of the best pose; else empty."""
-    T, body, alike = best.T_world_object, frame.body, _congruent(frame, best)
-    if not alike:
-        return ""
-    corners = np.vstack([body.means.T, np.ones(len(body))])
-    points = np.array([T @ one.T_body_other for one in alike]) @ corners
-    for rival in rivals:
-        there = rival.T_world_object @ body.symmetries @ corners
-        away = np.abs(points[:, None] - there[None]).max(axis=(2, 3)).min(axis=1)
-        if away.min() < frame.rules.look_alikes.alike * body.radius:
-            return alike[int(away.argmin())].reason
+    body, alike = frame.body, _congruent(frame, best)
+    limit = frame.rules.look_alikes.alike * body.radius
+    for rival, one in product(rivals, alike):
+        there = transform(rival.T_world_object @ body.symmetries, body.means)
+        away = np.abs(transform(best.T_world_object @ one.T_body_other, body.means) - there)
+        if away.max(axis=(1, 2)).min() < limit:
+            return one.reason
     return ""
 
 
@@ -201,14 +177,13 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     if not alike:
         return
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
-    met = float(best.matches.met.max())
     # the value grows as the square of the features met
     values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
-    fewer = met * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
-    here, _ = frame.prior(T)
+    missed = 1 - values[1:] / max(values[0], np.finfo(np.float64).tiny)
+    fewer = float(best.matches.met.max()) * missed
     for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
         moved = _moves_alike(frame, T) if alike[k].is_step else None
-        against = here - frame.prior(poses[1 + k] if moved is None else moved)[0]
+        against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
         least = 1 + max(against, 0.0) / np.log(rules.acceptance.rival)
         if fewer[k] < rules.look_alikes.fewer * least:
             yield Start(poses[1 + k], frame.close, T_moved=moved)
@@ -216,18 +191,16 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
 
 def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Floats]:
     """The pose (4, 4) tilted the other way, where one camera alone meets a nearly flat body."""
-    body, views = frame.body, frame.views
+    body, views, T = frame.body, frame.views, best.T_world_object
     if len(views) > 1:
-        least = frame.rules.acceptance.agreeing
-        seen = best.matches
+        least, seen = frame.rules.acceptance.agreeing, best.matches
         met = {name for name, share in zip(seen.names, seen.coverage) if share >= least}
         views = [view for view in views if view.name in met]
     if len(views) != 1 or views[0].sensor.dimension != 2 or len(body) < 3:
         return
     if thickness(body) <= frame.rules.look_alikes.flat:
-        T = best.T_world_object
-        middle = T[:3, :3] @ body.means.mean(axis=0) + T[:3, 3]
-        yield other_tilt(body, T, views[0].sensor.towards(middle[None])[0])
+        middle = transform(T, body.means.mean(axis=0)[None])
+        yield other_tilt(body, T, views[0].sensor.towards(middle)[0])
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
@@ -249,13 +222,12 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
     apart = ~agreeing & (seen.expected > 0)
     apart &= seen.unmatched_nearby >= rules.agreeing * seen.missed
     squares, degrees = seen.squares * agreeing, seen.measurements * agreeing
-    for k in np.flatnonzero(agreeing & (degrees > 0)):
-        rest, own = float(degrees.sum() - degrees[k]), float(degrees[k])
-        if np.count_nonzero(agreeing) < 3 or rest == 0:
-            continue
-        variance = float(squares.sum() - squares[k]) / rest
-        limit = max(rules.disagreeing, float(fdtri(own, rest, model.by_chance)))
-        apart[k] = squares[k] / own > limit * max(variance, LEAST_VARIANCE)
+    if np.count_nonzero(agreeing) > 2:
+        rest = degrees.sum() - degrees
+        variances = (squares.sum() - squares) / np.maximum(rest, 1e-12)
+        # NaN without degrees of freedom, which nothing is larger than
+        limits = np.maximum(rules.disagreeing, fdtri(degrees, rest, model.by_chance))
+        apart |= squares > degrees * limits * np.maximum(variances, LEAST_VARIANCE)
     names = [seen.names[k] for k in np.flatnonzero(apart)]
     return names if np.count_nonzero(agreeing & ~apart) >= 2 else []
 
@@ -269,8 +241,8 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
         if not seen.merged.any():
             break
         J, offsets = seen.rows()
-        step = gauss_newton(J.reshape(-1, 6), offsets.ravel(), frame.free)
-        start = Start(perturb(at.T_world_object, step))
+        rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
+        start = Start(perturb(at.T_world_object, least_squares(rest, free=frame.free).states[0]))
         at = likelihood.judge(likelihood.fit(start), start)
         seen = at.matches
     return [] if at is judged else [Start(at.T_world_object)]
@@ -288,19 +260,16 @@ def _paired(seen: Matches, reach: float) -> Matches:
     for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
         met = np.flatnonzero(seen.detections[k] >= 0)
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
-        if not len(met) or not len(lost):
-            continue
         apart = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k]
         away = apart + offsets[k, met]
         squared = (away * away).sum(axis=2) / 2
-        i, j = np.unravel_index(int(squared.argmin()), squared.shape)
-        if squared[i, j] > reach:
-            continue
-        pair = [lost[i], met[j]]
-        shares[k, pair] = shares[k, met[j]] / 2
-        offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
-        J[k, pair] = J[k, pair].mean(axis=0)
-        merged[k] = 1
+        if squared.min(initial=np.inf) <= reach:
+            i, j = np.unravel_index(int(squared.argmin()), squared.shape)
+            pair = [lost[i], met[j]]
+            shares[k, pair] = shares[k, met[j]] / 2
+            offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
+            J[k, pair] = J[k, pair].mean(axis=0)
+            merged[k] = 1
     return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged)
 
 

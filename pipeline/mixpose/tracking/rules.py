@@ -47,6 +47,15 @@ class RangeRules:
 
 
 @dataclass(frozen=True)
+class TimingRules:
+    """How velocity and delays are estimated, where sensors see moments of their own."""
+
+    linear: float = constant(0.1, "σ_ε: a velocity that moves features by less is not climbed with")
+    settled: float = constant(2e-3, "σ_ε: one that moves them by less leaves them where they are")
+    asked: int = constant(3, "frames, of which one is asked for delays that nobody told: for time")
+
+
+@dataclass(frozen=True)
 class Rules:
     """What a tracker goes by; `docs/constants.md` lists every field."""
 
@@ -55,6 +64,7 @@ class Rules:
     acceptance: AcceptanceRules = AcceptanceRules()
     motion: MotionRules = MotionRules()
     ranges: RangeRules = RangeRules()
+    timing: TimingRules = TimingRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()
     search: SearchBudget = THOROUGH
@@ -63,10 +73,9 @@ class Rules:
 
 @dataclass(frozen=True)
 class SceneRules:
-    """How detections are shared out, and when bodies are in doubt for each other's sake."""
+    """How detections are shared out among bodies."""
 
     gate: float = constant(6.0, "σ_ε around expected features: met within 2.2, the rest is motion")
-    rival: float = constant(0.5, "share of its detections from which another body is a rival")
     touching: float = constant(3.0, "σ_ε between images that run together: twice a spot's width")
     pulled: float = constant(0.1, "offset² in σ_ε² of a spot of two bodies: 2.5 times a blob's")
     thorough: int = constant(10, "frames, of which one searches thoroughly for what is away: 1/3 s")

@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
@@ -67,22 +68,20 @@ class Scene:
             group = [k for k, one in enumerate(self.bodies) if one.body.name == name]
             given, exchanged = identify(group, found)
             finders, rivals = finders | given, rivals | exchanged
-        verdicts = {k: found[finders[k]].verdict for k in found}
-        told = {k: _in_doubt(verdicts[k], rivals.get(k, [])) for k in found}
-        sure = [k for k, verdict in told.items() if verdict.status == "ok"]
-        for k in sure:
-            # another body that is not surely elsewhere, or its own markers where they repeat
-            # themselves: then it may be turned another way
-            own, best = self.bodies[k].body, told[k].best
-            away = [j for j, one in enumerate(self.bodies) if j not in sure and one.body is not own]
-            others = [found[j].frame for j in (k, *away)]
-            why = look_alike_of(found[k].frame, best, others) if best else ""
-            verdicts[k] = told[k] = verdicts[k].doubted(why)
-        after, estimates = [], []
+        told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
+        sure, after, estimates = [k for k in told if told[k].status == "ok"], [], []
         for k, tracked in enumerate(self.bodies):
-            data, ranked = found[k].frame, found[finders[k]].ranked
-            after.append(followed(data, verdicts[k]))
-            estimates.append(tracked.estimate(data, after[k], told[k], ranked))
+            data, verdict = found[k].frame, found[finders[k]].verdict
+            if told[k].status == "ok" and verdict.best:
+                # another body that is not surely elsewhere, or its own markers where they repeat
+                # themselves: then it may be turned another way
+                away = [
+                    j for j in found if j not in sure and self.bodies[j].body is not tracked.body
+                ]
+                others = [found[j].frame for j in (k, *away)]
+                verdict = told[k] = verdict.doubted(look_alike_of(data, verdict.best, others))
+            after.append(followed(data, verdict))
+            estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, estimates), estimates
 
     def _acquainted(
@@ -95,12 +94,10 @@ class Scene:
             if one.instance is None and one.status == "ok" and one.T_world_object is not None
         }
         after = list(tracks)
-        for k, T in sure.items():
-            body, known = self.bodies[k].body, dict(tracks[k].companions)
-            for j in sure.keys() - {k}:
-                label = self.bodies[j].label
-                known[label] = Companion.joined(known.get(label), T, sure[j], body)
-            after[k] = replace(tracks[k], companions=known)
+        for k, j in permutations(sure, 2):
+            label, known = self.bodies[j].label, after[k].companions
+            now = Companion.joined(known.get(label), sure[k], sure[j], self.bodies[k].body)
+            after[k] = replace(after[k], companions={**known, label: now})
         return tuple(after)
 
 
@@ -111,10 +108,9 @@ def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
         return verdict
     # odds that it has none, as its pose is another's, stand beside the poses
     total = sum(weight for _, weight in [*verdict.kept, *rivals])
-    kept = [*verdict.kept, *((pose, odds) for pose, odds in rivals if pose is not best)]
-    kept = [(pose, weight / total) for pose, weight in kept]
-    kept.sort(key=lambda pair: (pair[0] is not best, -pair[1]))
-    return Verdict("ambiguous", best, kept)
+    poses = [*verdict.kept, *((pose, odds) for pose, odds in rivals if pose is not best)]
+    kept = sorted(poses, key=lambda pair: (pair[0] is not best, -pair[1]))
+    return Verdict("ambiguous", best, [(pose, weight / total) for pose, weight in kept])
 
 
 def identify(
@@ -141,8 +137,7 @@ def identify(
     # no velocity is believed any more: they may have changed places, wherever they were before
     lost = np.array([one.track.misses > one.rules.motion.coasting for one in data], np.bool_)
     odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
-    rivals: dict[int, Rivals] = {}
-    limit = np.log(found[group[0]].frame.rules.acceptance.rival)
+    rivals, limit = dict[int, Rivals](), np.log(found[group[0]].frame.rules.acceptance.rival)
     for i, j in zip(*np.nonzero(odds > limit), strict=True):
         if i != j and known[i] in pose_of:
             other = pose_of.get(known[j], pose_of[known[i]])

@@ -26,8 +26,7 @@ class StaticClutter:
         """After one more frame without the body; what was seen as often as not is forgotten."""
         places = dict(self.places)
         for view in views:
-            points = view.observation.points
-            if points is None:
+            if (points := view.observation.points) is None:
                 continue
             old, count = places.get(view.name, (points[:0], np.zeros(0, dtype=np.intp)))
             nearest = _nearest(old, view.observation)
@@ -42,13 +41,12 @@ class StaticClutter:
         """The views without detections that were there in so many frames more than not."""
         moving = list(views)
         for k, view in enumerate(views):
-            if view.name not in self.places:
-                continue
-            places, counts = self.places[view.name]
-            static = places[counts >= frames]
-            moves = _nearest(static, view.observation) == len(static)
-            if not moves.all():
-                moving[k] = replace(view, observation=view.observation.only(moves))
+            if view.name in self.places:
+                places, counts = self.places[view.name]
+                static = places[counts >= frames]
+                moves = _nearest(static, view.observation) == len(static)
+                if not moves.all():
+                    moving[k] = replace(view, observation=view.observation.only(moves))
         return moving
 
 
