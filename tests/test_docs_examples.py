@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"`([\w./]+)`:\s*$")
 LINK = re.compile(r"\]\((?!https?:)([^)#]+)\)")
 DECIMAL = re.compile(r"-?\d+\.\d*(?:e[-+]?\d+)?")
-# Poses end within 1e-5 standard deviations of their maximum (`fit.near.SHARP`), by a way that hangs
+# Poses end within 1e-5 standard deviations of their maximum (`FitRules.sharp`), by a way that hangs
 # on rounding, and the figures are errors of that size: with and without wide vector units 1e-7 is
 # seen.  What is rounded to its last place may fall to either side.
 RELATIVE, UNITS = 1e-4, 1.01

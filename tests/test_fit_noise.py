@@ -45,7 +45,7 @@ def apart(views: Sequence[View], body: Body, T_a: Floats, T_b: Floats) -> float:
 
 def at_sigma(views: Sequence[View], body: Body) -> tuple[MatchedObjective, Ascent]:
     objective = matched_objective(views, body, [view.observation.sigma for view in views])
-    return objective, ascend(objective, TRUTH[None], perturb, ALL_FREE, near.SHARP)
+    return objective, ascend(objective, TRUTH[None], perturb, ALL_FREE, FitRules().sharp)
 
 
 def matched(objective: MatchedObjective, T: Floats) -> Matches:
@@ -105,7 +105,7 @@ def test_how_far_narrower_blurs_move_the_pose_is_known_before(
         _, variances, blurs, _ = errors_seen(matches, 6, known, errors)
         expected = near._moved(matches, ALL_FREE, blurs, variances)
         narrow = matched_objective(views, body, (blurs * sigmas).tolist())
-        end = ascend(narrow, ascent.states, perturb, ALL_FREE, near.SHARP).states[0]
+        end = ascend(narrow, ascent.states, perturb, ALL_FREE, FitRules().sharp).states[0]
         unit = float(np.sqrt(variances.mean())) * 1.5 / NOISE_PX
         moved = apart(views, body, end, ascent.states[0]) / unit
         # two steps of iterated least squares, of which there are some more

@@ -304,6 +304,10 @@ def _number(value: Any) -> str:
     if isinstance(value, tuple):
         items = ", ".join(_number(each).strip("`") for each in value)
         return f"`({items}{',' * (len(value) == 1)})`"
+    if dataclasses.is_dataclass(value):
+        parts = [(field, getattr(value, field.name)) for field in dataclasses.fields(value)]
+        changed = [(field.name, _number(at)) for field, at in parts if at != field.default]
+        return ", ".join(f"`{name}` {at}" for name, at in changed)
     return f"`{value:.4g}`" if isinstance(value, float) else f"`{value}`"
 
 

@@ -38,7 +38,7 @@ _NEAR = (
     Mutant(
         "fit-always-at-the-finest-blur",
         "fit/near.py",
-        "here.value[0] >= least * len(objective.views)",
+        "here.value[0] >= rules.near * len(objective.views)",
         "here.value[0] >= 0.0",
         "a start some widths off is never corrected",
     ),

@@ -38,18 +38,12 @@ from mixpose.objective import (
     project_body,
     together,
 )
-from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
 from mixpose.optimise import Ascent, NewtonOptions, ascend
 from mixpose.records import Floats, Mask
 from mixpose.rigid import TWIST_NAMES, perturb, twist_between
 from mixpose.sensors import Motion
 
 SearchName: TypeAlias = Literal["thorough", "live"]
-
-# what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end, and a hundredth of it is left
-SHARP = NewtonOptions(40, 1e-6, remaining=5e-7, value_error=value_error(STEPS_PER_SIGMA))
-COARSE = replace(SHARP, iterations=10, tolerance=1e-3)
-FINE = NewtonOptions(40, 1e-8, value_error=value_error(FINE_STEPS))
 
 
 @dataclass(frozen=True)
@@ -98,12 +92,12 @@ class Fit:
         blurs = tuple([dict(zip(names, level)) for level in levels])
         return cls(ascent.states[0], blurs, **rest)
 
-    def begins_at(self, other: Ascent) -> bool:
+    def begins_at(self, other: Ascent, tolerance: float) -> bool:
         """Whether another ascent ended where this fit's first did, so that it leads to the same."""
         assert self.first is not None
         away = twist_between(self.first.states[0], other.states[0])
         # what two ascents leave to be gained at one place: 0.003 σ_ε
-        same = 10 * SHARP.tolerance * abs(float(other.values[0]))
+        same = 10 * tolerance * abs(float(other.values[0]))
         return float(away @ other.last.curvature[0] @ away) < same
 
 
@@ -159,25 +153,25 @@ def fit_near(
         for level in blur_schedule(views, body, T_start, spread, rules)[:-1]:
             levels.append(level)
             at = build_objective(options.objective, views, body, samples, level, states[0])
-            states = ascend(at, states, perturb, free, COARSE).states
+            states = ascend(at, states, perturb, free, rules.coarse).states
         end = last or build_objective(options.objective, views, body, samples, sigmas, states[0])
         return ascend(end, states, perturb, free, newton)
 
     if options.objective != "matched":
-        return Fit.of(descended(None, FINE), views, [*levels, sigmas])
+        return Fit.of(descended(None, rules.fine), views, [*levels, sigmas])
     finest = finest or matched_objective(views, body, sigmas)
     if all(view.observation.cell is not None for view in views):  # whose noise is that of cells
-        fit = Fit.of(descended(finest, FINE), views, [*levels, sigmas])
+        fit = Fit.of(descended(finest, rules.fine), views, [*levels, sigmas])
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
         return replace(fit, T_world_object=T, freed=is_freed)
     level = [blur * sigma for sigma in sigmas]
     first = finest if blur == 1 else matched_objective(views, body, level)
-    least = rules.near if blur == 1 else -np.inf
-    ascent = begun or _at_once(first, T_start, free, least) or descended(first, SHARP)
+    ascent = begun or _at_once(first, T_start, free, rules, blur != 1)
+    ascent = ascent or descended(first, rules.sharp)
     known = climbed if climbed is not None and blur == 1 else []
     for fit in known:
-        if fit.begins_at(ascent):
+        if fit.begins_at(ascent, rules.sharp.tolerance):
             return fit
     rest = finest, free, noise, beside, errors, association, rules
     known.append(_to_the_noise(ascent, [*levels, level], blur, *rest))
@@ -196,7 +190,7 @@ def fit_together(
     """
     joint, states = together(objectives), np.array(starts)
     here = joint.linearise(states)
-    ends = ascend(joint, states, perturb, free, replace(SHARP, together=True), here)
+    ends = ascend(joint, states, perturb, free, replace(rules.sharp, together=True), here)
     is_near = here.value >= rules.near * np.array([len(one.views) for one in objectives])
     return [
         (objective, ends.of(slice(k, k + 1))) if is_near[k] else None
@@ -205,12 +199,12 @@ def fit_together(
 
 
 def _at_once(
-    objective: MatchedObjective, T_start: Floats, free: Mask, least: float
+    objective: MatchedObjective, T_start: Floats, free: Mask, rules: FitRules, anywhere: bool
 ) -> Ascent | None:
-    """The ascent from a start whose value per sensor is not less than the least."""
+    """The ascent from a start that is near, by its value per sensor, or anywhere."""
     here = objective.linearise(T_start[None])
-    is_near = here.value[0] >= least * len(objective.views)
-    return ascend(objective, T_start[None], perturb, free, SHARP, here) if is_near else None
+    is_near = anywhere or here.value[0] >= rules.near * len(objective.views)
+    return ascend(objective, T_start[None], perturb, free, rules.sharp, here) if is_near else None
 
 
 def _to_the_noise(
@@ -261,7 +255,7 @@ def _to_the_noise(
             places = matches.places[k, matches.weights[k] > 0, : matches.dimensions[k]]
             near.append(replace(view, observation=view.observation.around(places, errors.reach)))
         objective = matched_objective(near, finest.projection.body, levels[-1])
-        ascent = ascend(objective, ascent.states, perturb, free, SHARP)
+        ascent = ascend(objective, ascent.states, perturb, free, rules.sharp)
 
 
 def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:

@@ -37,10 +37,6 @@ from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
 
-# gains of log-likelihood that do not matter, 0.001 standard deviations; and shares of the energy:
-# a part in a thousand of heights, which drawing may be off by
-NATS = 1e-6
-
 
 @dataclass(frozen=True)
 class FitRules:
@@ -68,6 +64,18 @@ class FitRules:
     )
     unlike: float = constant(
         0.3, "spread of the features' brightness, relative: markers of one kind under one lamp"
+    )
+    nats: float = constant(1e-6, "log-likelihood of 1e-3 σ; of the energy: heights are 1e-3 off")
+    sharp: NewtonOptions = constant(
+        NewtonOptions(40, 1e-6, remaining=5e-7, value_error=value_error(STEPS_PER_SIGMA)),
+        "what gains 5e-7 is 1e-3 σ long; gains shrink faster near the end: a hundredth is left",
+    )
+    coarse: NewtonOptions = constant(
+        NewtonOptions(10, 1e-3, remaining=5e-7, value_error=value_error(STEPS_PER_SIGMA)),
+        "at blurs before σ_ε: the next goes on",
+    )
+    fine: NewtonOptions = constant(
+        NewtonOptions(40, 1e-8, value_error=value_error(FINE_STEPS)), "of grey values and integrals"
     )
 
 
@@ -104,16 +112,20 @@ def cell_variances(energies: Floats, shares: Floats, cells: Indices) -> Floats:
 
 
 def most_probable(
-    objective: MatchedObjective, T_world_object: Floats, prior: NormalPrior, misfit: float = 1.0
+    objective: MatchedObjective,
+    T_world_object: Floats,
+    prior: NormalPrior,
+    rules: FitRules = FitRules(),
+    misfit: float = 1.0,
 ) -> Floats:
     """The pose (4, 4) that maximises likelihood and prior, from a maximum of the objective."""
     T, likelihood = T_world_object, likelihood_at(objective, T_world_object, misfit)
     if not likelihood.is_alone:
         starts = np.concatenate([T[None], prior.points()])
         # roughly: it is asked which of several maxima is highest
-        T = _climbed(likelihood.objective, prior, starts, 1e4 * NATS)
+        T = _climbed(likelihood.objective, prior, starts, 1e4 * rules.nats)
     for _ in range(2):  # the second time with the noise that the maximum leaves
-        T = _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], NATS)
+        T = _climbed(likelihood_at(objective, T, misfit).objective, prior, T[None], rules.nats)
     return T
 
 
@@ -127,7 +139,7 @@ def believed(
     not fit, the fit to freed features; and whether it is that.
     """
     projection, body = objective.projection, objective.projection.body
-    T = most_probable(objective, T_world_object, prior)
+    T = most_probable(objective, T_world_object, prior, rules)
     T_unlike, noises = with_amplitudes(objective, T, prior, rules)
     if not projection.project(T[None]).seen.all() or len(body.nodes.points) != len(body):
         return T_unlike, False
@@ -144,7 +156,7 @@ def believed(
     if T_freed is not None:
         return T_freed, True
     # what is left at features is no noise of cells: in a body that does not fit it is as large
-    T = most_probable(objective, T, prior, ratio)
+    T = most_probable(objective, T, prior, rules, ratio)
     return with_amplitudes(objective, T, prior, rules, ratio)[0], False
 
 
@@ -158,11 +170,11 @@ def with_amplitudes(
     """The most probable pose near that of equally bright features, and the noise (L,) of cells."""
     T, equal = T_world_object, likelihood_at(objective, T_world_object).noise
     noise, cells = equal, np.array([view.observation.cells for view in objective.views])
-    smallest = NATS * objective.energies[:, 0] / cells
+    smallest = rules.nats * objective.energies[:, 0] / cells
     for _ in range(3):  # noise and pose by turns: the noise holds to a part in a hundred
         unlike = AmplitudesObjective(objective, noise, rules.unlike)
         noise = np.maximum(unlike.unexplained(T) / cells, smallest)
-        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], NATS)
+        T = _climbed(replace(unlike, noise=misfit * noise), prior, T[None], rules.nats)
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
