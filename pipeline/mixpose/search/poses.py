@@ -281,7 +281,8 @@ def _centres(problem: SearchProblem) -> Floats:
     options = NewtonOptions(12, damping=1e-6, unchecked=True)
     places = ascend(middles, _starts(problem), moved, problem.free[:3], options).states
     off = np.sqrt(-2 * middles.linearise(places).value)
-    near = places[np.argsort(off, kind="stable")[: np.count_nonzero(off < off.min() + radius)]]
+    count = np.count_nonzero(off < off.min(initial=np.inf) + radius)
+    near = places[np.argsort(off, kind="stable")[:count]]
     distinct = unlike(problem.body, from_parts(np.eye(3), near), 0.2)
     return np.asarray(near[distinct[: problem.budget.sample // 2]])
 
