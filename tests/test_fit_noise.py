@@ -93,6 +93,22 @@ def test_an_outlier_among_many_detections_is_left_where_it_moves_nothing(
     assert 0 < apart(views, MANY, T, narrow) < FitRules().moved * 1.4
 
 
+@pytest.mark.parametrize("away", [1.8, 2.4])
+def test_a_false_spot_beside_a_feature_does_not_draw_the_pose(
+    pinhole_cameras: list[PinholeCamera], away: float
+) -> None:
+    clean = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=2)
+    seen = clean[0].observation
+    assert isinstance(seen.pattern, PointPattern)
+    spot = seen.pattern.points[3] + [away * seen.sigma, 0.0]
+    spots = np.vstack([seen.pattern.points, spot])
+    views = [view_of("0", clean[0].sensor, spots), clean[1]]
+    drawn = apart(views, EIGHT, fitted(views, EIGHT, NEVER), fitted(clean, EIGHT, NEVER))
+    left = apart(views, EIGHT, fitted(views, EIGHT), fitted(clean, EIGHT, NEVER))
+    assert left < 0.8
+    assert drawn > 1.5
+
+
 def test_how_far_narrower_blurs_move_the_pose_is_known_before(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

@@ -43,6 +43,13 @@ _NEAR = (
         "a start some widths off is never corrected",
     ),
     Mutant(
+        "fit-false-spots-draw-unnoticed",
+        "fit/near.py",
+        "< reach[k] ** 2).any()",
+        "< 0).any()",
+        "the pose is drawn to a false spot beside a feature that is met",
+    ),
+    Mutant(
         "fit-prior-around-the-answer",
         "fit/near.py",
         "NormalPrior(T_start, uncertainty, free)",

@@ -39,7 +39,7 @@ from mixpose.objective import (
     together,
 )
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats, Mask, PointPattern
 from mixpose.rigid import TWIST_NAMES, perturb, twist_between
 from mixpose.sensors import Motion
 
@@ -236,6 +236,7 @@ def _to_the_noise(
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
+        is_noise = is_noise and not _are_drawn(finest.views, matches, errors.met * blurs * sigmas)
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
         if best is None and not is_end:
             # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
@@ -256,6 +257,17 @@ def _to_the_noise(
             near.append(replace(view, observation=view.observation.around(places, errors.reach)))
         objective = matched_objective(near, finest.projection.body, levels[-1])
         ascent = ascend(objective, ascent.states, perturb, free, rules.sharp)
+
+
+def _are_drawn(views: Sequence[View], matches: Matches, reach: Floats) -> bool:
+    """Whether features have detections of none within a reach (L,), in sensor units."""
+    for k, view in enumerate(views):
+        if isinstance(pattern := view.observation.pattern, PointPattern):
+            others = np.delete(pattern.points, matches.detections[k][matches.shares[k] > 0], axis=0)
+            places = matches.places[k, matches.weights[k] > 0, None, : matches.dimensions[k]]
+            if (np.vecdot(away := others - places, away) < reach[k] ** 2).any():
+                return True
+    return False
 
 
 def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:
