@@ -88,7 +88,8 @@ def test_rounded_matrices_are_mended_and_mirrors_are_refused() -> None:
 
 def test_one_pose_has_the_twist_that_it_has_among_many() -> None:
     # single poses take a way of their own, for speed; angles stay below a half-turn
-    twists = np.random.default_rng(5).uniform(-1, 1, (25, 6)) * [10, 10, 10, 1, 1, 1]
+    twists = np.random.default_rng(5).uniform(-1, 1, (25, 6)) * [10, 10, 10, 1.7, 1.7, 1.7]
+    assert (np.linalg.norm(twists[:, 3:], axis=1) > np.pi / 2).any()  # another way again
     moved = perturb(POSES[:25], twists)
     for T, twist, T_moved in zip(POSES, twists, moved, strict=False):
         np.testing.assert_allclose(perturb(T, twist), T_moved, rtol=0, atol=rounding(T_moved))
