@@ -11,6 +11,7 @@ from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.objective import View, project_body
 from mixpose.objective.matched import STEPS_PER_SIGMA
+from mixpose.objective.paper import SampledTerm
 from mixpose.records import PointPattern
 from mixpose.rigid import from_rotation_vector, perturb, transform
 from mixpose.sensors import Sensor
@@ -28,6 +29,15 @@ EIGHT = Body(
 def view_of(name: str, sensor: Sensor, points: Floats, sigma: float = 1.5) -> View:
     """Detections (M, m) of equal weight."""
     return View(name, sensor, Observation(PointPattern(points, np.ones(len(points))), sigma))
+
+
+def drawn_everywhere(views: Sequence[View], sigma: float) -> list[SampledTerm]:
+    """Densities wherever sensors see, with features of a standard deviation."""
+    boxes = [(view.sensor.lower, view.sensor.upper) for view in views]
+    return [
+        SampledTerm(view.sensor, view.observation.density(sigma, box, gradient=True))
+        for view, box in zip(views, boxes, strict=True)
+    ]
 
 
 def detect(

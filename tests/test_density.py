@@ -58,7 +58,7 @@ def test_every_density_integrates_to_one(pattern: Pattern, sigma: float) -> None
     g = observation.density(sigma, (lower - 6 * sigma, upper + 6 * sigma))
     assert g.values.dtype == np.float32
     # the window ends at 5 sigma: the tails hold 1e-6, float32 sums another 1e-6
-    integral = g.values.sum(dtype=np.float64) * g.window.step**g.dimension
+    integral = g.values.sum(dtype=np.float64) * g.window.step ** len(g.window.origin)
     assert integral == pytest.approx(1.0, abs=2e-5)
 
 
@@ -109,7 +109,7 @@ def test_densities_have_only_channels_that_are_looked_up_exactly(pattern: Patter
     density = observation.density(2.0, observation.extent, gradient=True)
     assert density.values.shape[2] == 3
     y = np.array([observation.extent[0]])
-    assert density.sample(y).shape == (1, 1 + density.dimension)
+    assert density.sample(y).shape == (1, 1 + len(density.window.origin))
     assert matched_atlas([observation], [2.0], 4.0).values.shape[2] == 3
 
 
@@ -135,7 +135,7 @@ def test_gradient_channels_are_the_derivative_of_the_density(pattern: Pattern) -
     lower, upper = observation.extent
     g = observation.density(sigma, (lower - 5 * sigma, upper + 5 * sigma), gradient=True)
     h = g.window.step
-    if g.dimension == 1:
+    if len(g.window.origin) == 1:
         numerical = (g.values[0, 2:, 0] - g.values[0, :-2, 0]) / (2 * h)
         analytic = g.values[0, 1:-1, 1]
     else:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from detections import drawn_everywhere
 from numpy.typing import NDArray
 
 from mixpose.body import Body, Gravity, PointFeature, SegmentFeature
@@ -21,7 +22,6 @@ from mixpose.objective import (
     build_objective,
     matched_objective,
     pose_jacobian,
-    sampled_terms,
 )
 from mixpose.objective.matched import FINE_STEPS
 from mixpose.objective.paper import SampledTerm
@@ -269,8 +269,7 @@ def test_far_away_on_one_bright_marker_the_paper_collapses_and_the_matched_does_
     ray = np.linalg.solve(camera.camera_matrix, np.array([*pattern.points[2], 1.0]))
     far = from_rotation_vector([0.3, 0.2, 0.1], ray * 50_000.0)
     both = np.stack([truth, far])
-    terms = sampled_terms(views, body.sample(10), [5.0])
-    paper = PaperObjective(terms, body.sample(10)).value(both)
+    paper = PaperObjective(drawn_everywhere(views, 5.0), body.sample(10)).value(both)
     matched = matched_objective(views, body, [5.0]).value(both)
     assert paper[1] > 1.5 * paper[0]
     assert matched[0] > 1.5 * matched[1]
@@ -302,8 +301,8 @@ def test_a_segment_is_matched_along_its_whole_length() -> None:
 
 
 def paper_objective(views: list[View], body: Body, samples: Floats, sigma: float) -> PaperObjective:
-    terms = sampled_terms(views, samples, [sigma] * len(views))
-    return PaperObjective(terms, samples, body.world_offsets(samples.shape[1]))
+    offsets = body.world_offsets(samples.shape[1])
+    return PaperObjective(drawn_everywhere(views, sigma), samples, offsets)
 
 
 def test_wider_features_keep_the_maximum_of_a_deformed_object_where_exact_ones_split_it(

@@ -73,9 +73,7 @@ def test_all_are_on_as_a_rule_and_any_is_an_argument() -> None:
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH)
     assert tracker.proposers == PROPOSERS
     assert tracker.refinements == REFINEMENTS
-    none = Tracker(
-        EIGHT, tracker.options, tracker.samples, tracker.start_uncertainty, TRUTH, proposers=()
-    )
+    none = replace(tracker, proposers=())
     assert none.proposers == ()
 
 

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions, Fit
-from mixpose.judgement import DetectionModel, JudgementRules, NoiseModel
+from mixpose.judgement import JudgementRules, NoiseModel
 from mixpose.objective import View
 from mixpose.records import Estimate, PointPattern
 from mixpose.rigid import (
@@ -229,8 +229,9 @@ def test_precise_ranges_need_no_help_of_earlier_frames() -> None:
 
 def test_second_derivatives_are_differences_of_gradients_at_every_pose_of_a_batch() -> None:
     T = from_rotation_vector([0.1, 0.2, 0.3], [0.3, -0.2, 0.05])
-    views, free = views_at(T, np.random.default_rng(1)), np.ones(6, dtype=np.bool_)
-    term = AssociationTerm(views, TROLLEY, free, 1.0, DetectionModel())
+    views = views_at(T, np.random.default_rng(1))
+    tracker = Tracker.create(TROLLEY, EstimatorOptions())
+    term = AssociationTerm(tracker.data(tracker.begin(), 0, None, views), 1.0)
     poses = perturb(T, 0.02 * np.random.default_rng(2).standard_normal((3, 6)))
     batch = term.linearise(poses)
     assert batch.hessian is not None

@@ -13,7 +13,7 @@ from detections import EIGHT, TRUTH, detect, view_of
 from matches import Seen, matches_of, scored
 from numpy.typing import NDArray
 
-from mixpose.body import Body, PointFeature
+from mixpose.body import ASIDE, Body, PointFeature
 from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import (
     AcceptanceRules,
@@ -31,7 +31,7 @@ from mixpose.rigid import (
 )
 from mixpose.search import SearchBudget, SearchReport, SearchResult, SearchState
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import ASIDE, Rules, Track, Tracker
+from mixpose.tracking import Rules, Track, Tracker
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import (

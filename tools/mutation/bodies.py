@@ -149,11 +149,11 @@ _OPTIMISE = (
         "more evaluations than Newton's method needs",
     ),
     Mutant(
-        "optimise-always-converged",
+        "optimise-every-last-step-taken",
         "optimise/ascent.py",
-        "self._converged = [False] * count",
-        "self._converged = [True] * count",
-        "an ascent that ran out of iterations counts as done",
+        "self._is_taken = [options.unchecked] * count",
+        "self._is_taken = [True] * count",
+        "an ascent that ran out of iterations takes a step that nobody looked at",
     ),
     Mutant(
         "optimise-flat-directions-are-singular",
@@ -165,8 +165,8 @@ _OPTIMISE = (
     Mutant(
         "optimise-last-step-not-taken",
         "optimise/ascent.py",
-        "self._is_taken[k] = self._converged[k] = True",
-        "self._converged[k] = True",
+        "self._is_taken[k] = True",
+        "self._is_taken[k] = False",
         "the state is a step short of the maximum",
     ),
 )

@@ -15,8 +15,8 @@ _ATLAS = (
     Mutant(
         "density-drawn-too-narrowly",
         "density/atlas.py",
-        "reach = DRAWING.reach * n",
-        "reach = 2.5 * n",
+        "reach=DRAWING.reach * n",
+        "reach=2.5 * n",
         "features four widths apart draw each other",
     ),
     Mutant(

@@ -113,7 +113,7 @@ _PROBABLE = (
     Mutant(
         "objective-prior-points-too-close",
         "objective/terms.py",
-        "steps = np.sqrt(count) * np.diag(",
+        "steps = np.sqrt(self.free.sum()) * np.diag(",
         "steps = np.diag(",
         "other maxima are sought within less than the prior allows",
         (_PRIOR,),

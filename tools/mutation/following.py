@@ -116,8 +116,8 @@ _PREDICTION = (
     Mutant(
         "tracking-goes-on-from-the-farthest-branch",
         "tracking/track.py",
-        "min(self.branches, key=away, default=None)",
-        "max(self.branches, key=away, default=None)",
+        "np.linalg.norm(away, axis=1).argmin()",
+        "np.linalg.norm(away, axis=1).argmax()",
         "of two poses each takes the velocity of the other",
         (_TRACK,),
     ),
@@ -151,8 +151,8 @@ _MOTION = (
     Mutant(
         "tracking-clocks-with-nothing-in-common-believed",
         "tracking/track.py",
-        "if all(abs(view.delay) <= longest for view in applied):",
-        "if all(abs(view.delay) <= 1e99 for view in applied):",
+        "all(abs(view.delay) <= longest for view in applied)",
+        "all(abs(view.delay) <= 1e99 for view in applied)",
         "sensors of clocks that began at different times are moved away",
         (_DELAYS,),
     ),
@@ -202,8 +202,8 @@ _GATING = (
     Mutant(
         "tracking-fewer-detections-go-unnoticed",
         "tracking/scene.py",
-        "points is not None and len(points) < before[name][0]",
-        "points is not None and len(points) < 0",
+        "is not None and len(points) < before[view.name][0]",
+        "is not None and len(points) < 0",
         "a window that cuts features off is not noticed",
         (_WINDOWS,),
     ),

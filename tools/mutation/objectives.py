@@ -81,8 +81,8 @@ _KERNEL = (
     Mutant(
         "objective-curvature-without-variance",
         "objective/matched.py",
-        "drawn = (strength / variances)[..., None] * C",
-        "drawn = strength[..., None] * C",
+        "drawn = (strength / variances)[..., None] * (",
+        "drawn = strength[..., None] * (",
         "steps depend on the unit of lengths",
     ),
 )

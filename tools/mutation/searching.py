@@ -12,8 +12,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-other-tilt-never-tried",
         "tracking/proposers.py",
-        "        for T in _tilted(frame, ranked[0]):",
-        "        for T in []:",
+        "yield from _tilted(frame, ranked[0])",
+        "yield from []",
         "a flat body followed at the wrong tilt stays there",
         (_PROPOSERS,),
     ),
@@ -148,8 +148,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-one-branch-followed",
         "tracking/proposers.py",
-        "[*frame.predictions, *beside]",
-        "[*frame.predictions[:1], *beside]",
+        "(*frame.predictions, frame.beside)",
+        "(*frame.predictions[:1], frame.beside)",
         "of two possible poses one is forgotten",
         (_STARTS,),
     ),

@@ -12,13 +12,13 @@ from statistics import median
 
 import numpy as np
 
+from mixpose.body import ASIDE
 from mixpose.checking import CAUSES, explanation
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
-from mixpose.tracking import ASIDE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either

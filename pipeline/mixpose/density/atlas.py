@@ -60,14 +60,14 @@ class Atlas:
         self.per_unit = scale.per_unit
         # (rows, columns, 3) tiles that were looked up last, in units of `_Scale`
         self.values: Singles = np.zeros((0, 0, 3), dtype=np.float32)
-        self._grids: dict[int, tuple[GridPattern, float, float]] = {}
-        self._corners: dict[int, Floats] = {}  # (2, 2) of grids, in cells
+        # with the blur that is left, the mass, and the corners (2, 2) in cells
+        self._grids: dict[int, tuple[GridPattern, float, float, Floats]] = {}
         q, share, counts = [np.zeros((0, 2))], [np.zeros(0)], [0] * len(patterns)
         for k, pattern in enumerate(patterns):
             if isinstance(pattern, GridPattern):
                 small, left = reduced(pattern, scale.widths[k])
-                self._grids[k] = small, left, mass(small)
-                self._corners[k] = np.array(small.extent) * scale.per_unit[k, 0, 0]
+                corners = np.array(small.extent) * scale.per_unit[k, 0, 0]
+                self._grids[k] = small, left, mass(small), corners
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
@@ -103,8 +103,9 @@ class Atlas:
     def _to_own_tiles(self, index: Floats) -> None:
         """Turn places in cells into those in tiles around them, in place."""
         around, shifts, values = self._own
-        is_left = around.shape != index.shape
-        if is_left or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
+        if around.shape != index.shape or (
+            np.abs(index - around).max(initial=0.0) > 0.5 * self.tile
+        ):
             around = np.rint(index)
             middles = around.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(middles) // len(index))
@@ -118,15 +119,15 @@ class Atlas:
     @cached_property
     def pages(self) -> Pages:
         """For many places, on planes that hold all that is seen."""
-        corners, L = list(self._corners.values()), len(self.per_unit)
-        return Pages(self._q, corners, self.tile, self._scale.reach, L)
+        corners = [grid[-1] for grid in self._grids.values()]
+        return Pages(self._q, corners, self.tile, self._scale.reach, len(self.per_unit))
 
     def _near(self, sensors: Indices, middles: Floats) -> tuple[Indices, Indices]:
         """Tiles (K,), in order, and detections (K,) that reach them, of tiles of sensors (P,)."""
         if len(sensors) * len(self._q) <= DRAWING.few_pairs:
             inside = np.abs(self._q - middles[:, None]) < self._reach
-            near = inside[..., 0] & inside[..., 1] & (self._sensor == sensors[:, None])
-            of, which = np.nonzero(near)
+            of_sensor = self._sensor == sensors[:, None]
+            of, which = np.nonzero(inside[..., 0] & inside[..., 1] & of_sensor)
             return of, which
         apart = 2 * self._reach  # along a third coordinate: no sensor reaches another
         tiles = cKDTree(np.column_stack([middles, apart * sensors]))
@@ -185,22 +186,18 @@ class Atlas:
     def _drawn_pages(self, sensors: Indices, middles: Floats) -> tuple[Indices, Singles]:
         """Those of pages around places (P, 2) in cells on which there is something, and they."""
         of, which = self._near(sensors, middles)
-        is_filled = np.zeros(len(sensors), dtype=np.bool_)
-        is_filled[of] = True
-        for k, (lower, upper) in self._corners.items():
+        is_filled = np.isin(np.arange(len(sensors)), of)
+        for k, (*_, (lower, upper)) in self._grids.items():
             inside = (middles > lower - self._reach) & (middles < upper + self._reach)
             is_filled |= (sensors == k) & inside.all(axis=1)
         filled = np.flatnonzero(is_filled)
         of = np.searchsorted(filled, of)
-        room, numbers = (
-            self._drawn(sensors[filled], middles[filled], of, which),
-            np.arange(len(filled)),
-        )
-        return filled, room[numbers % _TOGETHER, :, numbers // _TOGETHER]
+        column, row = np.divmod(np.arange(len(filled)), _TOGETHER)
+        return filled, self._drawn(sensors[filled], middles[filled], of, which)[row, :, column]
 
     def _of_grid(self, sensor: int, middle: Floats) -> Singles:
         """A tile (side, 3 side) of grey values or a profile."""
-        pattern, sigma, total = self._grids[sensor]
+        pattern, sigma, total, _ = self._grids[sensor]
         side = self._side
         cells = middle + (np.arange(side) - 0.5 * (side - 1))[:, None]
         u, v = (cells / self.per_unit[sensor, 0, 0, 0]).T
@@ -229,11 +226,15 @@ class _Scale(NamedTuple):
         widths = [sigma * drawn / n for sigma in sigmas]
         across = [(n / sigma, (m - 1) * n / sigma) for sigma, m in zip(sigmas, dimensions)]
         tops = [(math.sqrt(2 * np.pi) * w) ** -m for w, m in zip(widths, dimensions)]
-        units = np.array([(top, top / w, top / w) for top, w in zip(tops, widths)])
-        is_flat = np.array(dimensions) == 1 if 1 in dimensions else None
-        per_unit = np.array(across)[:, None, None]
-        reach = DRAWING.reach * n + DRAWING.rim - 1
-        return cls(per_unit, widths, drawn, reach, units[:, None, None], is_flat)
+        units = [(top, top / w, top / w) for top, w in zip(tops, widths)]
+        return cls(
+            per_unit=np.array(across)[:, None, None],
+            widths=widths,
+            sigma=drawn,
+            reach=DRAWING.reach * n + DRAWING.rim - 1,
+            units=np.array(units)[:, None, None],
+            is_flat=np.array(dimensions) == 1 if 1 in dimensions else None,
+        )
 
 
 class Pages:

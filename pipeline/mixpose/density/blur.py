@@ -161,5 +161,4 @@ def reduced(pattern: GridPattern, sigma: float) -> tuple[GridPattern, float]:
 
 def odd_factor(ratio: float) -> int:
     """Largest odd whole number up to a ratio, at least 1: odd boxes have a central pixel."""
-    whole = max(int(ratio + 1e-9), 1)
-    return whole if whole % 2 else whole - 1
+    return max(int(ratio + 1e-9) - 1, 0) // 2 * 2 + 1

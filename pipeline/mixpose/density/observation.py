@@ -51,17 +51,12 @@ class Density:
     window: Window  # index = (y - origin) / step
     sigma: float  # standard deviation, in sensor units, that one exact feature has in it
 
-    @property
-    def dimension(self) -> int:
-        """m, the number of sensor coordinates."""
-        return len(self.window.origin)
-
     def sample(self, y: Floats) -> Singles:
         """The channels (..., 1 + m) at sensor coordinates (..., m), bilinear; 0 outside and at NaN.
 
         Without the last axis for a single channel.
         """
-        m = self.dimension
+        m = len(self.window.origin)
         index = (y.reshape(-1, m) - self.window.origin) / self.window.step
         index = np.clip(np.nan_to_num(index, copy=False, nan=FAR), FAR, -FAR)
         u = index[None, :, 0].astype(np.float32)
@@ -77,10 +72,8 @@ def render(pattern: Pattern, sigma: float, window: Window, *, gradient: bool = F
         pattern, left = reduced(pattern, sigma)
     u, v = window.axis(0), window.axis(pattern.dimension - 1)
     layers = blurred(pattern, left, u, v, total, gradient=gradient)
-    if not gradient:
-        return Density(layers[0], window, sigma)
-    # three channels: of two cv2.remap of OpenCV 5 knows places to 1/32 of a cell only
-    layers += [np.zeros(window.shape, dtype=np.float32)] * (3 - len(layers))
+    if gradient:  # three channels: of two cv2.remap of OpenCV 5 knows places to 1/32 of a cell only
+        layers += [np.zeros(window.shape, dtype=np.float32)] * (3 - len(layers))
     return Density(np.asarray(cv2.merge(layers), dtype=np.float32), window, sigma)
 
 
@@ -130,8 +123,9 @@ class Observation:
 
     @property
     def _amounts(self) -> Floats | Singles:
-        pattern = self.pattern
-        return pattern.weights if isinstance(pattern, PointPattern) else pattern.values
+        return (
+            self.pattern.values if isinstance(self.pattern, GridPattern) else self.pattern.weights
+        )
 
     @cached_property
     def is_empty(self) -> bool:
@@ -189,8 +183,7 @@ class Observation:
         if isinstance(self.pattern, PointPattern):
             overlap = self_overlap(self.pattern.points, self.pattern.weights, 2 * sigma**2)
             return overlap / self.weight**2
-        lower, upper = self.extent
-        g = self.density(sigma, (lower - DRAWING.cut * sigma, upper + DRAWING.cut * sigma))
+        g = self.density(sigma, (np.array(-np.inf), np.array(np.inf)))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)
 

@@ -39,7 +39,7 @@ from mixpose.objective import (
     together,
 )
 from mixpose.optimise import Ascent, NewtonOptions, ascend
-from mixpose.records import Floats, Mask, PointPattern
+from mixpose.records import Floats, Mask
 from mixpose.rigid import TWIST_NAMES, perturb, twist_between
 from mixpose.sensors import Motion
 
@@ -250,23 +250,30 @@ def _to_the_noise(
         if is_end:
             return best
         blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]
-        # of what was detected around the features: a fine grid holds no more
-        near = []
-        for k, view in enumerate(finest.views):
-            places = matches.places[k, matches.weights[k] > 0, : matches.dimensions[k]]
-            near.append(replace(view, observation=view.observation.around(places, errors.reach)))
-        objective = matched_objective(near, finest.projection.body, levels[-1])
+        views = _around(finest.views, matches, errors.reach)
+        objective = matched_objective(views, finest.projection.body, levels[-1])
         ascent = ascend(objective, ascent.states, perturb, free, rules.sharp)
+
+
+def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:
+    """Views of what was detected around the features in view: a fine grid holds no more."""
+    near = zip(views, matches.places, matches.weights > 0, matches.dimensions, strict=True)
+    return [
+        replace(view, observation=view.observation.around(y[seen, :m], reach))
+        for view, y, seen, m in near
+    ]
 
 
 def _are_drawn(views: Sequence[View], matches: Matches, reach: Floats) -> bool:
     """Whether features have detections of none within a reach (L,), in sensor units."""
     for k, view in enumerate(views):
-        if isinstance(pattern := view.observation.pattern, PointPattern):
-            others = np.delete(pattern.points, matches.detections[k][matches.shares[k] > 0], axis=0)
-            places = matches.places[k, matches.weights[k] > 0, None, : matches.dimensions[k]]
-            if (np.vecdot(away := others - places, away) < reach[k] ** 2).any():
-                return True
+        points, met = view.observation.points, matches.shares[k] > 0
+        if points is None or len(points) <= np.count_nonzero(met):
+            continue
+        others = np.delete(points, matches.detections[k][met], axis=0)
+        away = others - matches.places[k, matches.weights[k] > 0, None, : matches.dimensions[k]]
+        if (np.vecdot(away, away) < reach[k] ** 2).any():
+            return True
     return False
 
 

@@ -32,7 +32,7 @@ from mixpose.objective import (
     matched_objective,
 )
 from mixpose.objective.matched import FINE_STEPS, STEPS_PER_SIGMA, value_error
-from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend
+from mixpose.optimise import NewtonOptions, Quadratic, Sum, Term, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.sensors import Sensor
@@ -141,11 +141,9 @@ def believed(
     projection, body = objective.projection, objective.projection.body
     T = most_probable(objective, T_world_object, prior, rules)
     T_unlike, noises = with_amplitudes(objective, T, prior, rules)
-    if not projection.project(T[None]).seen.all() or len(body.nodes.points) != len(body):
-        return T_unlike, False
-    densities = _densities(objective, noises)
-    points = transform(T_unlike, body.nodes.points)
-    ratio = misfit(densities, points, int(prior.free.sum()), rules)
+    ratio, points = 1.0, transform(T_unlike, body.nodes.points)
+    if projection.project(T[None]).seen.all() and len(points) == len(body):
+        ratio = misfit(_densities(objective, noises), points, int(prior.free.sum()), rules)
     if ratio == 1:
         return T_unlike, False
     sigmas = [view.observation.sigma for view in objective.views]
@@ -178,8 +176,7 @@ def with_amplitudes(
     # twice the logarithm of the ratio of likelihoods, each with its own noise
     gain = float(cells @ np.log(np.maximum(equal, smallest) / noise))
     freedom = len(cells) * (len(objective.projection.body.nodes.points) - 1)
-    is_equal = gain < float(chdtri(freedom, 1 - rules.believed))
-    return (T_world_object, equal) if is_equal else (T, noise)
+    return (T, noise) if gain >= chdtri(freedom, 1 - rules.believed) else (T_world_object, equal)
 
 
 def _densities(objective: MatchedObjective, noises: Floats) -> list[SensorDensity]:
@@ -272,15 +269,15 @@ def own_peaks(sensor: SensorDensity, count: int) -> Floats | None:
 
 @dataclass(frozen=True)
 class LabelledPlaces:
-    """Minus the sum of squares between features and the places that are taken for theirs."""
+    """Minus half the sum of squares between features and the places that are taken for theirs."""
 
     projection: BodyProjection
     places: Floats  # (L, n, 2) in unknown order
-    scales: Floats  # (L,) 1 / √2 σ
+    scales: Floats  # (L,) 1 / σ
     labels: Indices  # (L, n), the place of each feature
 
     def offsets(self, poses: Floats) -> tuple[Floats, Floats]:
-        """Places less projections (H, 2Ln), in units of √2 σ, and Jacobians (H, 2Ln, 6)."""
+        """Places less projections (H, 2Ln), in units of σ, and Jacobians (H, 2Ln, 6)."""
         at, H = self.projection.project(poses), len(poses)
         taken = np.take_along_axis(self.places, self.labels[..., None], axis=1)
         scales = self.scales[:, None, None, None]
@@ -289,9 +286,7 @@ class LabelledPlaces:
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
-        offsets, J = self.offsets(poses)
-        gradient = 2 * (offsets[:, None] @ J)[:, 0]
-        return Quadratic(-(offsets**2).sum(axis=1), gradient, 2 * J.swapaxes(1, 2) @ J)
+        return squares_of(*self.offsets(poses))
 
     def nearest(self, T: Floats) -> Indices:
         """The labels with the least sum of squares at a pose (4, 4)."""
@@ -303,14 +298,13 @@ class LabelledPlaces:
 
     def fitted(self, T: Floats, free: Mask) -> tuple[float, Floats, LabelledPlaces]:
         """The sum of squares that is reached from a pose, where, and with which labels."""
-        term, tried = replace(self, labels=self.nearest(T)), set[bytes]()
-        while (key := term.labels.tobytes()) not in tried:
-            tried.add(key)
-            last = term
+        tried = set[bytes]()
+        while (labels := self.nearest(T)).tobytes() not in tried:
+            tried.add(labels.tobytes())
+            term = replace(self, labels=labels)
             end = ascend(term, T[None], perturb, free, NewtonOptions(60, tolerance=1e-13))
             T = end.states[0]
-            term = replace(self, labels=self.nearest(T))
-        return -float(end.values[0]), T, last
+        return -2 * float(end.values[0]), T, term
 
     def exchanged(self, T: Floats, free: Mask) -> list[float]:
         """Sums of squares, to first order, once two features of a sensor change their places."""
@@ -340,11 +334,14 @@ def fit_freed(
         if y is None:
             return None
         places[k, :, : y.shape[1]] = y
-    scales = 1 / np.sqrt([sensor.variance for sensor in densities])
+    scales = np.sqrt(2 / np.array([sensor.variance for sensor in densities]))
     term = LabelledPlaces(projection, places, scales, np.zeros(places.shape[:2], np.intp))
     ends = sorted((term.fitted(T, free) for T in starts), key=lambda end: end[0])
     least, T_best, best = ends[0]
-    rivals = {end.labels.tobytes(): squares for squares, _, end in ends}
-    del rivals[best.labels.tobytes()]
+    rivals = {
+        end.labels.tobytes(): squares
+        for squares, _, end in ends
+        if (end.labels != best.labels).any()
+    }
     others = np.array([*rivals.values(), *best.exchanged(T_best, free)])
     return T_best if ((others / least) ** (-0.5 * redundant)).sum() < 1 else None

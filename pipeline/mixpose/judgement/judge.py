@@ -146,8 +146,9 @@ def judge(
     noise: NoiseEstimate | None = None,
 ) -> ScoredPose:
     """Judge a pose, estimated in free directions (6,); arguments as in `Case`."""
-    case = objective, T_world_object, before, prior, matches, noise
-    return judge_together([case], free, rules, left_out)[0]
+    return judge_together(
+        [(objective, T_world_object, before, prior, matches, noise)], free, rules, left_out
+    )[0]
 
 
 def judge_together(

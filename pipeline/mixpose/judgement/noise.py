@@ -216,10 +216,13 @@ def _lasting(
     biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
     A, v = shown[:, :-1], shown[:, -1]
     if model.bias:
-        S = inverted(A + np.eye(len(v)) / model.bias**2)
-        mean, degrees = S @ v, float((S * A).sum())
-        if v @ mean > chdtri(max(degrees, 1.0), 1 - model.by_chance):
-            return biases, mean, S + np.outer(mean, mean)
+        known = A + np.eye(len(v)) / model.bias**2
+        mean = dposv(known, v)[1]
+        # seldom as large as chance makes it for the least degrees of freedom
+        if v @ mean > chdtri(1.0, 1 - model.by_chance):
+            S = inverted(known)
+            if v @ mean > chdtri(max(float((S * A).sum()), 1.0), 1 - model.by_chance):
+                return biases, mean, S + np.outer(mean, mean)
     return biases, np.zeros_like(v), np.zeros_like(A)
 
 

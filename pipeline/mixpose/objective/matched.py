@@ -70,7 +70,6 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     `variances`, `tops` and `scales` (L, 1) are v, N(0; 0, v), and the factor s of each sensor.
     """
     L, H, n = match.weights.shape
-    C = match.sampled[..., 0] * match.weights
     pull = (match.sampled[..., 1:] * match.weights[..., None]).reshape(L, H, 1, 2 * n)
     rest = (pull @ match.J.reshape(L, H, 2 * n, 6))[:, :, 0]
     product = np.vecdot(match.sampled[..., 0], match.weights)
@@ -78,7 +77,7 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     strength = 2 * scales * amplitude
     value = (scales * product * amplitude).sum(axis=0)
     gradient = (strength[..., None] * rest).sum(axis=0)
-    drawn = (strength / variances)[..., None] * C
+    drawn = (strength / variances)[..., None] * (match.sampled[..., 0] * match.weights)
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)
     if not len(match.pairs):
         return Quadratic(value, gradient, curvature)
@@ -152,8 +151,11 @@ class MatchedObjective:
         if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0]):
             return self.at_hand[1]
         at = self.projection.project(poses)
-        sampled = self.atlas.look_up(at.y)
-        return Match(*at[:5], sampled, *overlaps(at.y, at.weights, self.variances, self.tops))
+        return Match(
+            *at[:5],
+            self.atlas.look_up(at.y),
+            *overlaps(at.y, at.weights, self.variances, self.tops),
+        )
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
@@ -166,10 +168,10 @@ class MatchedObjective:
     def seen(self, objectives: Sequence[MatchedObjective], poses: Floats) -> list[MatchedObjective]:
         """The objectives that were put `together`, with what each sees at its pose (K, 4, 4)."""
         match = self.match(poses)
-        counts = [len(body.nodes.points) for body in self.projection.bodies]
-        parts = [match.of(slice(k, k + 1), n) for k, n in enumerate(counts)]
-        pairs = zip(objectives, poses, parts, strict=True)
-        return [replace(objective, at_hand=(T, part)) for objective, T, part in pairs]
+        return [
+            replace(one, at_hand=(T, match.of(slice(k, k + 1), len(body.nodes.points))))
+            for k, (one, T, body) in enumerate(zip(objectives, poses, self.projection.bodies))
+        ]
 
     def _blocks(self, poses: Floats) -> list[Floats]:
         n = len(self.projection.body.nodes.points)
@@ -225,6 +227,9 @@ def together(objectives: Sequence[MatchedObjective]) -> MatchedObjective:
     """The objectives of several bodies, of bare points, on the same densities and blurs."""
     bodies = [one.projection.body for one in objectives]
     projection = project_body(objectives[0].projection.sensors, *bodies)
-    energies = np.concatenate([one.energies for one in objectives], axis=1)
-    weights = np.concatenate([one.weights for one in objectives], axis=1)
-    return replace(objectives[0], projection=projection, energies=energies, weights=weights)
+    return replace(
+        objectives[0],
+        projection=projection,
+        energies=np.concatenate([one.energies for one in objectives], axis=1),
+        weights=np.concatenate([one.weights for one in objectives], axis=1),
+    )

@@ -48,9 +48,8 @@ class PaperObjective:
     ) -> None:
         self.terms = tuple(terms)
         self.points = samples.reshape(-1, 3)
-        self.offsets = np.zeros((1, 3))
-        if world_offsets is not None and world_offsets.any():
-            self.offsets = np.broadcast_to(world_offsets, samples.shape).reshape(-1, 3)
+        offsets = np.zeros(3) if world_offsets is None else world_offsets
+        self.offsets = np.broadcast_to(offsets, samples.shape).reshape(-1, 3)
 
     def value(self, T_world_object: Floats) -> Floats:
         """Values (...,) at poses (..., 4, 4)."""
@@ -68,18 +67,16 @@ class PaperObjective:
         """Value, gradient and mean-shift curvature at one pose (4, 4)."""
         points = transform(T_world_object, self.points) + self.offsets
         arms, count = self.points @ T_world_object[:3, :3].T, len(points)
-        looked_up, jacobians = [], []
-        for term in self.terms:
-            y, by_world, _ = term.sensor.linearise(points)
-            looked_up.append(term.density.sample(y).astype(np.float64))
-            jacobians.append(pose_jacobian(by_world, arms))
-        parts = self._parts([g[None, :, 0] for g in looked_up])
+        at = [(term.density, *term.sensor.linearise(points)) for term in self.terms]
+        drawn = [density.sample(y).astype(np.float64) for density, y, _, _ in at]
+        parts = self._parts([g[None, :, 0] for g in drawn])
         gradient, curvature = np.zeros(6), np.zeros((6, 6))
-        for k, (term, g, J) in enumerate(zip(self.terms, looked_up, jacobians, strict=True)):
+        for k, ((density, _, by_world, _), g) in enumerate(zip(at, drawn, strict=True)):
+            J = pose_jacobian(by_world, arms)
             rest = (part[0] for j, part in enumerate(parts) if j != k)
             others = math.prod(rest, start=np.ones(count))
             gradient += np.einsum("s,sm,smk->k", others, g[:, 1:], J) / count
-            pull = others * g[:, 0] / (count * term.density.sigma**2)
+            pull = others * g[:, 0] / (count * density.sigma**2)
             curvature += (J * pull[:, None, None]).reshape(-1, 6).T @ J.reshape(-1, 6)
         return float((others * g[:, 0]).mean()), gradient, curvature
 
@@ -101,15 +98,18 @@ class PaperObjective:
             return [remap(g.values, *maps[2 * k : 2 * k + 2]) for k, g in enumerate(self._alone)]
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
             points = transform(poses, self.points) + self.offsets
-            places = [term.sensor.project(points)[0] for term in self.terms]
-            return [g.sample(y) for g, y in zip(self._alone, places, strict=True)]
+            return [
+                g.sample(term.sensor.project(points)[0])
+                for term, g in zip(self.terms, self._alone, strict=True)
+            ]
 
     @cached_property
     def _alone(self) -> list[Density]:
         """The densities without gradients, which values do not need."""
-        drawn = [term.density for term in self.terms]
-        first = [np.ascontiguousarray(np.atleast_3d(one.values)[..., 0]) for one in drawn]
-        return [replace(one, values=values) for one, values in zip(drawn, first, strict=True)]
+        return [
+            replace(density, values=np.ascontiguousarray(np.atleast_3d(density.values)[..., 0]))
+            for density in (term.density for term in self.terms)
+        ]
 
     @cached_property
     def _maps(self) -> _AffineMaps | None:
@@ -176,19 +176,14 @@ class _AffineMaps:
 
         `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
         """
-        rows = poses.reshape(-1, 16).dot(self._by_pose)
-        if cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
-            return self._indices(rows)
-        lower, upper = self._limits
+        rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
-            maps = self._indices(rows)
-            maps[~((maps >= lower) & (maps <= upper))] = FAR
+            single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
+            maps = np.asarray(single.dot(self._samples).reshape(len(rows), -1, count))
+            if not cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
+                lower, upper = self._limits
+                maps[~((maps >= lower) & (maps <= upper))] = FAR
         return maps
-
-    def _indices(self, rows: Floats) -> Singles:
-        c, count = self._samples.shape
-        single = rows[:, : self._width].astype(np.float32).reshape(-1, c)
-        return np.asarray(single.dot(self._samples).reshape(len(rows), -1, count))
 
 
 def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats, Floats]:
@@ -198,21 +193,20 @@ def region_of_interest(sensor: Sensor, y: Floats, margin: float) -> tuple[Floats
 
 
 def sampled_terms(
-    views: Sequence[View], samples: Floats, sigmas: Sequence[float], near: Floats | None = None
+    views: Sequence[View], samples: Floats, sigmas: Sequence[float], near: Floats
 ) -> list[SampledTerm]:
-    """Densities g_l around the samples (N, R, 3) at a pose (4, 4), or wherever a sensor sees.
+    """Densities g_l around the samples (N, R, 3) at a pose (4, 4), of sensors that see any.
 
     `sigmas` are the standard deviations of a feature at this level, per view, in sensor units.
     """
     terms = []
     for view, sigma in zip(views, sigmas, strict=True):
-        box = (view.sensor.lower, view.sensor.upper)
-        if near is not None:
-            y, visible = view.sensor.project(transform(near, samples.reshape(-1, 3)))
-            if not visible.any():
-                continue
+        y, visible = view.sensor.project(transform(near, samples.reshape(-1, 3)))
+        if visible.any():
             box = region_of_interest(view.sensor, y[visible], DRAWING.paper_reach * sigma)
-        terms.append(SampledTerm(view.sensor, view.observation.density(sigma, box, gradient=True)))
+            terms.append(
+                SampledTerm(view.sensor, view.observation.density(sigma, box, gradient=True))
+            )
     return terms
 
 

@@ -60,10 +60,9 @@ class Match(NamedTuple):
         """The same at some of the poses, of the first n features; the others have no weight."""
         bells = self.bells[:, poses]
         near = bells.any(axis=(0, 1))
-        away = self.away[:, poses][:, :, near]
         features = [part[:, poses, :n] for part in self[:6]]
-        over = self.norm[:, poses], self.pairs[near], bells[..., near], away
-        return Match._make([*features, *over])
+        norm, away = self.norm[:, poses], self.away[:, poses][:, :, near]
+        return Match._make([*features, norm, self.pairs[near], bells[..., near], away])
 
 
 class BodyProjection:

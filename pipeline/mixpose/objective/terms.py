@@ -42,8 +42,7 @@ class NormalPrior:
 
     def points(self) -> Floats:
         """The mean, and √k standard deviations to either side along each of k directions."""
-        count = int(self.free.sum())
-        steps = np.sqrt(count) * np.diag(np.where(self.free, self.uncertainty, 0.0))[self.free]
+        steps = np.sqrt(self.free.sum()) * np.diag(self.uncertainty)[self.free]
         twists = np.concatenate([np.zeros((1, 6)), np.stack([steps, -steps], 1).reshape(-1, 6)])
         return perturb(self.T_world_object, twists)
 
@@ -83,7 +82,7 @@ class AmplitudesObjective:
         """⟨g − Σ α_i h_i, g − Σ α_i h_i⟩ per sensor (L,), at a pose (4, 4)."""
         parts = self._mixtures(T_world_object)
         explained = [a @ (2 * C[:, 0] - B @ a) for a, B, _, C, _, _ in parts]
-        return np.asarray(self.matched.energies[:, 0] - np.array(explained))
+        return np.asarray(self.matched.energies[:, 0] - explained)
 
     def _mixtures(self, T_world_object: Floats) -> Iterator[tuple[Floats, ...]]:
         """By sensor α (n,), B, B + λP (n, n), b, ∇b (n, 1 + m), p_i − p_j (n, n, m), J (n m, 6)."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf
 
 from mixpose.constants import constant
-from mixpose.records import Floats, Indices, Mask
+from mixpose.records import Floats, Mask
 
 _TINY = float(np.finfo(np.float64).tiny)
 _NO_DAMPING = float(np.sqrt(np.finfo(np.float64).eps))  # and by its inverse steps move nothing
@@ -82,13 +82,11 @@ class Ascent(NamedTuple):
 
     states: Any  # with a leading axis H
     values: Floats  # (H,)
-    converged: Mask  # (H,) false where the iterations ran out
-    iterations: Indices  # (H,) evaluations
     last: Quadratic  # models at the best states that were evaluated; the last step is taken unseen
 
     def of(self, rows: slice) -> Ascent:
         """The ascents of some of the states."""
-        return Ascent._make([*[part[rows] for part in self[:4]], self.last.of(rows)])
+        return Ascent(self.states[rows], self.values[rows], self.last.of(rows))
 
 
 def ascend(
@@ -102,14 +100,14 @@ def ascend(
     """Climb to a maximum near each of H states."""
     climb = _Climb(states, at_start or term.linearise(states), free, options)
     going = everything = list(range(len(climb.gains)))
-    for iteration in range(1, options.iterations):
-        going = climb.unfinished(going, iteration)
+    for _ in range(1, options.iterations):
+        going = climb.unfinished(going)
         if not going:
             break
         asked = everything if options.together else going
         some = slice(None) if asked == everything else asked
         tried = move(climb.states[some], climb.steps[some])
-        going = climb.take(tried, term.linearise(tried), asked, going, iteration + 1)
+        going = climb.take(tried, term.linearise(tried), asked, going)
     return climb.ended(move)
 
 
@@ -122,12 +120,10 @@ class _Climb:
         self._damping = [options.damping] * count
         self.steps, self.gains = _steps(here, free, self._damping, options)
         self._before = [0.0] * count  # gains of the steps before these
-        self._converged = [False] * count
-        self._iterations = [options.iterations] * count
         self._is_taken = [options.unchecked] * count  # whether the step is taken unseen
 
-    def unfinished(self, going: list[int], iteration: int) -> list[int]:
-        """Those of some states that have not arrived after so many evaluations."""
+    def unfinished(self, going: list[int]) -> list[int]:
+        """Those of some states that have not arrived."""
         options = self._options
         if options.unchecked:
             return going
@@ -137,15 +133,12 @@ class _Climb:
             is_near = gain**2 <= options.remaining * size * self._before[k]
             if is_near or gain <= max(options.tolerance * size, options.negligible):
                 # so near, the model is right: its last step is taken unseen
-                self._is_taken[k] = self._converged[k] = True
-                self._iterations[k] = iteration
+                self._is_taken[k] = True
             else:
                 left.append(k)
         return left
 
-    def take(
-        self, tried: Any, there: Quadratic, asked: list[int], going: list[int], iteration: int
-    ) -> list[int]:
+    def take(self, tried: Any, there: Quadratic, asked: list[int], going: list[int]) -> list[int]:
         """Go to states that are better, and damp the other steps: those that are not stuck."""
         options, values, better = self._options, self._here.value.tolist(), there.value.tolist()
         count, ease = len(values), 1 if options.unchecked else 10
@@ -164,8 +157,6 @@ class _Climb:
                 self._damping[k] = max(10 * self._damping[k], 100 * options.damping)
             if self._damping[k] <= 1 / _NO_DAMPING:
                 left.append(k)
-            else:
-                self._converged[k], self._iterations[k] = is_close, iteration
         if min(chosen) == count:
             self.states, self._here, self.steps, self.gains = tried, there, steps, gains
             return left
@@ -181,8 +172,7 @@ class _Climb:
         taken = np.array(self._is_taken)
         values = self._here.value + taken * self.gains
         states = move(self.states, taken[:, None] * self.steps)
-        ends = np.array(self._converged), np.array(self._iterations)
-        return Ascent(states, values, *ends, self._here)
+        return Ascent(states, values, self._here)
 
 
 def _steps(

@@ -14,9 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
-from mixpose.records import Floats, Indices, Mask, Singles
+from mixpose.records import Floats, Indices, Mask
 from mixpose.search.problem import SearchProblem
 from mixpose.search.three_points import (
     FIRST,
@@ -78,15 +79,22 @@ def triangulate(
         on_a = a.origins[:, None] + s[..., None] * a.directions[:, None]
         on_b = b.origins[None] + t[..., None] * b.directions[None]
         gap = np.linalg.norm(on_a - on_b, axis=-1)
-        off_a = gates[first] * (a.offset + a.slope * np.abs(s))
-        off_b = gates[second] * (b.offset + b.slope * np.abs(t))
-        tolerance = np.hypot(off_a, off_b)
+        tolerance = np.hypot(
+            gates[first] * (a.offset + a.slope * np.abs(s)),
+            gates[second] * (b.offset + b.slope * np.abs(t)),
+        )
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
         points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
-        sensors = np.broadcast_to([first, second], pairs.shape)
-        error = allowed / np.sqrt(sine2[good])
-        meetings.append((points, error, gap[good] / allowed, sensors, pairs))
+        meetings.append(
+            TriangulatedPoints(
+                points,
+                tolerance=allowed / np.sqrt(sine2[good]),
+                gap=gap[good] / allowed,
+                sensors=np.broadcast_to([first, second], pairs.shape),
+                rays=pairs,
+            )
+        )
     return TriangulatedPoints(*map(np.concatenate, zip(*meetings, strict=True)))
 
 
@@ -211,16 +219,15 @@ def _of_point(problem: SearchProblem, points: TriangulatedPoints, p: int) -> Flo
         ahead = depth > start[ray]
         ray, feature, depth = ray[ahead], feature[ahead], depth[ahead]
         places = origins[ray] + depth[:, None] * directions[ray]
-        off = _off(places, distances.astype(np.float32)[np.ix_(feature, feature)])
-        allowed = (np.sqrt(0.5) * error[ray]).astype(np.float32)
+        off = np.abs(cdist(places, places) - distances[np.ix_(feature, feature)])
+        allowed = np.sqrt(0.5) * error[ray]
         a, b = np.nonzero(off <= allowed + allowed[:, None])
         apart = (a < b) & (ray[a] != ray[b]) & (feature[a] != feature[b])
         a, b = a[apart], b[apart]
         best = np.argsort(off[a, b], kind="stable")[:most]
         a, b = a[best], b[best]
         body.append(features[np.stack([np.full(len(a), i), feature[a], feature[b]])])
-        point = np.broadcast_to(points.points[p], (len(a), 3))
-        world.append(np.stack([point, places[a], places[b]]))
+        world.append(np.stack([np.full((len(a), 3), points.points[p]), places[a], places[b]]))
     return align_triples(*(np.concatenate(one, axis=1).swapaxes(1, 2) for one in (body, world)))
 
 
@@ -232,28 +239,15 @@ def _rays_near(problem: SearchProblem, points: TriangulatedPoints, p: int) -> tu
     """
     parts = []
     for k, (sensor, rays) in enumerate(problem.cameras):
-        used = points.rays[p][points.sensors[p] == k]
-        rest = rays.select(np.setdiff1d(np.arange(len(rays)), used))
+        rest = rays.select(np.delete(np.arange(len(rays)), points.rays[p, points.sensors[p] == k]))
         away = points.points[p] - rest.origins
         along = (away * rest.directions).sum(axis=1)
         across = np.linalg.norm(away - along[:, None] * rest.directions, axis=1)
-        error = problem.reach(sensor) * (rest.offset + rest.slope * np.abs(along))
-        error = np.hypot(error, points.tolerance[p])
+        error = np.hypot(
+            problem.reach(sensor) * (rest.offset + rest.slope * np.abs(along)), points.tolerance[p]
+        )
         start = np.full(len(rest), 0.0 if rest.central else -np.inf)
         parts.append((rest.origins, rest.directions, across, along, error, start))
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
     nearest = np.argsort(columns[2], kind="stable")[: 3 * problem.budget.sample]
     return tuple(column[nearest] for column in columns)
-
-
-def _off(places: Floats, expected: Singles) -> Singles:
-    """How far pairs of places (K, 3) are from the expected distance (K, K)."""
-    x = (places - places[:1]).astype(np.float32)
-    squares = (x * x).sum(axis=1)
-    # in place: the arrays are large
-    off = -2 * x @ x.T
-    off += squares
-    off += squares[:, None]
-    np.sqrt(np.maximum(off, 0, out=off), out=off)
-    off -= expected
-    return np.asarray(np.abs(off, out=off))

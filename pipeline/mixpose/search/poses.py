@@ -71,8 +71,8 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     near = 1 - np.sqrt(dv[:, :, None] ** 2 + du[:, None] ** 2)
     label, iv, iu = np.nonzero(near > 0)
     value = (near[label, iv, iu] * 255).astype(np.int32)
-    order = np.argsort(value, kind="stable")  # where disks overlap the nearest is drawn last
-    label, iv, iu, value = (part[order] for part in (label, iv, iu, value))
+    # where disks overlap the nearest is drawn last
+    label, iv, iu, value = np.array([label, iv, iu, value])[:, np.argsort(value, kind="stable")]
     cells = np.zeros((rows, columns), dtype=np.int32)
     cells[row[label, iv], column[label, iu]] = ((label + 1) << 8) + value
     to_cells = np.diag([1 / (unit * step), 1 / (unit * step), 1.0])
@@ -173,8 +173,7 @@ def _pairs(y: Floats, seen: Mask, points: Floats, reach: float) -> tuple[Indices
     pose, feature = np.nonzero(seen)
     away, nearest = cKDTree(points).query(y[pose, feature], distance_upper_bound=reach)
     order = np.argsort(away, kind="stable")[: np.count_nonzero(np.isfinite(away))]
-    _, first = np.unique(pose[order] * len(points) + nearest[order], return_index=True)
-    met = order[first]
+    met = order[np.unique(pose[order] * len(points) + nearest[order], return_index=True)[1]]
     return pose[met], feature[met], nearest[met]
 
 

@@ -144,8 +144,7 @@ def peaks(pattern: GridPattern, sigma: float) -> Floats:
     size = 2 * max(round(spread), 1) + 1
     highest = cv2.dilate(blurred, np.ones((size, size), np.uint8))
     places = np.array(np.nonzero((blurred >= highest) & (blurred > 0.1 * blurred.max())))
-    order = np.argsort(-blurred[tuple(places)], kind="stable")
-    places = places[:, order[: 8 * THOROUGH.sample]]
+    places = places[:, np.argsort(-blurred[tuple(places)], kind="stable")[: 8 * THOROUGH.sample]]
     inner = np.clip(places, 1, np.array(blurred.shape)[:, None] - 2)
     # tops of parabolas through three neighbours, within half a step
     around = np.array([[-1], [0], [1]])
@@ -182,5 +181,4 @@ class SearchProblem:
         """Poses (H, 4, 4) with the held directions of the reference."""
         if self.free.all() or not len(poses):
             return poses
-        twists = twist_between(self.T_reference, poses)
-        return perturb(self.T_reference, np.where(self.free, twists, 0.0))
+        return perturb(self.T_reference, self.free * twist_between(self.T_reference, poses))

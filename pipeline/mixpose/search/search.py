@@ -88,10 +88,8 @@ def search_frame(
     detections = sensor_detections(views, body)
     if not detections:
         return SearchResult([])
-    reference = np.eye(4) if T_reference is None else T_reference
-    search = _Search(SearchProblem(detections, body, free, reference, rules, budget, seed))
-    after = search.run(state)
-    return SearchResult(search.candidates(), SearchReport(**search.cost), after)
+    T = np.eye(4) if T_reference is None else T_reference
+    return _Search(SearchProblem(detections, body, free, T, rules, budget, seed)).run(state)
 
 
 class _Search:
@@ -101,23 +99,25 @@ class _Search:
         self._problem, self._body, self._budget = problem, problem.body, problem.budget
         views, cameras = [one.view for one in problem.detections], problem.cameras
         self._images = [label_image(problem, *camera) for camera in cameras]
-        most = sum(min(len(rays), len(self._body)) for _, rays in cameras)
-        self._enough = self._budget.sufficient * most  # detections explained
+        self._enough = self._budget.sufficient * sum(  # detections explained
+            min(len(rays), len(self._body)) for _, rays in cameras
+        )
         # ranges are met by chance too often, and err too coarsely, to be counted one by one
-        are_cameras = all(one.rays is not None for one in problem.detections)
-        self._by_evidence = bool(self._images) and are_cameras
+        self._by_evidence = bool(cameras) and all(
+            one.rays is not None for one in problem.detections
+        )
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
-        few = sparse(self._body, 4 * self._budget.sample)
-        self._descent = Descent(views, few, problem.free, self._budget)
+        self._descent = Descent(
+            views, sparse(self._body, 4 * self._budget.sample), problem.free, self._budget
+        )
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
-        length = self._budget.shortlist
-        self._stages = [((blur,) * len(views), steps, length) for blur, steps in plan]
+        self._stages = [((blur,) * len(views), n, self._budget.shortlist) for blur, n in plan]
         self._poses, self._judged = np.zeros((0, 4, 4)), np.zeros((2, 0))
-        self.cost = Counter(made=0)
+        self._cost = Counter(made=0)
 
-    def run(self, state: SearchState) -> SearchState:
-        """Make as many guesses as are needed and allowed; where to go on in the next frame."""
+    def run(self, state: SearchState) -> SearchResult:
+        """Make as many guesses as are needed and allowed."""
         budget, after = self._budget, SearchState()
         generators = generators_of(self._problem) if self._images else []
         if len(generators) > 1:
@@ -127,15 +127,15 @@ class _Search:
                 break
             skipped = state.batch if k == state.generator else 0
             done = self._draw(generator, budget.max_guesses, skipped)
-            if self.cost["made"] >= budget.max_guesses:
+            if self._cost["made"] >= budget.max_guesses:
                 after = SearchState(k, done)
                 break
-        no_more = self._by_evidence and self.cost["made"]
-        if self._coverage() < budget.sufficient and not no_more:
+        is_guessed = self._by_evidence and self._cost["made"] > 0
+        if self._coverage() < budget.sufficient and not is_guessed:
             self._refine(*from_spread_orientations(self._problem))
-        return after
+        return SearchResult(self._candidates(), SearchReport(**self._cost), after)
 
-    def candidates(self) -> list[Candidate]:
+    def _candidates(self) -> list[Candidate]:
         """Distinct poses, best first, without those that the best leaves no chance."""
         budget, (ranks, _) = self._budget, self._judged
         kept = self._distinct(budget.sample)
@@ -156,11 +156,11 @@ class _Search:
         for make in islice(generator, skipped, None):
             done += 1
             more = self._problem.allowed(make())
-            self.cost["made"] += len(more)
+            self._cost["made"] += len(more)
             if few is not body and len(more) > budget.shortlist:
                 rank = self._count(few, more)
                 more = more[np.argsort(-rank, kind="stable")[: budget.shortlist]]
-            self.cost["tested"] += len(more)
+            self._cost["tested"] += len(more)
             rank = self._count(body, more)
             better = rank > (ranks[-1] if len(ranks) == length else -np.inf)
             poses = np.concatenate([poses, more[better]])
@@ -175,7 +175,7 @@ class _Search:
                     rivals = slice(3, 3 + 2 * budget.sample)
                     poses, ranks = poses[rivals], ranks[rivals]
                     break
-            if self.cost["made"] >= most:
+            if self._cost["made"] >= most:
                 break
         # detections that are missed cost four nats each
         self._refine(poses[ranks > best - budget.outdone / 4], self._stages)
@@ -188,9 +188,8 @@ class _Search:
 
     def _are_enough(self, guesses: Floats, explained: float) -> bool:
         """Whether the best guesses of several cameras, refined, leave no need for others."""
-        doubtful = explained < self._enough
         if not self._confirm or (
-            doubtful and self._judge(guesses)[0].max() < self._budget.hopeless
+            explained < self._enough and self._judge(guesses)[0].max() < self._budget.hopeless
         ):
             return False
         self._refine(guesses, self._stages)
@@ -227,7 +226,7 @@ class _Search:
 
     def _refine(self, guesses: Floats, stages: Sequence[Stage]) -> None:
         """Keep what guesses lead to from less to less blur."""
-        self.cost["refined"] += len(guesses)
+        self._cost["refined"] += len(guesses)
         if len(poses := self._descent.refine(guesses, stages)):
             judged = np.append(self._judged, np.array(self._judge(poses)), axis=1)
             best = np.argsort(-judged[0], kind="stable")

@@ -248,9 +248,8 @@ def _perspective(
     # smaller than the error in the image, nothing is told apart
     near = np.sqrt(squared.max(axis=0))[which] > reach * rays.slope * distances.min(axis=0)
     distances, which = distances[:, near], which[near]
-    directions = gathered(rays.directions, detections[:, which])
-    world = rays.origins[0][:, None] + directions * distances[:, None]
-    return align_triples(gathered(features, corners[:, which]), world)
+    away = gathered(rays.directions, detections[:, which]) * distances[:, None]
+    return align_triples(gathered(features, corners[:, which]), rays.origins[0][:, None] + away)
 
 
 def _orthographic(
@@ -265,11 +264,10 @@ def _orthographic(
     length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))
     rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
     rise[flat > length + tolerance] = np.nan
-    direction = rays.directions[0][:, None]
     poses = []
     for sign, mirror in product((1.0, -1.0), repeat=2):
         good = np.abs(np.abs(rise[1] - sign * rise[0]) - rise[2]) <= tolerance
         depth = mirror * np.array([0 * rise[0], sign * rise[0], rise[1]])[:, None, good]
-        world = seen[..., good] + (depth - depth.mean(axis=0)) * direction
+        world = seen[..., good] + (depth - depth.mean(axis=0)) * rays.directions[0][:, None]
         poses.append(align_triples(body[..., good], world))
     return np.concatenate(poses)

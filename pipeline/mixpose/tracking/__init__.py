@@ -1,6 +1,5 @@
 """Tracking: propose, fit, judge, decide, follow, from frame to frame."""
 
-from mixpose.body import ASIDE as ASIDE
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import (
     Expectation as Expectation,

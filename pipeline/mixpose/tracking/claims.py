@@ -1,4 +1,4 @@
-"""Whose each detection is: a body's, nobody's so far, or two bodies' in one.
+"""Whose each detection is: a body's, or nobody's so far.
 
 No detection belongs to two bodies.  What belongs to another is left out of what a body sees: from
 its density, so that it does not pull, and from the clutter that its evidence is weighed against.
@@ -31,7 +31,7 @@ class Claims:
     views: tuple[View, ...]  # of L sensors
     places: Floats  # (D, 3)
     begins: Indices  # (L + 1,), where the detections of each sensor begin
-    owners: Indices  # (D,), the number of a body; -1: nobody's so far; -2: two bodies' in one spot
+    owners: Indices  # (D,), the number of a body; -1: nobody's so far
 
     @classmethod
     def none(cls, views: Sequence[View]) -> Claims:
@@ -69,8 +69,7 @@ class Claims:
         """
         whose = np.array([-1, *(k for k, some in places.items() for _ in some)], dtype=np.intp)
         away = cdist(self.places, np.concatenate([self.places[:0], *places.values()]))
-        nearest = np.insert(away, 0, gate, axis=1).argmin(axis=1)
-        return replace(self, owners=whose[nearest])
+        return replace(self, owners=whose[np.insert(away, 0, gate, axis=1).argmin(axis=1)])
 
     def met_by(self, pose: ScoredPose, left: Mask) -> Met:
         """What a pose meets of the detections that are left for its body."""
@@ -80,19 +79,17 @@ class Claims:
         met = used.detections >= 0
         return kept[(first[:, None] + used.detections)[met]], used.squared[met]
 
-    def taken(self, met: Mapping[int, Met], merged: Sequence[int]) -> Claims:
+    def taken(self, met: Mapping[int, Met]) -> Claims:
         """By what bodies meet; of a detection that two meet, the one that it lies nearer to."""
         owners, nearest = self.owners.copy(), np.full(len(self.owners), np.inf)
         for k, (numbers, squared) in met.items():
             nearer = squared < nearest[numbers]
             owners[numbers[nearer]], nearest[numbers[nearer]] = k, squared[nearer]
-        owners[merged] = -2
         return replace(self, owners=owners)
 
-    def near(self, chosen: Mask, places: Floats, reach: float) -> Indices:
-        """Those of some detections (D,) that lie within reach, in σ_ε, of places (n, 3)."""
-        away = cdist(self.places[chosen], places).min(axis=1, initial=np.inf)
-        return np.asarray(np.flatnonzero(chosen)[away < reach])
+    def are_near(self, chosen: Mask, places: Floats, reach: float) -> bool:
+        """Whether any of some detections (D,) lies within reach, in σ_ε, of places (n, 3)."""
+        return bool((cdist(self.places[chosen], places) < reach).any())
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:

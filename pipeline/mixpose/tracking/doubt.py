@@ -51,8 +51,7 @@ def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
         return ""
     if not is_known(data, best):
         return TRIANGLE
-    is_alone = len(data.sensors) > 1 and np.count_nonzero(best.matches.met) == 1
-    if track.believed or not is_alone:
+    if track.believed or len(data.sensors) < 2 or np.count_nonzero(best.matches.met) != 1:
         return ""
     # a pose that is sure for doubtful ones before it alone errs as they do
     gained = max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
@@ -123,8 +122,8 @@ def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:
     are_few = judged.measurements - 6 <= rules.look_alikes.by_chance
     if not are_few or track.believed >= rules.proposals.believed or (seen.dimensions != 2).any():
         return False
-    noise, is_missed = rules.judgement.noise, bool((seen.missed > 0.5).any())
-    return is_missed or is_far_off(seen, track.residuals.total, rules.acceptance, noise)
+    is_missed, noise = (seen.missed > 0.5).any(), rules.judgement.noise
+    return bool(is_missed) or is_far_off(seen, track.residuals.total, rules.acceptance, noise)
 
 
 def _evidence(data: Frame, start: Start) -> float:
@@ -134,5 +133,6 @@ def _evidence(data: Frame, start: Start) -> float:
 
 def _mirrored(data: Frame, chosen: Mask) -> Frame:
     """The frame, of the body reflected in the plane nearest to some of its features (N,)."""
-    near = frozenset(np.flatnonzero(chosen).tolist())
-    return data.seen_otherwise(body=mirror_image(data.body, near))
+    return data.seen_otherwise(
+        body=mirror_image(data.body, frozenset(np.flatnonzero(chosen).tolist()))
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import Prior, ScoredPose, flat_prior, nearest_alike
+from mixpose.judgement import AcceptanceRules, Prior, ScoredPose, flat_prior, nearest_alike
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -24,18 +24,29 @@ from mixpose.tracking.track import Branch, Track, either
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """A frame, and what is known before it."""
+class Setup:
+    """A body, and how its poses are estimated: what stays the same from frame to frame."""
 
-    views: Sequence[View]
     body: Body
     options: EstimatorOptions
     samples: Floats  # (N, R, 3) of the body, for the objectives that integrate by sampling
+    start_uncertainty: Floats  # (6,)
+    rules: Rules
+
+    @cached_property
+    def free(self) -> Mask:
+        """Which of the six directions are estimated."""
+        return free_mask(self.options)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(Setup):
+    """A frame, and what is known before it."""
+
+    views: Sequence[View]
     track: Track
     predictions: Sequence[Branch]
     T_reference: Floats | None  # (4, 4), that tells poses apart that look the same
-    start_uncertainty: Floats  # (6,)
-    rules: Rules
     frame: int
     time_s: float | None
     drawn: MatchedObjective | None = None  # `finest`, where it is at hand
@@ -47,10 +58,13 @@ class Frame:
     beside: Branch | None = None  # where another body lets expect one that is not where it was
     sensors: Sequence[str] = ()  # all that had a frame, also those that saw nothing
 
-    @cached_property
-    def free(self) -> Mask:
-        """Directions that are estimated."""
-        return free_mask(self.options)
+    def first_is(
+        self,
+        trusted: Callable[[ScoredPose, Mask, AcceptanceRules], bool],
+        ranked: Sequence[ScoredPose],
+    ) -> bool:
+        """Whether there is a pose, and the most evident is `trusted` by the rules of acceptance."""
+        return any(trusted(best, self.free, self.rules.acceptance) for best in ranked[:1])
 
     @cached_property
     def is_timed(self) -> bool:
@@ -65,8 +79,9 @@ class Frame:
     @cached_property
     def noise(self) -> Floats:
         """What is remembered of each view's noise: squares in σ_ε², degrees of freedom (2, L)."""
-        names = [view.name for view in self.views]
-        return self.rules.judgement.noise.memory * self.track.residuals.of(names)
+        return self.rules.judgement.noise.memory * self.track.residuals.of(
+            [view.name for view in self.views]
+        )
 
     @property
     def close(self) -> Floats:
@@ -108,10 +123,10 @@ class Frame:
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""
-        views, still = (
-            [v for v in some if v.name not in names] for some in (self.views, self.still)
+        return self.seen_otherwise(
+            views=[view for view in self.views if view.name not in names],
+            still=[view for view in self.still if view.name not in names],
         )
-        return self.seen_otherwise(views=views, still=still)
 
     def seen_otherwise(self, **changes: Any) -> Frame:
         """With other views or another body, of which nothing is drawn or fitted yet."""
@@ -126,8 +141,12 @@ class Frame:
         )
         projection = project_body(tuple(view.sensor for view in views), self.body)
         # densities do not move with the sensors
-        drawn = replace(self.finest, views=views, projection=projection)
-        return replace(self, views=views, still=still, drawn=drawn)
+        return replace(
+            self,
+            views=views,
+            still=still,
+            drawn=replace(self.finest, views=views, projection=projection),
+        )
 
     def expected(self, T_world_object: Floats, *, is_there: bool = True) -> Expected:
         """The velocity that the frames before let expect of a pose, or near it."""
@@ -137,8 +156,9 @@ class Frame:
         branch = self.track.nearest(T_world_object, self.body)
         if branch is None or not elapsed:
             return rest
-        T = nearest_alike(T_world_object, self.body, branch.T_world_object)
-        moved = twist_between(branch.T_world_object, T)
+        moved = twist_between(
+            branch.T_world_object, nearest_alike(T_world_object, self.body, branch.T_world_object)
+        )
         if branch.course is None and branch.velocity is not None:  # by the last two steps alone
             velocity = moved / elapsed + (moved / elapsed - branch.velocity) / 2
             return rest._replace(velocity=velocity, gain=np.full(6, 1.5 / elapsed))

@@ -38,8 +38,9 @@ class Offsets(NamedTuple):
 
     def by_delay(self, velocity: Floats, sensors: Sequence[int] | Floats) -> Floats:
         """How the features of some sensors would move with their delays, (K, q) per second."""
-        own = self.sensor[:, None] == np.array(sensors, int)
-        return np.where(own, (self.rows @ velocity)[:, None], 0.0)
+        return np.where(
+            self.sensor[:, None] == np.array(sensors, int), (self.rows @ velocity)[:, None], 0.0
+        )
 
     def least_squares(
         self, velocity: Floats, expected: Expected, free: Mask, variance: float
@@ -117,10 +118,9 @@ def with_motion_unknown(judged: ScoredPose, frame: Frame, motion: Motion) -> Sco
 
 def offsets_at(frame: Frame, T_world_object: Floats) -> Offsets:
     """What is met at a pose."""
-    rules, expected = frame.rules.judgement, frame.expected(T_world_object)
-    narrowest = rules.noise.errors.narrowest
+    rules, narrowest = frame.rules.judgement, frame.rules.judgement.noise.errors.narrowest
     matches = associate(frame.finest, T_world_object, rules.association, narrowest)
-    return offsets_of(frame, matches, expected)
+    return offsets_of(frame, matches, frame.expected(T_world_object))
 
 
 def offsets_of(frame: Frame, matches: Matches, expected: Expected | None = None) -> Offsets:
@@ -166,8 +166,8 @@ def delays_after(frame: Frame, best: ScoredPose) -> DelayEvidence:
     names = (*before.names, *(n for n in own if n != reference and n not in before.names))
     met = offsets_of(frame, used)
     late = met.by_delay(expected.velocity, [own.index(n) if n in own else -1 for n in names])
-    rest = float(met.offsets @ met.offsets) / max(len(met.offsets) - 6, 1)
-    variance = max(rest, LEAST_VARIANCE)
+    degrees = max(len(met.offsets) - 6, 1)
+    variance = max(float(met.offsets @ met.offsets) / degrees, LEAST_VARIANCE)
     # what a pose and an unknown change of the velocity explain as well says nothing of delays
     shifts = met.rows * met.late[:, None] * expected.deviation / np.sqrt(variance)
     other = np.block([[met.rows, shifts], [np.zeros((6, 6)), np.eye(6)]])

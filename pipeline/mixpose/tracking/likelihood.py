@@ -30,8 +30,8 @@ from mixpose.judgement import (
     nearest_alike,
 )
 from mixpose.objective import NormalPrior, View, project_body
-from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, Term, ascend
-from mixpose.records import Floats, Mask, PointPattern
+from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
+from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
 from mixpose.tracking.frame import Frame, given
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
@@ -62,22 +62,26 @@ class MatchedLikelihood:
 
     def fit(self, start: Start, begun: Ascent | None = None) -> Fit:
         """Ascend the session's objective through narrowing blurs; `begun` at σ_ε already."""
-        uncertainty, frame = start.uncertainty, self.frame
+        T, uncertainty, frame = start.T_world_object, start.uncertainty, self.frame
         if start.left_out:
             frame = frame.without(start.left_out)
         if uncertainty is None:
-            return Fit(start.T_world_object)
+            return Fit(T)
         if frame.together and start.prediction is frame.predictions[0]:
             return frame.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         is_bent = self.knows_detections and frame.body.spread
-        spread = given(frame, start.T_world_object) if is_bent else 0.0
+        spread = given(frame, T) if is_bent else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
-            where = seen.views, seen.body, T_start, uncertainty, seen.options, seen.samples
             return fit_near(
-                *where,
+                seen.views,
+                seen.body,
+                T_start,
+                uncertainty,
+                seen.options,
+                seen.samples,
                 finest=seen.finest,
                 begun=begun,
                 climbed=climbed,
@@ -89,7 +93,6 @@ class MatchedLikelihood:
                 rules=seen.rules.fit,
             )
 
-        T = start.T_world_object
         return fit_in_motion(frame, T, climb) if timed else climb(frame, T)
 
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
@@ -100,8 +103,9 @@ class MatchedLikelihood:
         if frame.is_timed:
             motion = motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
             frame = frame.in_motion(motion)
-        case = case_of(frame, fit, start)
-        judged = judge_together([case], frame.free, frame.rules.judgement, start.left_out)[0]
+        (judged,) = judge_together(
+            [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
+        )
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
 
 
@@ -208,26 +212,23 @@ def _summed(odds: Floats) -> tuple[Floats, Floats]:
 class AssociationTerm:
     """Logarithm of `sum_associations`, whose second derivatives are differences of gradients."""
 
-    views: Sequence[View]
-    body: Body
-    free: Mask
-    noise: float
-    detection: DetectionModel
+    frame: Frame
+    noise: float  # in σ_ε
 
     def linearise(self, poses: Floats) -> Quadratic:
         """Second-order models at poses (H, 4, 4)."""
-        free, count = self.free, len(poses)
-        error = self.noise * min(view.observation.sigma for view in self.views)
-        arm = float(np.linalg.norm(self.body.means, axis=1).max())
+        frame, free, model = self.frame, self.frame.free, self.frame.rules.judgement
+        error = self.noise * min(frame.sigmas)
+        arm = float(np.linalg.norm(frame.body.means, axis=1).max())
         # steps that move ranges by a hundredth of their error: half of the digits are left
         scale = 0.01 * np.repeat([error, error / max(arm, error)], 3)[free]
         steps = scale[:, None] * np.eye(6)[free]
         twists = np.vstack([np.zeros(6), steps, -steps])
         around = perturb(poses[:, None], twists).reshape(-1, 4, 4)
-        found = sum_associations(self.views, self.body, around, self.noise, self.detection)
-        gradients = found.gradient.reshape(count, -1, 6)
+        found = sum_associations(frame.views, frame.body, around, self.noise, model.detection)
+        gradients = found.gradient.reshape(len(poses), -1, 6)
         here, ahead, behind = np.split(gradients, [1, 1 + len(steps)], axis=1)
-        H = np.zeros((count, 6, 6))
+        H = np.zeros((len(poses), 6, 6))
         H[:, free] = (behind - ahead) / (2 * scale[:, None])
         at = slice(None, None, len(twists))
         H = (H + H.swapaxes(1, 2)) / 2
@@ -252,7 +253,7 @@ class AssociationLikelihood:
         else:
             uncertainty = np.where(frame.free, known.uncertainty, 0.0)
             levels = blur_schedule(frame.views, frame.body, T, uncertainty)
-            ratios = [max(np.divide(level, frame.sigmas).tolist()) for level in levels]
+            ratios = (np.array(levels) / frame.sigmas).max(axis=1).tolist()
             widths = [ratio for ratio in ratios if ratio > self._noise] + widths
         states, options = T[None], NewtonOptions(tolerance=1e-7)
         for width in widths:
@@ -268,7 +269,7 @@ class AssociationLikelihood:
         count, inner = int(free.sum()), np.ix_(free, free)
         degrees = max(float(found.met[0]) - count, 0.0)
         squares = float(found.squares[0]) if degrees else 0.0
-        remembered = model.noise.memory * before.of(("",)) + [[squares], [degrees]]
+        noise = model.noise.memory * before.of(("",)) + [[squares], [degrees]]
         # a direction that all of it leaves open is as uncertain as anywhere
         information = self._definite(self._posterior(start, self._noise).linearise(T[None]))
         information += np.diag(1 / frame.anywhere[1][free] ** 2)
@@ -277,22 +278,21 @@ class AssociationLikelihood:
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
         degrees = rules.ranges.stated_degrees + float(before.total[1])
         covariance *= model.noise.enlargement(count, degrees)
-        log_density, _ = frame.prior(T)
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,
-            log_evidence=float(found.log_odds[0]) + log_density + float(volume),
-            noise=RememberedNoise(("",), remembered),
+            log_evidence=float(found.log_odds[0]) + frame.prior(T)[0] + float(volume),
+            noise=RememberedNoise(("",), noise),
             spread=np.sqrt(np.diag(covariance)),
         )
 
     def _posterior(self, start: Start, noise: float) -> Sum:
         """Likelihood and prior, of ranges that err by so much in σ_ε."""
-        frame, known, detection = self.frame, start.prediction, self.frame.rules.judgement.detection
-        terms: list[Term] = [AssociationTerm(frame.views, frame.body, frame.free, noise, detection)]
-        if known is not None and known.spread is not None:
-            terms.append(NormalPrior(known.T_world_object, known.uncertainty, frame.free))
-        return Sum(tuple(terms))
+        likelihood, known = AssociationTerm(self.frame, noise), start.prediction
+        if known is None or known.spread is None:
+            return Sum((likelihood,))
+        prior = NormalPrior(known.T_world_object, known.uncertainty, self.frame.free)
+        return Sum((likelihood, prior))
 
     def _definite(self, here: Quadratic) -> Floats:
         """Minus the Hessian (k, k) where definite; in directions where not, next to nothing."""
@@ -302,8 +302,10 @@ class AssociationLikelihood:
         scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(np.float64).eps))
         hessian = here.hessian[0][np.ix_(free, free)]
         values, vectors = np.linalg.eigh(hessian * scale * scale[:, None])
-        bounded = (vectors * np.maximum(values, least)) @ vectors.T
-        return np.asarray(bounded / scale / scale[:, None])
+        # bounded, in its own units again
+        return np.asarray(
+            (vectors * np.maximum(values, least)) @ vectors.T / np.outer(scale, scale)
+        )
 
 
 Likelihood: TypeAlias = MatchedLikelihood | AssociationLikelihood
@@ -311,6 +313,7 @@ Likelihood: TypeAlias = MatchedLikelihood | AssociationLikelihood
 
 def likelihood_of(frame: Frame) -> Likelihood:
     """The likelihood for a frame."""
-    is_matched = frame.options.objective == "matched"
-    are_ranges = is_matched and are_associated(frame.views, frame.body, frame.rules.ranges)
+    are_ranges = frame.options.objective == "matched" and are_associated(
+        frame.views, frame.body, frame.rules.ranges
+    )
     return AssociationLikelihood(frame) if are_ranges else MatchedLikelihood(frame)

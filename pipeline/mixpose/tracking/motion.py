@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -91,8 +91,11 @@ class RandomWalk:
         means = squares.sum(axis=1) / np.maximum(np.count_nonzero(squares, axis=1), 1)
         shares, other = np.repeat(means, 3), np.repeat(means[::-1], 3)
         rate = np.maximum(shares, self.rules.other_kind * other) / lever**2 / elapsed
-        recall = self.rules.recall
-        return RandomWalk(recall * self.rates + rate, recall * self.count + 1, self.rules)
+        return replace(
+            self,
+            rates=self.rules.recall * self.rates + rate,
+            count=self.rules.recall * self.count + 1,
+        )
 
     def variance(self, elapsed: float) -> Floats:
         """Variance (6,) of the displacement in a time."""
@@ -145,8 +148,7 @@ class Course:
         rates = mean[:, 1:3] + gains * (moved - mean[:, 0])[:, None]
         variance = covariance[:, 1, 1] - gains[:, 0] * covariance[:, 1, 0]
         rates[3:] += np.cross(moved[3:], rates[3:], axisb=0, axisc=0) / 2
-        deviation = np.sqrt(np.maximum(variance, 0.0))
-        return Expected(rates[:, 0], gains[:, 0], deviation, rates[:, 1])
+        return Expected(rates[:, 0], gains[:, 0], np.sqrt(np.maximum(variance, 0.0)), rates[:, 1])
 
     def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> Course:
         """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""

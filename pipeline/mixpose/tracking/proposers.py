@@ -37,8 +37,11 @@ OUT_OF_STEP = "out of step or bumped"
 
 def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """Where the branches of the track expect the body, and another body beside it; always."""
-    beside = [] if frame.beside is None else [frame.beside]
-    return [Start(p.T_world_object, p.uncertainty, p) for p in [*frame.predictions, *beside]]
+    return [
+        Start(one.T_world_object, one.uncertainty, one)
+        for one in (*frame.predictions, frame.beside)
+        if one
+    ]
 
 
 def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
@@ -64,8 +67,10 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     first, rules = frame.predictions[0], frame.rules.proposals
     wide = np.where(frame.free, np.maximum(first.uncertainty, frame.start_uncertainty), 0.0)
     narrow, sigmas = wide / rules.narrowing, np.array(frame.sigmas)
-    levels = blur_schedule(frame.views, frame.body, first.T_world_object, narrow)
-    stages = [(tuple(level / sigmas), rules.steps, rules.kept) for level in levels]
+    stages = [
+        (tuple(level / sigmas), rules.steps, rules.kept)
+        for level in blur_schedule(frame.views, frame.body, first.T_world_object, narrow)
+    ]
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(first.T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
@@ -134,9 +139,7 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
             best = ranked[0]
             yield from _as_evident(frame, best)
     if ranked and "tilted" in kinds:
-        moved = _moves_alike(frame, ranked[0].T_world_object)
-        for T in _tilted(frame, ranked[0]):
-            yield Start(T, frame.close * frame.rules.proposals.narrowing, T_moved=moved)
+        yield from _tilted(frame, ranked[0])
 
 
 def reason(frame: Frame, best: ScoredPose, rivals: Iterable[ScoredPose]) -> str:
@@ -167,8 +170,8 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
     # single ranges do not say what is met
     if len(body.nodes.points) != len(body) or (best.matches.dimensions == 1).any():
         return ()
-    tolerance = tolerance_of(body, body, frame.rules.look_alikes.alike)
-    return like_features(body, met_features(best), body, tolerance)
+    met, rules = met_features(best), frame.rules.look_alikes
+    return like_features(body, met, body, tolerance_of(body, body, rules.alike))
 
 
 def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
@@ -179,8 +182,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     poses = np.array([T, *(T @ one.T_body_other for one in alike)])
     # the value grows as the square of the features met
     values = np.sqrt(frame.finest.shares(poses, whole=True).sum(axis=0))
-    missed = 1 - values[1:] / max(values[0], np.finfo(np.float64).tiny)
-    fewer = float(best.matches.met.max()) * missed
+    fewer = best.matches.met.max() * (1 - values[1:] / max(values[0], np.finfo(np.float64).tiny))
     for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
         moved = _moves_alike(frame, T) if alike[k].is_step else None
         against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
@@ -189,8 +191,8 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
             yield Start(poses[1 + k], frame.close, T_moved=moved)
 
 
-def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Floats]:
-    """The pose (4, 4) tilted the other way, where one camera alone meets a nearly flat body."""
+def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Start]:
+    """The pose tilted the other way, where one camera alone meets a nearly flat body."""
     body, views, T = frame.body, frame.views, best.T_world_object
     if len(views) > 1:
         least, seen = frame.rules.acceptance.agreeing, best.matches
@@ -199,16 +201,16 @@ def _tilted(frame: Frame, best: ScoredPose) -> Iterable[Floats]:
     if len(views) != 1 or views[0].sensor.dimension != 2 or len(body) < 3:
         return
     if thickness(body) <= frame.rules.look_alikes.flat:
-        middle = transform(T, body.means.mean(axis=0)[None])
-        yield other_tilt(body, T, views[0].sensor.towards(middle)[0])
+        away = views[0].sensor.towards(transform(T, body.means.mean(axis=0)[None]))[0]
+        wide = frame.close * frame.rules.proposals.narrowing
+        yield Start(other_tilt(body, T, away), wide, T_moved=_moves_alike(frame, T))
 
 
 def without_sensor(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """The pose fitted without the sensors that disagree with two others or more."""
-    if not likelihood.knows_detections or len(frame.views) < 3 or judged.left_out:
+    if len(frame.views) < 3 or judged.left_out:
         return
-    rules = frame.rules
-    if apart := disagreeing(judged.matches, rules.acceptance, rules.judgement.noise):
+    if apart := disagreeing(judged.matches, frame.rules.acceptance, frame.rules.judgement.noise):
         yield Start(judged.T_world_object, frame.close, left_out=dict.fromkeys(apart, OUT_OF_STEP))
 
 
@@ -234,8 +236,6 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
 
 def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """Least squares with the middle of two features that run into each other in one detection."""
-    if not likelihood.knows_detections:
-        return []
     at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
         if not seen.merged.any():
@@ -260,8 +260,7 @@ def _paired(seen: Matches, reach: float) -> Matches:
     for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
         met = np.flatnonzero(seen.detections[k] >= 0)
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
-        apart = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k]
-        away = apart + offsets[k, met]
+        away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
         squared = (away * away).sum(axis=2) / 2
         if squared.min(initial=np.inf) <= reach:
             i, j = np.unravel_index(int(squared.argmin()), squared.shape)
@@ -279,21 +278,21 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
     has_cells = any(view.observation.cell is not None for view in frame.views)
-    if not judged.is_unlike or not likelihood.knows_detections or has_cells:
+    if not judged.is_unlike or has_cells:
         return
     errors = frame.rules.judgement.noise.errors
     variances = pooled(frame.noise, errors, errors.typical_degrees)
     largest = errors.outlying**2 * variances[:, None]
     narrowest = errors.blur * float(np.sqrt(variances.max()))
-    for one in frame.predictions:
-        for blur in [blur for blur in frame.rules.proposals.blurs if blur > narrowest]:
-            start = Start(one.T_world_object, one.uncertainty, blur=blur)
-            found = likelihood.judge(likelihood.fit(start), start)
-            met = found.matches.shares > 0
-            off = np.count_nonzero(met & (found.matches.squared > largest), axis=1)
-            # where all of a sensor are off it is out of step, and the others no better for it
-            if not (off > np.count_nonzero(met, axis=1) / 2).any():
-                yield Start(found.T_world_object)
+    blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
+    for one, blur in product(frame.predictions, blurs):
+        start = Start(one.T_world_object, one.uncertainty, blur=blur)
+        found = likelihood.judge(likelihood.fit(start), start)
+        met = found.matches.shares > 0
+        off = np.count_nonzero(met & (found.matches.squared > largest), axis=1)
+        # where all of a sensor are off it is out of step, and the others no better for it
+        if not (off > np.count_nonzero(met, axis=1) / 2).any():
+            yield Start(found.T_world_object)
 
 
 PROPOSERS: tuple[Proposer, ...] = (predicted, multistart, searched, look_alikes)

@@ -108,9 +108,9 @@ def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
         return verdict
     # odds that it has none, as its pose is another's, stand beside the poses
     total = sum(weight for _, weight in [*verdict.kept, *rivals])
-    poses = [*verdict.kept, *((pose, odds) for pose, odds in rivals if pose is not best)]
-    kept = sorted(poses, key=lambda pair: (pair[0] is not best, -pair[1]))
-    return Verdict("ambiguous", best, [(pose, weight / total) for pose, weight in kept])
+    told = [*verdict.kept, *(pair for pair in rivals if pair[0] is not best)]
+    told.sort(key=lambda pair: (pair[0] is not best, -pair[1]))
+    return Verdict("ambiguous", best, [(pose, weight / total) for pose, weight in told])
 
 
 def identify(
@@ -122,11 +122,10 @@ def identify(
     poses, known = [bests[k] for k in finders], [k for k in group if found[k].frame.predictions]
     data = [found[k].frame for k in known]
     # by body (rows) and pose; in the last column none, which says nothing
-    likely = np.zeros((len(known), len(poses) + 1))
-    for row, one in zip(likely, data, strict=True):
-        row[:-1] = [one.prior(pose.T_world_object)[0] for pose in poses]
-    rows, columns = linear_sum_assignment(likely[:, :-1], maximize=True)
-    pose_of = {known[i]: int(j) for i, j in zip(rows, columns, strict=True)}
+    rows = [[*(one.prior(pose.T_world_object)[0] for pose in poses), 0.0] for one in data]
+    likely = np.reshape(rows, (len(known), len(poses) + 1))
+    pairs = zip(*linear_sum_assignment(likely[:, :-1], maximize=True), strict=True)
+    pose_of = {known[i]: int(j) for i, j in pairs}
     spare = [j for j in range(len(poses)) if j not in pose_of.values()]
     pose_of |= dict(zip([k for k in group if k not in known], spare, strict=False))
     without = iter([k for k in group if k not in bests])
@@ -172,8 +171,8 @@ class Expectation:
         """
         if not self.cameras or not predictions or not np.isfinite(self._feature_reach):
             return {}
-        projection = project_body(tuple(self.cameras.values()), self.body)
-        at = projection.project(np.array([one.T_world_object for one in predictions]))
+        poses = np.array([one.T_world_object for one in predictions])
+        at = project_body(tuple(self.cameras.values()), self.body).project(poses)
         uncertainty = np.array([one.uncertainty for one in predictions])
         by_pose = np.einsum("lpnij,pj->lpni", at.J**2, (uncertainty * self.free) ** 2)
         scales = np.sqrt((at.J[..., :3] ** 2).sum(axis=(3, 4)).max(axis=2))
@@ -208,8 +207,11 @@ def are_as_good(tallies: Tallies, before: Tallies) -> bool:
 
 def have_fewer(views: Sequence[View], before: Tallies) -> bool:
     """Whether a camera has fewer detections than it met features in the frame before."""
-    seen = [(view.name, view.observation.points) for view in views if view.name in before]
-    return any(points is not None and len(points) < before[name][0] for name, points in seen)
+    return any(
+        (points := view.observation.points) is not None and len(points) < before[view.name][0]
+        for view in views
+        if view.name in before
+    )
 
 
 @dataclass(frozen=True)
@@ -240,8 +242,9 @@ class WindowedScene:
             if not any(have_fewer(views, track.tallies) for track in tracks):
                 after, estimates = self.scene.advance(tracks, frame, time_s, views)
                 pairs = zip(after, tracks, strict=True)
-                as_good = all(are_as_good(now.tallies, then.tallies) for now, then in pairs)
-                if as_good and self._are_met(after):
+                if self._are_met(after) and all(
+                    are_as_good(now.tallies, then.tallies) for now, then in pairs
+                ):
                     return after, estimates, views
         views = observe({})
         return *self.scene.advance(tracks, frame, time_s, views), views

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mixpose.fit import Fit, fit_together
-from mixpose.judgement import Case, ScoredPose, Verdict, is_possible, judge_together
+from mixpose.judgement import Case, ScoredPose, Verdict, convinces, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Mask
 from mixpose.tracking.claims import Claims, Met
@@ -24,7 +24,7 @@ from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import MatchedLikelihood, Start, case_of
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
-from mixpose.tracking.tracker import Tracker, are_convincing, judged_again
+from mixpose.tracking.tracker import Tracker, judged_again
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +40,6 @@ class Explanation:
         """The decision about the frame, and why it is in doubt."""
         return decided(self.frame, self.ranked)
 
-    @property
-    def is_possible(self) -> bool:
-        """Whether the best pose is worth telling."""
-        free, rules = self.frame.free, self.frame.rules.acceptance
-        return any(is_possible(one, free, rules) for one in self.ranked[:1])
-
 
 @dataclass
 class Sharing:
@@ -59,7 +53,6 @@ class Sharing:
     rules: SceneRules
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
-    merged: list[int] = field(default_factory=list)  # detections that are two bodies' in one
 
     def explained(self) -> dict[int, Explanation]:
         """The poses of all bodies."""
@@ -67,26 +60,29 @@ class Sharing:
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
-        self._leave_merged()
         self._judge_again()
         return self.found
 
     def _where_expected(self) -> None:
         """Bodies that are where they are expected, all at once, until nothing changes hands."""
-        places = {}
-        for k, (tracked, track) in enumerate(zip(self.bodies, self.tracks, strict=True)):
-            if track.branches and not track.misses and not track.doubted:
-                first = tracked.predictions(track, self.frame, self.time_s)[0]
-                places[k] = self._nobody.features(tracked.body, first.T_world_object)
+        places = {
+            k: self._features(k, self.bodies[k].predictions(track, self.frame, self.time_s)[0])
+            for k, track in enumerate(self.tracks)
+            if track.branches and not track.misses and not track.doubted
+        }
         some, claims = list(places), self._nobody.expected(places, self.rules.gate)
         for _ in range(3):  # neighbours' neighbours are settled by then
             self.found |= self._at_once(some, claims, places)
             self.claimed = [
-                k for k, one in self.found.items() if are_convincing(one.frame, one.ranked)
+                k for k, one in self.found.items() if one.frame.first_is(convinces, one.ranked)
             ]
-            claims = self._claims(self.claimed)
+            claims = self._claims()
             changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
-            some = [k for k in changed if self._are_near(k, changed[k], self._features(k))]
+            some = [
+                k
+                for k, mask in changed.items()
+                if self._are_near(k, mask, self._features(k, self.found[k].ranked[0]))
+            ]
             if not some:
                 break
 
@@ -104,36 +100,48 @@ class Sharing:
             alike = {
                 k: one
                 for k, one in frames.items()
-                if len(one.views) == whole and not self._are_near(k, ~left[k], places[k])
+                if len(one.views) == whole
+                and not one.is_timed
+                and not self._are_near(k, ~left[k], places[k])
             }
             frames |= climbed_together(alike, self._shared)
-        ranked = {k: self.bodies[k].explain(one, quickly=True) for k, one in frames.items()}
-        return {k: Explanation(frames[k], left[k], ranked[k]) for k in some}
+        return {
+            k: Explanation(one, left[k], self.bodies[k].explain(one, quickly=True))
+            for k, one in frames.items()
+        }
 
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
         self._look(waiting)
-        while possible := [k for k in waiting if self.found[k].is_possible]:
+        while possible := [
+            k for k in waiting if self.found[k].frame.first_is(is_possible, self.found[k].ranked)
+        ]:
             winner = max(possible, key=lambda k: self.found[k].ranked[0].log_evidence)
             self.claimed.append(winner)
             waiting = [k for k in waiting if k != winner]
             # those that may have wanted the same, or are expected beside it
-            label = self.bodies[winner].label
-            beside = {k for k in waiting if label in self.tracks[k].companions}
-            self._look([k for k in waiting if k in beside or self._overlap(k, winner) > 0])
+            label, taken = self.bodies[winner].label, self._met(winner)[0]
+            self._look(
+                [
+                    k
+                    for k in waiting
+                    if label in self.tracks[k].companions
+                    or (self.found[k].ranked and np.isin(self._met(k)[0], taken).any())
+                ]
+            )
 
     def _look(self, some: Iterable[int]) -> None:
         """By all proposers, on what is left; identical bodies that are forgotten look as one."""
-        claims, twins = self._claims(self.claimed), dict[int, Explanation]()
+        claims, twins = self._claims(), dict[int, Explanation]()
         for k in some:
             body, track, left = self.bodies[k].body, self.tracks[k], claims.left(k)
             if self.bodies[k].instance is None or not self._is_forgotten(k):
                 self.found[k] = self._everywhere(k, left, track)
-                continue
-            if id(body) not in twins:
-                twins[id(body)] = self._everywhere(k, left, replace(track, branches=()))
-            own = self._frame(k, left, searches=twins[id(body)].frame.searches)
-            self.found[k] = replace(twins[id(body)], frame=own)
+            else:
+                if id(body) not in twins:
+                    twins[id(body)] = self._everywhere(k, left, replace(track, branches=()))
+                own = self._frame(k, left, searches=twins[id(body)].frame.searches)
+                self.found[k] = replace(twins[id(body)], frame=own)
 
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
@@ -144,23 +152,13 @@ class Sharing:
             data = replace(data, options=replace(data.options, search="live"))
         return Explanation(data, left, self.bodies[k].explain(data))
 
-    def _leave_merged(self) -> None:
-        """Take from bodies what they meet loosely beside another's feature: it is both's."""
-        claims = self._claims(self.claimed)
-        places = {k: self._features(k) for k in self.claimed}
-        for k in self.claimed:
-            numbers, squared = self._met(k)
-            loose = np.isin(np.arange(len(claims.owners)), numbers[squared > self.rules.pulled])
-            others = np.concatenate([places[k][:0], *(places[j] for j in places if j != k)])
-            loose &= claims.owners == k
-            self.merged += claims.near(loose, others, self.rules.touching).tolist()
-
     def _judge_again(self) -> None:
-        """Judge poses for which other detections are left by now; without merged ones, fit them."""
-        claims = self._claims(self.claimed)
+        """Judge poses for which other detections are left by now."""
+        claims = self._claims()
         for k, one in self.found.items():
             if not np.array_equal(left := claims.left(k), one.left):
-                self.found[k] = self._again(k, left, fitted=bool(self.merged))
+                data = self._frame(k, left, beside=one.frame.beside, searches=one.frame.searches)
+                self.found[k] = Explanation(data, left, judged_again(data, one.ranked))
 
     def _companion(self, k: int) -> Branch | None:
         """Where the body is expected beside that sure one which tells most."""
@@ -177,12 +175,6 @@ class Sharing:
         # the one that leaves the least volume
         return min(told, key=lambda one: float(np.log(one.uncertainty).sum()), default=None)
 
-    def _again(self, k: int, left: Mask, *, fitted: bool = False) -> Explanation:
-        """The poses of a body by what is left for it by now, and fitted to that."""
-        ranked, before = self.found[k].ranked, self.found[k].frame
-        data = self._frame(k, left, beside=before.beside, searches=before.searches)
-        return Explanation(data, left, judged_again(data, ranked, fitted=fitted))
-
     def _frame(self, k: int, left: Mask, track: Track | None = None, **known: Any) -> Frame:
         """What is left of the frame for a body, and what is known before it."""
         track, views = track or self.tracks[k], self._nobody.part(left)
@@ -192,19 +184,12 @@ class Sharing:
     def _nobody(self) -> Claims:
         return Claims.none(self.views)
 
-    def _claims(self, claimed: Sequence[int]) -> Claims:
-        """Whose each detection is, if some bodies have what they meet."""
-        return self._nobody.taken({k: self._met(k) for k in claimed}, self.merged)
+    def _claims(self) -> Claims:
+        """Whose each detection is by now."""
+        return self._nobody.taken({k: self._met(k) for k in self.claimed})
 
     def _met(self, k: int) -> Met:
         return self._nobody.met_by(self.found[k].ranked[0], self.found[k].left)
-
-    def _overlap(self, a: int, b: int) -> float:
-        """Share of the detections of the one that meets fewer that both meet."""
-        if not self.found[a].ranked or not self.found[b].ranked:
-            return 0.0
-        one, other = (set(self._met(k)[0].tolist()) for k in (a, b))
-        return len(one & other) / max(min(len(one), len(other)), 1)
 
     @cached_property
     def _shared(self) -> SharedDensities | None:
@@ -218,13 +203,13 @@ class Sharing:
         track = self.tracks[k]
         return not track.branches or track.misses > self.bodies[k].rules.motion.coasting
 
-    def _features(self, k: int) -> Floats:
-        return self._nobody.features(self.bodies[k].body, self.found[k].ranked[0].T_world_object)
+    def _features(self, k: int, pose: Branch | ScoredPose) -> Floats:
+        return self._nobody.features(self.bodies[k].body, pose.T_world_object)
 
     def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
         """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
         reach = self.bodies[k].rules.judgement.noise.errors.reach
-        return len(self._nobody.near(chosen, places, reach)) > 0
+        return self._nobody.are_near(chosen, places, reach)
 
 
 def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
@@ -232,21 +217,19 @@ def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> di
 
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
-    begun = dict(frames)
-    for k, one in frames.items():
-        if not one.is_timed:
-            drawn = matched_objective(one.views, one.body, one.sigmas, shared=shared)
-            begun[k] = replace(one, drawn=drawn)
+    begun = {
+        k: replace(one, drawn=matched_objective(one.views, one.body, one.sigmas, shared=shared))
+        for k, one in frames.items()
+    }
     starts = {
         k: Start(one.predictions[0].T_world_object, one.predictions[0].uncertainty)
         for k, one in begun.items()
-        if not one.is_timed and one.options.objective == "matched" and can_be_together(one.body)
+        if one.options.objective == "matched" and can_be_together(one.body)
     }
     if len(starts) < 2:
         return begun
-    objectives = [begun[k].finest for k in starts]
     poses, first = [one.T_world_object for one in starts.values()], begun[min(starts)]
-    ends = fit_together(objectives, poses, first.free, first.rules.fit)
+    ends = fit_together([begun[k].finest for k in starts], poses, first.free, first.rules.fit)
     fits, cases = dict[int, Fit](), list[Case]()
     for (k, start), end in zip(starts.items(), ends, strict=True):
         if end is not None:

@@ -32,9 +32,11 @@ class StaticClutter:
             nearest = _nearest(old, view.observation)
             is_met = np.isin(np.arange(len(old)), nearest)
             count = np.minimum(count + np.where(is_met, 1, -1), 2 * frames)
-            new = points[nearest == len(old)]
-            joined = np.concatenate([old[count > 0], new])
-            places[view.name] = joined, np.append(count[count > 0], np.ones(len(new), np.intp))
+            kept, new = count > 0, points[nearest == len(old)]
+            places[view.name] = (
+                np.concatenate([old[kept], new]),
+                np.append(count[kept], np.ones(len(new), np.intp)),
+            )
         return StaticClutter(places)
 
     def without(self, views: Sequence[View], frames: int) -> list[View]:

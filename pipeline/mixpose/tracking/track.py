@@ -75,13 +75,16 @@ class DelayEvidence:
         for k, view in enumerate(views):
             if view.unsure is not None:
                 late = self.seconds.get(view.name, DelaySeen(0.0, self.unknown_s))
-                known = replace(view, unsure=late.deviation, estimated=late.seconds)
-                applied[k] = replace(known, delay=view.delay + late.seconds)
+                applied[k] = replace(
+                    view,
+                    delay=view.delay + late.seconds,
+                    unsure=late.deviation,
+                    estimated=late.seconds,
+                )
         # a clock that differs by ten standard deviations is not the same: none is late then
         longest = min(10 * self.unknown_s, math.inf if elapsed is None else max(elapsed, 0.0))
-        if all(abs(view.delay) <= longest for view in applied):
-            return applied
-        return [replace(view, delay=0.0) for view in applied]
+        are_believed = all(abs(view.delay) <= longest for view in applied)
+        return applied if are_believed else [replace(view, delay=0.0) for view in applied]
 
 
 @dataclass(frozen=True)
@@ -135,10 +138,6 @@ class Track:
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
 
-    def applied(self, views: Sequence[View], time_s: float | None) -> list[View]:
-        """Views as late as they are known to be at a time."""
-        return self.delays.applied(views, time_s, self.seconds_until(time_s))
-
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s
@@ -157,12 +156,8 @@ class Track:
         if len(self.branches) == 1:
             return self.branches[0]
         scale = np.repeat([body.radius, 1.0], 3)
-
-        def away(branch: Branch) -> float:
-            twist = twist_between(branch.T_world_object, T_world_object) / scale
-            return float(np.linalg.norm(twist))
-
-        return min(self.branches, key=away, default=None)
+        away = [twist_between(one.T_world_object, T_world_object) / scale for one in self.branches]
+        return self.branches[int(np.linalg.norm(away, axis=1).argmin())] if away else None
 
 
 def predict(

@@ -6,21 +6,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Self
 
 import numpy as np
 from scipy.special import expit
 
 from mixpose.body import Body
-from mixpose.fit import EstimatorOptions, Fit, free_mask
+from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import APART, ScoredPose, Verdict, convinces, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Hypothesis, Mask, Offsets, SensorReport, label_of
+from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, is_known
-from mixpose.tracking.frame import Frame, follow
+from mixpose.tracking.frame import Frame, Setup, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.motion import per_kind
@@ -29,16 +28,11 @@ from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, predict
 
 
-@dataclass(frozen=True)
-class Tracker:
-    """A body, and how its poses are estimated: what stays the same from frame to frame."""
+@dataclass(frozen=True, eq=False)
+class Tracker(Setup):
+    """A tracked body: how its poses are sought and judged in each frame."""
 
-    body: Body
-    options: EstimatorOptions
-    samples: Floats  # (N, R, 3), of the body, for the objectives that integrate by sampling
-    start_uncertainty: Floats  # (6,)
     T_start: Floats | None = None  # (4, 4)
-    rules: Rules = Rules()
     proposers: tuple[Proposer, ...] = PROPOSERS  # as tried; the first: where it is expected
     refinements: tuple[Refinement, ...] = REFINEMENTS
     instance: int | None = None  # which of identical bodies, of the same `Body`; None: only one
@@ -54,20 +48,22 @@ class Tracker:
         distance: float | None = None,
         rules: Rules = Rules(),
         instance: int | None = None,
-    ) -> Self:
+    ) -> Tracker:
         """Prepare tracking, from about T_start (4, 4) within half-widths, or those of the rules."""
         start = per_kind(body, rules.motion.start)
         if distance is not None:
             start[:3] = distance
         if rotation_deg is not None:
             start[3:] = np.radians(rotation_deg)
-        samples = body.sample(options.samples, seed=options.seed)
-        return cls(body, options, samples, start, T_start, rules, instance=instance)
-
-    @property
-    def free(self) -> Mask:
-        """Which of the six directions are estimated."""
-        return free_mask(self.options)
+        return cls(
+            body,
+            options,
+            body.sample(options.samples, seed=options.seed),
+            start,
+            rules,
+            T_start,
+            instance=instance,
+        )
 
     @property
     def label(self) -> str:
@@ -102,15 +98,15 @@ class Tracker:
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
         data = Frame(
-            views=track.applied(seen, time_s),
-            body=self.body,
-            options=self.options,
-            samples=self.samples,
+            self.body,
+            self.options,
+            self.samples,
+            self.start_uncertainty,
+            self.rules,
+            views=track.delays.applied(seen, time_s, track.seconds_until(time_s)),
             track=track,
             predictions=predictions,
             T_reference=predictions[0].T_world_object if predictions else self.T_start,
-            start_uncertainty=self.start_uncertainty,
-            rules=self.rules,
             frame=frame,
             time_s=time_s,
             sensors=[view.name for view in views],
@@ -139,12 +135,11 @@ class Tracker:
         for propose in self.proposers if data.views else ():
             for start in propose(data, ranked):
                 judged = consider(start, propose.__name__)
-                if judged is None:
-                    continue
-                for refine in self.refinements:
-                    for better in refine(data, likelihood, judged):
-                        consider(better, refine.__name__)
-            if quickly and not are_convincing(data, ranked):
+                if judged and likelihood.knows_detections:
+                    for refine in self.refinements:
+                        for better in refine(data, likelihood, judged):
+                            consider(better, refine.__name__)
+            if quickly and not data.first_is(convinces, ranked):
                 break
             quickly = False
         return ranked
@@ -205,21 +200,15 @@ def estimate_pose(
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
 
 
-def are_convincing(data: Frame, ranked: Sequence[ScoredPose]) -> bool:
-    """Whether the best pose, near its prediction, needs no other to compare with."""
-    return any(convinces(best, data.free, data.rules.acceptance) for best in ranked[:1])
-
-
-def judged_again(
-    data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
-) -> list[ScoredPose]:
-    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first."""
+def judged_again(data: Frame, poses: Sequence[ScoredPose]) -> list[ScoredPose]:
+    """Poses that were fitted to other detections, judged by a frame, the most evident first."""
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
     for one in poses if data.views else ():
-        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
+        start = Start(one.T_world_object, left_out=one.left_out)
         fit = likelihood.fit(start)
-        judged, blurs = likelihood.judge(fit, start), fit.blurs or one.blurs
-        judged = replace(judged, proposer=one.proposer, blurs=blurs)
+        judged = replace(
+            likelihood.judge(fit, start), proposer=one.proposer, blurs=fit.blurs or one.blurs
+        )
         insert(ranked, judged, data.body, data.free, data.rules.acceptance)
     return ranked
 
@@ -235,8 +224,8 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     for one, weight in verdict.kept:
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
-        momentary = one.covariance - one.persistent
-        deviation = np.sqrt(momentary.diagonal()) if data.is_timed else None
+        momentary = (one.covariance - one.persistent).diagonal()
+        deviation = np.sqrt(momentary) if data.is_timed else None
         spread = one.spread if data.options.fuse else None
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
     used = best.used
@@ -252,7 +241,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         tallies=dict(zip(used.names, tallies)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,
-        known=is_known(data, best),
+        known=is_ok or is_known(data, best),
         believed=track.believed + is_ok,
         doubted=not is_ok,
     )
