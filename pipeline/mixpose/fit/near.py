@@ -267,10 +267,10 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
 def _are_drawn(views: Sequence[View], matches: Matches, reach: Floats) -> bool:
     """Whether features have detections of none within a reach (L,), in sensor units."""
     for k, view in enumerate(views):
-        points, met = view.observation.points, matches.shares[k] > 0
-        if points is None or len(points) <= np.count_nonzero(met):
+        taken = matches.detections[k][matches.shares[k] > 0]
+        if matches.count[k] <= len(taken) or (points := view.observation.points) is None:
             continue
-        others = np.delete(points, matches.detections[k][met], axis=0)
+        others = np.delete(points, taken, axis=0)
         away = others - matches.places[k, matches.weights[k] > 0, None, : matches.dimensions[k]]
         if (np.vecdot(away, away) < reach[k] ** 2).any():
             return True
