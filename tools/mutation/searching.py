@@ -308,8 +308,8 @@ _SEARCH = (
     Mutant(
         "search-held-shifts-move",
         "search/problem.py",
-        "np.where(self.free, twists, 0.0)",
-        "np.where(self.free | (np.arange(6) < 3), twists, 0.0)",
+        "self.free * twist_between(",
+        "(self.free | (np.arange(6) < 3)) * twist_between(",
         "directions that are not free change",
     ),
     Mutant(
