@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -107,6 +108,27 @@ def test_a_false_spot_beside_a_feature_does_not_draw_the_pose(
     left = apart(views, EIGHT, fitted(views, EIGHT), fitted(clean, EIGHT, NEVER))
     assert left < 0.8
     assert drawn > 1.5
+
+
+def test_a_false_spot_is_seen_beside_features_that_share_a_detection(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    clean = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=2)
+    seen = clean[0].observation
+    assert isinstance(seen.pattern, PointPattern)
+    # in place of the first feature's own spot, one that is as near to it and no feature's
+    points = seen.pattern.points.copy()
+    points[0] += [2.5 * seen.sigma, 0.0]
+    views = [view_of("0", clean[0].sensor, points), clean[1]]
+    objective, _ = at_sigma(views, EIGHT)
+    found, reach = matched(objective, TRUTH), np.full(2, 3.0 * seen.sigma)
+    assert found.detections[0].tolist().count(-1) == 1
+    others = found.detections.max(axis=1, keepdims=True)
+    shared = np.where(found.detections == -1, others, found.detections)
+    merged = replace(found, detections=shared, shares=found.weights)
+    assert near._are_drawn(views, merged, reach)
+    assert not near._are_drawn(views, merged, reach / 3)
+    assert not near._are_drawn(clean, matched(at_sigma(clean, EIGHT)[0], TRUTH), reach)
 
 
 def test_how_far_narrower_blurs_move_the_pose_is_known_before(

@@ -45,8 +45,8 @@ _NEAR = (
     Mutant(
         "fit-false-spots-draw-unnoticed",
         "fit/near.py",
-        "< reach[k] ** 2).any()",
-        "< 0).any()",
+        "places) < reach[k]).any()",
+        "places) < 0).any()",
         "the pose is drawn to a false spot beside a feature that is met",
     ),
     Mutant(

@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.fit.probable import FitRules, believed
@@ -267,13 +268,12 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
 def _are_drawn(views: Sequence[View], matches: Matches, reach: Floats) -> bool:
     """Whether features have detections of none within a reach (L,), in sensor units."""
     for k, view in enumerate(views):
-        taken = matches.detections[k][matches.shares[k] > 0]
-        if matches.count[k] <= len(taken) or (points := view.observation.points) is None:
-            continue
-        others = np.delete(points, taken, axis=0)
-        away = others - matches.places[k, matches.weights[k] > 0, None, : matches.dimensions[k]]
-        if (np.vecdot(away, away) < reach[k] ** 2).any():
-            return True
+        # merged features share a detection
+        taken = set(matches.detections[k][matches.shares[k] > 0].tolist())
+        if matches.count[k] > len(taken) and (points := view.observation.points) is not None:
+            places = matches.places[k, matches.weights[k] > 0, : matches.dimensions[k]]
+            if (cdist(np.delete(points, [*taken], axis=0), places) < reach[k]).any():
+                return True
     return False
 
 
