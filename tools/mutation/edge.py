@@ -130,8 +130,8 @@ _CHECKING = (
     Mutant(
         "checking-mirrored-tilts-left-out",
         "checking/lookalikes.py",
-        'np.einsum("lhkm,lhkmi->hi", weighted, J)',
-        '-np.einsum("lhkm,lhkmi->hi", weighted, J)',
+        "np.where(seen[..., None, None], J, 0.0)",
+        "-np.where(seen[..., None, None], J, 0.0)",
         "look-alikes are not found, as the steps turn the wrong way",
     ),
     Mutant(

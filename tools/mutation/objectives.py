@@ -131,8 +131,8 @@ _SAMPLED = (
     Mutant(
         "objective-left-of-the-image-is-seen",
         "objective/paper.py",
-        "maps[~((maps >= lower) & (maps <= upper))] = FAR",
-        "maps[~(maps <= upper)] = FAR",
+        "maps[~((maps >= lower) & (maps <= upper))] = DRAWING.far",
+        "maps[~(maps <= upper)] = DRAWING.far",
         "what a sensor cannot measure counts as measured",
     ),
     Mutant(

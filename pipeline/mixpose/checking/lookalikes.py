@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.body import Body
 from mixpose.objective import BodyProjection, project_body
-from mixpose.optimise import NewtonOptions, Quadratic, ascend
+from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, rotation_angle_deg
 from mixpose.search import far_apart, sparse, spread_turns
@@ -172,12 +172,12 @@ class _Paired:
 
 def _least_squares(toward: Floats, J: Floats, seen: Mask, noise: Floats) -> Quadratic:
     """Models of offsets (L, H, k, 2) with Jacobians (L, H, k, 2, 6), as far as they are seen."""
-    weights = (seen / noise[:, None, None] ** 2)[..., None]
-    weighted = weights * np.where(seen[..., None], toward, 0.0)
-    return Quadratic(
-        -0.5 * np.einsum("lhkm,lhkm->h", weighted, toward),
-        np.einsum("lhkm,lhkmi->hi", weighted, J),
-        np.einsum("lhkmi,lhkmj->hij", weights[..., None] * J, J, optimize=True),
+    scale, (L, H, n) = noise[:, None, None, None], seen.shape
+    residuals = np.where(seen[..., None], toward, 0.0) / scale
+    rows = np.where(seen[..., None, None], J, 0.0) / scale[..., None]
+    # of all sensors together, by pose
+    return squares_of(
+        residuals.swapaxes(0, 1).reshape(H, 2 * L * n), rows.swapaxes(0, 1).reshape(H, 2 * L * n, 6)
     )
 
 

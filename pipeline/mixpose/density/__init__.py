@@ -1,7 +1,7 @@
 """Densities g_l of where features are: blur, normalisation, windows, tiles, levels of blur."""
 
 from mixpose.density.atlas import Atlas as Atlas, remap as remap
-from mixpose.density.blur import DRAWING as DRAWING, FAR as FAR
+from mixpose.density.blur import DRAWING as DRAWING
 from mixpose.density.observation import (
     Density as Density,
     Observation as Observation,

@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mixpose.density.blur import DRAWING, FAR, blurred, mass, reduced
+from mixpose.density.blur import DRAWING, blurred, mass, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
 # tiles that are drawn at once: they have room for as many detections each
@@ -103,9 +103,8 @@ class Atlas:
     def _to_own_tiles(self, index: Floats) -> None:
         """Turn places in cells into those in tiles around them, in place."""
         around, shifts, values = self._own
-        if around.shape != index.shape or (
-            np.abs(index - around).max(initial=0.0) > 0.5 * self.tile
-        ):
+        is_left = around.shape != index.shape
+        if is_left or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
             around = np.rint(index)
             middles = around.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(middles) // len(index))
@@ -267,7 +266,7 @@ class Pages:
         self._room = np.zeros((1, side, columns, 3 * side), dtype=np.float32)
         self._drawn = 1
         # from a place in the plane to one in the array, by page; from nothing out of the array
-        self._shifts = np.full((columns, 2), FAR)
+        self._shifts = np.full((columns, 2), DRAWING.far)
 
     @property
     def values(self) -> Singles:

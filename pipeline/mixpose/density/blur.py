@@ -67,7 +67,6 @@ class DrawingRules:
 
 
 DRAWING = DrawingRules()
-FAR = DRAWING.far
 
 
 def blurred(

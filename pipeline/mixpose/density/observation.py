@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.density.atlas import Atlas, remap
-from mixpose.density.blur import DRAWING, FAR, blurred, mass, odd_factor, reduced
+from mixpose.density.blur import DRAWING, blurred, mass, odd_factor, reduced
 from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, PointPattern, Singles
 
 
@@ -58,7 +58,9 @@ class Density:
         """
         m = len(self.window.origin)
         index = (y.reshape(-1, m) - self.window.origin) / self.window.step
-        index = np.clip(np.nan_to_num(index, copy=False, nan=FAR), FAR, -FAR)
+        index = np.clip(
+            np.nan_to_num(index, copy=False, nan=DRAWING.far), DRAWING.far, -DRAWING.far
+        )
         u = index[None, :, 0].astype(np.float32)
         v = index[None, :, 1].astype(np.float32) if m == 2 else np.zeros_like(u)
         looked_up = remap(self.values, u, v).reshape(*y.shape[:-1], *self.values.shape[2:])

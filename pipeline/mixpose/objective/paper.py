@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.density import DRAWING, FAR, Density, remap
+from mixpose.density import DRAWING, Density, remap
 from mixpose.objective.matched import MatchedObjective, matched_objective
 from mixpose.objective.projection import View, pose_jacobian
 from mixpose.optimise import Quadratic
@@ -161,7 +161,7 @@ class _AffineMaps:
             by_pose = np.pad(by_pose, [(0, 0), (0, 0), (0, 0), (0, 3)])
             by_pose[3, 3, :, 4:] = P[:, :3]
         self._samples: Singles = np.ascontiguousarray(np.hstack(parts).T, dtype=np.float32)
-        lower, upper = np.clip(np.concatenate(limits, axis=1), FAR, -FAR)
+        lower, upper = np.clip(np.concatenate(limits, axis=1), DRAWING.far, -DRAWING.far)
         self._limits = [one[:, None].astype(np.float32) for one in (lower, upper)]
         # numbers within ±1 if the centre lies so that all samples are seen
         reach = sum(float(np.linalg.norm(one, axis=1).max()) for one in (parts[0], offsets))
@@ -174,7 +174,8 @@ class _AffineMaps:
     def at(self, poses: Floats) -> Singles:
         """Indices (k, 2 L, S) along columns and rows, sensor by sensor, at poses (k, 4, 4).
 
-        `FAR`, outside any array, for samples that a sensor does not see or that are not finite.
+        `DRAWING.far`, outside any array, for samples that a sensor does not see or that are not
+        finite.
         """
         rows, (c, count) = poses.reshape(-1, 16).dot(self._by_pose), self._samples.shape
         with np.errstate(all="ignore"):  # poses may be anywhere, even not finite
@@ -182,7 +183,7 @@ class _AffineMaps:
             maps = np.asarray(single.dot(self._samples).reshape(len(rows), -1, count))
             if not cv2.checkRange(rows[:, self._width :], True, -1.0, 1.0)[0]:
                 lower, upper = self._limits
-                maps[~((maps >= lower) & (maps <= upper))] = FAR
+                maps[~((maps >= lower) & (maps <= upper))] = DRAWING.far
         return maps
 
 

@@ -100,7 +100,7 @@ def ascend(
     """Climb to a maximum near each of H states."""
     climb = _Climb(states, at_start or term.linearise(states), free, options)
     going = everything = list(range(len(climb.gains)))
-    for _ in range(1, options.iterations):
+    for _ in range(options.iterations - 1):
         going = climb.unfinished(going)
         if not going:
             break

@@ -10,9 +10,9 @@ from mixpose.tracking.scene import (
     is_convincing as is_convincing,
 )
 from mixpose.tracking.track import (
-    DelayEvidence as DelayEvidence,
     Branch as Branch,
     Companion as Companion,
+    DelayEvidence as DelayEvidence,
     Track as Track,
     predict as predict,
 )

@@ -162,11 +162,8 @@ class Sharing:
 
     def _companion(self, k: int) -> Branch | None:
         """Where the body is expected beside that sure one which tells most."""
-        body, rules, known = (
-            self.bodies[k].body,
-            self.bodies[k].rules.motion,
-            self.tracks[k].companions,
-        )
+        body, rules = self.bodies[k].body, self.bodies[k].rules.motion
+        known = self.tracks[k].companions
         told = [
             known[label].expected(self.found[j].ranked[0].T_world_object, body, rules)
             for j in self.claimed
