@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -41,6 +42,16 @@ class PointPattern:
 
     points: Floats
     weights: Floats
+
+    @property
+    def size(self) -> int:
+        """M, the number of points."""
+        return len(self.points)
+
+    @cached_property
+    def total(self) -> float:
+        """Sum of the weights."""
+        return float(self.weights.sum())
 
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)
@@ -95,6 +106,16 @@ class GridPattern:
     values: NDArray[np.float32]
     origin: Floats
     step: float
+
+    @property
+    def size(self) -> int:
+        """The number of grid points."""
+        return self.values.size
+
+    @cached_property
+    def total(self) -> float:
+        """Sum of the values."""
+        return float(self.values.sum())
 
     @property
     def dimension(self) -> int:

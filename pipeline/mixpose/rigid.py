@@ -116,7 +116,7 @@ def perturb(T_world_object: Floats, twist: Floats) -> Floats:
 
 def twist_between(T_from: Floats, T_to: Floats) -> Floats:
     """The twist (..., 6) with ``perturb(T_from, twist) == T_to``."""
-    R_difference = T_to[..., :3, :3] @ np.swapaxes(T_from[..., :3, :3], -1, -2)
+    R_difference = T_to[..., :3, :3] @ T_from[..., :3, :3].swapaxes(-1, -2)
     if R_difference.ndim == 2:
         twist = np.empty(6)
         twist[:3] = T_to[:3, 3] - T_from[:3, 3]

@@ -28,8 +28,8 @@ _PREDICTION = (
     Mutant(
         "tracking-prior-as-wide-as-the-world",
         "tracking/frame.py",
-        "return float(np.logaddexp.reduce(terms)), spreads[terms.index(max(terms))]",
-        "return float(np.logaddexp.reduce(terms)), anywhere[1]",
+        "return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]",
+        "return float(reduce(np.logaddexp, terms)), anywhere[1]",
         "a pose near its prediction that meets one feature has high evidence",
         (_TRACK,),
     ),

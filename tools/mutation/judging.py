@@ -67,8 +67,8 @@ _FIELDS = (
     Mutant(
         "judgement-markers-off-are-noise",
         "judgement/noise.py",
-        "np.concatenate([rest @ fields[:, :q], r @ fields[:, q:]])",
-        "np.concatenate([rest @ fields[:, :q], 0 * r @ fields[:, q:]])",
+        "pulls**2 @ kinds[:, 1:]",
+        "pulls**2 @ kinds[:, 1:] * [1, 1, 0]",
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
@@ -113,7 +113,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-out-of-view-is-free",
         "judgement/judge.py",
-        "unseen = found.unseen.sum(axis=1) * detection.log_unseen",
+        "unseen = found.unseen.sum(axis=-1) * detection.log_unseen",
         "unseen = 0.0",
         "a pose gains by moving features out of the picture",
     ),
@@ -127,7 +127,7 @@ _EVIDENCE = (
     Mutant(
         "judgement-choices-cost-nothing",
         "judgement/judge.py",
-        "+ missed - ways +",
+        "+ missed - chosen - assigned +",
         "+ missed +",
         "among many detections some pose is sure to be found by chance",
     ),
@@ -162,22 +162,22 @@ _EVIDENCE = (
     Mutant(
         "judgement-a-point-in-space-counts-for-each-camera",
         "judgement/judge.py",
-        "together = np.nonzero(near.sum(axis=1) > 1)",
-        "together = np.nonzero(near.sum(axis=1) > 9)",
+        "are_several = near.sum(axis=-2) > 1",
+        "are_several = near.sum(axis=-2) > 9",
         "screws that all cameras see pass for the body",
     ),
     Mutant(
         "judgement-points-in-space-anywhere-are-the-feature",
         "judgement/judge.py",
-        "0.5 * (tight - away)",
-        "0.5 * tight",
+        "0.5 * (rarity + tight - np.expm1(both - tight))",
+        "0.5 * (rarity + tight)",
         "a false point beside a feature is as good as one at it",
     ),
     Mutant(
         "judgement-points-in-space-are-missed-again",
         "judgement/judge.py",
-        "gained[pose, feature], missed[pose, feature] = space[likelier], 0.0",
-        "gained[pose, feature] = space[likelier]",
+        "np.where(likelier, space, gained), np.where(likelier, 0.0, missed)",
+        "np.where(likelier, space, gained), missed",
         "a covered camera makes what two others see doubtful",
     ),
 )

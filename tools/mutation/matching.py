@@ -126,7 +126,7 @@ _RECORD = (
     Mutant(
         "matching-merged-features-move-as-one",
         "matching/associate.py",
-        "if merged.any():",
+        "if np.count_nonzero(merged):",
         "if False:",
         "the middle of two features moves as if it were one of them",
         ("test_tracking_outliers.py",),

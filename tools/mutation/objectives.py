@@ -67,8 +67,8 @@ _KERNEL = (
     Mutant(
         "objective-neighbours-taken-for-apart",
         "objective/matched.py",
-        "exponents.max(initial=-np.inf)",
-        "exponents.min(initial=0.0)",
+        "not np.count_nonzero(overlap)",
+        "not overlap.all()",
         "a body with some features close together is fitted as if they were apart",
     ),
     Mutant(

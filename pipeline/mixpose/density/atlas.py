@@ -71,7 +71,7 @@ class Atlas:
                 continue
             counts[k] = len(pattern.points)
             q.append(pattern.points * scale.per_unit[k, 0, 0])
-            share.append(pattern.weights / pattern.weights.sum())
+            share.append(pattern.weights / pattern.total)
         self._q, self._share = np.concatenate(q), np.concatenate(share).astype(np.float32)
         self._sensor = np.arange(len(counts)).repeat(counts)
         # cells along the part of a tile that is looked up
@@ -103,8 +103,7 @@ class Atlas:
     def _to_own_tiles(self, index: Floats) -> None:
         """Turn places in cells into those in tiles around them, in place."""
         around, shifts, values = self._own
-        is_left = around.shape != index.shape
-        if is_left or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
+        if around.shape != index.shape or np.abs(index - around).max(initial=0.0) > 0.5 * self.tile:
             around = np.rint(index)
             middles = around.reshape(-1, 2)
             sensors = np.arange(len(index)).repeat(len(middles) // len(index))
@@ -164,14 +163,14 @@ class Atlas:
         count, side, scale = len(middles), self._side, self._scale
         place = np.arange(len(of)) - of.searchsorted(of)
         most = int(place.max(initial=0)) + 1
-        begin = (self._q[which] - middles[of]) * (1 / scale.sigma)
+        begin = (self._q.take(which, axis=0) - middles.take(of, axis=0)) * (1 / scale.sigma)
         cells = (np.arange(side) - 0.5 * (side - 1)) * (1 / scale.sigma)
         away = begin.astype(np.float32)[..., None] - cells.astype(np.float32)
         bells = np.exp(np.float32(-0.5) * away * away)
         if scale.is_flat is not None:  # rows that are all alike
             flat = scale.is_flat[sensors[of]]
             bells[flat, 1], away[flat, 1] = 1.0, 0.0
-        bells[:, 1] *= self._share[which, None]
+        bells[:, 1] *= self._share.take(which)[:, None]
         slopes = bells * away
         slots = most * of + place
         along_v = np.zeros((count * most, 2, side), dtype=np.float32)

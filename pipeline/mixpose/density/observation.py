@@ -116,20 +116,14 @@ class Observation:
     @property
     def cells(self) -> int:
         """Number of cells, or of detections."""
-        return self._amounts.size
-
-    @cached_property
-    def weight(self) -> float:
-        """Sum of all weights or values."""
-        return float(self._amounts.sum())
+        return self.pattern.size
 
     @property
-    def _amounts(self) -> Floats | Singles:
-        return (
-            self.pattern.values if isinstance(self.pattern, GridPattern) else self.pattern.weights
-        )
+    def weight(self) -> float:
+        """Sum of all weights or values."""
+        return self.pattern.total
 
-    @cached_property
+    @property
     def is_empty(self) -> bool:
         """Whether the sensor saw no feature at all."""
         return is_empty(self.pattern)
@@ -206,10 +200,8 @@ def peak(variance: Any, dimension: Any) -> Any:
 def close_pairs(places: Floats, variances: Floats) -> Indices:
     """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m) at least.
 
-    At the variance of each; of few points, all pairs.
+    At the variance of each.
     """
-    if places.shape[1] ** 2 <= DRAWING.few_pairs:
-        return all_pairs(places.shape[1])
     reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
     each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
     return np.unique(np.concatenate(each), axis=0).astype(np.intp)
@@ -225,16 +217,20 @@ def all_pairs(count: int) -> Indices:
 
 def self_overlap(points: Floats, weights: Floats, variance: float) -> float:
     """⟨g, g⟩ = Σ_ij w_i w_j N(y_i − y_j; 0, v) of points (n, m) and weights (n,), v = 2σ²."""
-    i, j = close_pairs(points[None], np.array([variance])).T
-    away = points[i] - points[j]
-    bells = np.exp(np.vecdot(away, away) * (-0.5 / variance))
-    overlap = float(weights @ weights + 2 * (weights[i] * weights[j]) @ bells)
-    return overlap * float(peak(variance, points.shape[1]))
+    if len(points) ** 2 <= DRAWING.few_pairs:
+        away = points[:, None] - points
+        overlap = weights @ np.exp(np.vecdot(away, away) * (-0.5 / variance)) @ weights
+    else:
+        i, j = close_pairs(points[None], np.array([variance])).T
+        away = points[i] - points[j]
+        bells = np.exp(np.vecdot(away, away) * (-0.5 / variance))
+        overlap = weights @ weights + 2 * (weights[i] * weights[j]) @ bells
+    return float(overlap * peak(variance, points.shape[1]))
 
 
 def is_empty(pattern: Pattern) -> bool:
     """Whether a pattern has no feature at all."""
     if isinstance(pattern, PointPattern):
-        return len(pattern.points) == 0 or not pattern.weights.sum() > 0
+        return not pattern.total > 0
     # a profile below zero has no density, nor has one that single precision cannot normalise
     return not pattern.values.max() > 1e-30

@@ -222,7 +222,7 @@ def _to_the_noise(
 ) -> Fit:
     """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
     sigmas = np.array([view.observation.sigma for view in finest.views])
-    blurs, count, first = np.full(len(sigmas), blur), int(free.sum()), ascent
+    blurs, count, first = np.array([blur] * len(sigmas)), int(np.count_nonzero(free)), ascent
     likeliest, best = -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
@@ -236,7 +236,7 @@ def _to_the_noise(
         variances = np.minimum(variances, (before / errors.blur) ** 2)
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
-        is_noise = not (matches.squared > errors.outlying**2 * variances[:, None]).any()
+        is_noise = not np.count_nonzero(matches.squared > errors.outlying**2 * variances[:, None])
         is_noise = is_noise and not _are_drawn(finest.views, matches, errors.met * blurs * sigmas)
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
         if best is None and not is_end:

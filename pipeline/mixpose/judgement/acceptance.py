@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -123,7 +124,7 @@ def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules
     Poses that meet detections by chance come in numbers, and about equally good.
     """
     first, *others = ranked
-    rest = float(np.logaddexp.reduce([-np.inf, *(one.log_evidence for one in others)]))
+    rest = float(reduce(np.logaddexp, [one.log_evidence for one in others], -math.inf))
     return bool(
         first.coverage >= rules.doubtful_coverage
         and first.measurements >= np.count_nonzero(free) + rules.spare
@@ -207,13 +208,12 @@ def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: Noi
     Where that is not known, half as far beyond what is typical: half of σ_ε; right geometry has
     0.2.
     """
-    degrees = float(used.measurements.sum()) - 6
+    degrees = sum(used.measurements.tolist()) - 6
     if degrees < 1:
         return False
-    variance = model.errors.typical**2 / 4
-    if before[1] >= model.known:
-        variance = max(before[0] / before[1], LEAST_VARIANCE)
-    return bool(float(used.squares.sum()) / degrees >= rules.disagreeing * variance)
+    is_told, typical = before[1] >= model.known, model.errors.typical**2 / 4
+    variance = max(before[0] / before[1], LEAST_VARIANCE) if is_told else typical
+    return bool(sum(used.squares.tolist()) / degrees >= rules.disagreeing * variance)
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:

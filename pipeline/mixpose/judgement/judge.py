@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -28,7 +28,7 @@ from mixpose.constants import constant
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverted, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import Floats, Indices, Mask, SensorReport
+from mixpose.records import Floats, Mask, SensorReport
 
 Prior: TypeAlias = tuple[float, Floats]
 """What is known of a pose before its frame: log of its density, per length and radian of each free
@@ -93,23 +93,23 @@ class ScoredPose:
     @cached_property
     def coverage(self) -> float:
         """Mean share of the body's features in view that are met."""
-        return float(self.used.coverage.sum()) / len(self.used.names)
+        return float(sum(self.used.coverage.tolist())) / len(self.used.names)
 
     @cached_property
     def measurements(self) -> float:
         """Number of sensor coordinates that are met."""
-        return float(self.used.measurements.sum())
+        return float(sum(self.used.measurements.tolist()))
 
     @cached_property
     def features(self) -> tuple[int, int]:
         """Numbers of features that some sensor meets, and that some sensor has in view."""
-        met, in_view = self.matches.met_by, self.matches.weights.any(axis=0)
-        return int(np.count_nonzero(met)), int(np.count_nonzero(in_view))
+        in_view = self.matches.weights.any(axis=0)
+        return int(np.count_nonzero(self.matches.met_by)), int(np.count_nonzero(in_view))
 
-    @cached_property
+    @property
     def score(self) -> float:
         """Mean cosine between predicted and observed densities, 0 to 1."""
-        return float(np.sqrt(self.used.explained).sum()) / len(self.used.names)
+        return float(sum(np.sqrt(self.used.explained).tolist())) / len(self.used.names)
 
     @property
     def is_unlike(self) -> bool:
@@ -159,16 +159,18 @@ def judge_together(
 ) -> list[ScoredPose]:
     """Judge K poses that the same sensors see and take part in; those left out meet nothing."""
     left_out, whole, noises = left_out or {}, [], []
+    association = rules.association, rules.noise.errors.narrowest
     for objective, T, before, _, matches, noise in cases:
-        narrowest = rules.noise.errors.narrowest
-        whole.append(matches or associate(objective, T, rules.association, narrowest))
-        part = taken_part(whole[-1], left_out)
-        noises.append(noise_of(part, free, before, rules.noise, noise))
-    variances, seen = np.array([noise[0] for noise in noises]), Matches.stacked(whole)
+        whole.append(matches or associate(objective, T, *association))
+        noises.append(noise_of(taken_part(whole[-1], left_out), free, before, rules.noise, noise))
+    # one pose needs no axis of poses
+    variances, seen = noises[0][0], whole[0]
+    if len(cases) > 1:
+        variances, seen = np.array([noise[0] for noise in noises]), Matches.stacked(whole)
     if left_out:
         used = np.array([name not in left_out for name in whole[0].names])
-        measured, variances = variances, np.ones((len(whole), len(used)))
-        variances[:, used] = measured
+        measured, variances = variances, np.ones((*variances.shape[:-1], len(used)))
+        variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
     evidence, bent = _evidence(cases, seen, variances, free, rules.detection)
     return [
@@ -193,27 +195,35 @@ def _evidence(
     """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
     bodies = [case[0].projection.body for case in cases]
     priors = [case[3] or flat_prior(body, free, detection) for case, body in zip(cases, bodies)]
-    sizes, bent = np.array([2 * body.radius for body in bodies]), np.zeros((len(cases), 6, 6))
+    sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
+    bent = np.zeros((len(cases), 6, 6))
     given = seen, variances, free, priors, sizes, detection
     evidence = log_evidence(*given, information_of(seen, variances))
     if any(body.spread for body in bodies):
-        spreads = np.zeros((len(cases), seen.shares.shape[2], 3, 3))
-        for own, body, case in zip(spreads, bodies, cases, strict=True):
+        spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
+        by_pose = spreads.reshape(len(cases), *spreads.shape[-3:])
+        for own, body, case in zip(by_pose, bodies, cases, strict=True):
             turned = body.node_spreads(case[1])
             own[: len(turned)] = turned
         # rigid as a rule, and bent now and then: as often the one as the other
-        information, at_all = information_of(seen, variances, spreads), spreads.any(axis=(1, 2, 3))
+        information = information_of(seen, variances, spreads)
+        at_all = spreads.any(axis=(-3, -2, -1))
         both = np.logaddexp(evidence, log_evidence(*given, information, spreads)) - math.log(2)
         evidence = np.where(at_all, both, evidence)
         for k in np.flatnonzero(at_all).tolist():
-            bent[k][np.ix_(free, free)] = inverted(information[k][np.ix_(free, free)])
+            inner = np.ix_(free, free)
+            bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
     return evidence, bent
 
 
 def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
     """Nothing is known: anywhere within some radii of the body, turned in any way."""
-    room = detection.room * body.radius
-    shifts, turns = np.count_nonzero(free[:3]), np.count_nonzero(free[3:])
+    return _flat_prior(body, tuple(free.tolist()), detection.room * body.radius)
+
+
+@lru_cache(maxsize=64)
+def _flat_prior(body: Body, free: tuple[bool, ...], room: float) -> Prior:
+    shifts, turns = sum(free[:3]), sum(free[3:])
     rotations = 8 * math.pi**2 if turns == 3 else (2 * math.pi) ** turns
     volume = room**shifts * rotations / len(body.symmetries)
     return -math.log(volume), np.array([room] * 3 + [math.pi] * 3)
@@ -233,14 +243,15 @@ def log_evidence(
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
-    chosen = np.flatnonzero(free)
-    known = np.eye(len(chosen)) / wide[:, chosen, None] ** 2
-    inner = information[:, chosen[:, None], chosen] + known
+    (chosen,) = free.nonzero()
+    inner = (
+        information[..., chosen[:, None], chosen] + np.eye(len(chosen)) / wide[:, chosen, None] ** 2
+    )
     laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
     evidence = odds[0] + odds[1] + laplace + log_densities
     if detection.by_count:
         evidence = np.maximum(evidence, paid_by_count(odds, found, free))
-    return np.where(found.shares.any(axis=(1, 2)), evidence, -np.inf)
+    return np.where(found.met.any(axis=-1), evidence, -np.inf)
 
 
 def odds_of(
@@ -260,28 +271,27 @@ def odds_of(
     gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
-    is_blind = (gained + missed).sum(axis=2) < detection.log_blind
+    is_blind = (gained + missed).sum(axis=-1) < detection.log_blind
     shares = found.shares
-    if is_blind.any():
+    if np.count_nonzero(is_blind):
         even = found.weights / np.maximum(found.expected, 1.0)[..., None]
         missed = np.where(is_blind[..., None], even * detection.log_blind, missed)
         gained, shares = (one * ~is_blind[..., None] for one in (gained, shares))
     # a detection that chance puts as near is not the feature's
     near = (gained > 0) & (m == 2)[:, None]
-    gained, missed, coordinates = gained.sum(axis=1), missed.sum(axis=1), m @ shares
+    (gained, missed), coordinates = np.array([gained, missed]).sum(axis=-2), m @ shares
     # a feature that no sensor sees is covered, as if two had missed it: not one by one
-    most = 2 * detection.log_missed * found.weights.max(axis=1)
-    missed = np.where(shares.any(axis=1), missed, np.maximum(missed, most))
-    together = np.nonzero(near.sum(axis=1) > 1)
-    if detection.in_space and len(together[0]):
-        space, share = _in_space(found, roots, crowd, near, together, sizes, spreads)
-        likelier = space < (gained + missed)[together]
-        pose, feature = (index[likelier] for index in together)
-        gained[pose, feature], missed[pose, feature] = space[likelier], 0.0
-        most = 3 * share[likelier]
-        coordinates[pose, feature] = np.minimum(coordinates[pose, feature], most)
-    unseen = found.unseen.sum(axis=1) * detection.log_unseen
-    return gained.sum(axis=1), missed.sum(axis=1) + unseen, coordinates.sum(axis=1)
+    most = 2 * detection.log_missed * found.weights.max(axis=-2)
+    missed = np.where(shares.any(axis=-2), missed, np.maximum(missed, most))
+    are_several = near.sum(axis=-2) > 1
+    if detection.in_space and np.count_nonzero(are_several):
+        space, share = _in_space(found, roots, crowd, near, sizes, spreads)
+        likelier = are_several & (space < gained + missed)
+        gained, missed = np.where(likelier, space, gained), np.where(likelier, 0.0, missed)
+        coordinates = np.where(likelier, np.minimum(coordinates, 3 * share), coordinates)
+    unseen = found.unseen.sum(axis=-1) * detection.log_unseen
+    gained, missed, coordinates = np.array([gained, missed, coordinates]).sum(axis=-1)
+    return gained, missed + unseen, coordinates
 
 
 def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
@@ -290,42 +300,37 @@ def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
         return np.asarray(found.squared / (2 * roots**2)[..., None])
     r = (found.offsets / roots[..., None, None])[..., None]
     by_world = found.J[..., :3] / roots[..., None, None, None]
-    S = np.eye(2) + by_world @ spreads[:, None] @ by_world.swapaxes(3, 4)
-    away = (r * np.linalg.solve(S, r)).sum(axis=(3, 4))
+    S = np.eye(2) + by_world @ spreads[..., None, :, :, :] @ by_world.swapaxes(-2, -1)
+    away = (r * np.linalg.solve(S, r)).sum(axis=(-2, -1))
     return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
 
 
 def _in_space(
-    found: Matches,
-    roots: Floats,
-    crowd: Floats,
-    near: Mask,
-    chosen: tuple[Indices, ...],
-    sizes: Floats,
-    spreads: Floats | None,
+    found: Matches, roots: Floats, crowd: Floats, near: Mask, sizes: Floats, spreads: Floats | None
 ) -> tuple[Floats, Floats]:
-    """What features met by several cameras say if clutter are points in space (C,), and shares.
+    """What features met by several cameras say if clutter are points in space (K, N), and shares.
 
     A clutter point lies where the cameras see it; only that it lies at the feature tells.
     """
-    pose, feature = chosen
-    at, sizes, roots = (pose, slice(None), feature), sizes[pose, None, None], roots[pose][..., None]
-    met, J, r = near[at], found.J[..., :3][at] / roots[..., None], found.offsets[at] / roots
-    rows = (J * met[..., None, None]).reshape(len(pose), -1, 3).swapaxes(1, 2)
-    A = np.eye(3) / sizes**2 + rows @ rows.swapaxes(1, 2)
-    pull = rows @ r.reshape(len(pose), -1, 1)
-    place = np.linalg.solve(A, pull)
-    share = (met * found.shares[at]).max(axis=1)
+    *K, L, N = near.shape
+    J, r = found.J[..., :3] / roots[..., None, None, None], found.offsets / roots[..., None, None]
+    rows = (J * near[..., None, None]).swapaxes(-4, -3).reshape(*K, N, 2 * L, 3).swapaxes(-2, -1)
+    A = rows @ rows.swapaxes(-2, -1)
+    A.reshape(*K, N, 9)[..., ::4] += 1 / sizes[..., None, None] ** 2
+    pull = rows @ r.swapaxes(-3, -2).reshape(*K, N, 2 * L, 1)
+    share = (near * found.shares).max(axis=-2)
     # detections per area, of which each has a depth
-    (aa, ab), (_, bb) = (J @ J.swapaxes(2, 3)).transpose(2, 3, 0, 1)
-    squared = np.maximum(crowd[pose] ** 2 * (aa * bb - ab * ab), 1e-300)
-    rarity = np.where(met, np.log(sizes[:, 0] / np.sqrt(squared)), -np.inf)
+    a, b = J[..., 0, :], J[..., 1, :]
+    areas = np.vecdot(a, a) * np.vecdot(b, b) - np.vecdot(a, b) ** 2
+    squared = (crowd[..., None] ** 2 * areas).min(axis=-2, initial=1e300, where=near)
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
-        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads[chosen], A))
+        place = np.linalg.solve(A, pull)
+        A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads, A))
         pull = A @ place
-    away = (place * pull).sum(axis=(1, 2))
-    tight = np.linalg.slogdet(A / (2 * np.pi))[1]
-    return share * np.maximum(rarity.max(axis=1) + 0.5 * (tight - away), 0.0), share
+    # det(A + p pᵀ) is det(A) (1 + pᵀA⁻¹p)
+    tight, both = np.linalg.slogdet(np.array([A, A + pull @ pull.swapaxes(-2, -1)]))[1]
+    rarity = np.log(sizes[..., None] ** 2 / np.maximum(squared, 1e-300)) - 3 * math.log(2 * math.pi)
+    return share * np.maximum(0.5 * (rarity + tight - np.expm1(both - tight)), 0.0), share
 
 
 def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mask) -> Floats:
@@ -333,9 +338,11 @@ def paid_by_count(odds: tuple[Floats, Floats, Floats], found: Matches, free: Mas
     gained, missed, coordinates = odds
     expected, count = found.expected, np.count_nonzero(free)
     pins = -(-count // max(found.dimensions.tolist()))
-    observed, features = (found.count * (expected > 0)).sum(axis=1), expected.max(axis=1)
+    observed, features = np.vecdot(found.count, expected > 0), expected.max(axis=-1)
     # ways to choose detections, and to assign them to features
     some = np.maximum([observed, features], pins)
-    ways = (gammaln(some + 1) - gammaln(some - pins + 1)).sum(axis=0)
+    chosen, assigned = gammaln(some + 1) - gammaln(some - pins + 1)
     spare = np.maximum(1.0 - count / np.maximum(coordinates, 1.0), 0.0)
-    return np.asarray(gained * spare + missed - ways + (math.lgamma(pins + 1) - math.log(2)))
+    return np.asarray(
+        gained * spare + missed - chosen - assigned + (math.lgamma(pins + 1) - math.log(2))
+    )

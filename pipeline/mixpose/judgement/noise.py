@@ -99,15 +99,16 @@ def noise_of(
     what of it lasts from frame to frame and leaves velocities alone; what is remembered; and the
     ratio of residuals to the largest that those before let chance make.
     """
-    chosen = np.flatnonzero(free)
+    (chosen,) = free.nonzero()
     count, inner = len(chosen), (chosen[:, None], chosen)
     variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
     is_noise = found.squared <= model.errors.outlying**2 * scale[:, None]
     shares, noise = np.where(is_noise, found.shares, 0.0), np.sqrt(scale)
+    met = shares.sum(axis=1)
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, rows)
+    J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, met, rows)
     inverse = inverted(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
     drawn = inverse @ (J.T @ fields)
@@ -116,15 +117,14 @@ def noise_of(
     q = fields.shape[1] - 3 * shares.shape[1]
     lasting = left[:, :q] / (sizes := noise.repeat(q // len(noise)))
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
-    rest, (covariance, steady) = r, np.zeros((2, 6, 6))
-    if mean.any():
+    rest, pulls, (covariance, steady) = r, r @ fields, np.zeros((2, 6, 6))
+    if np.count_nonzero(mean):
         rest, moved = r - lasting @ mean, drawn[:, :q] / sizes
+        pulls[:q] = rest @ fields[:, :q]
         steady[inner] = moved @ second @ moved.T
-    pulls = np.concatenate([rest @ fields[:, :q], r @ fields[:, q:]])
-    redundancy = float(shares.sum(axis=1) @ found.dimensions) - count
-    own = _normal_equations(rest, redundancy, fields, left, pulls, kinds)
+    own = _normal_equations(rest, float(met @ found.dimensions) - count, fields, left, pulls, kinds)
     moments = model.memory * before.moments + own
-    by_kind, of_fields = _variances(moments, own, float(found.met.sum()) / len(found.names), model)
+    by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
@@ -154,39 +154,40 @@ def _level(
     rules, past = model.errors, before.of(matches.names)
     sums, ratio = model.memory * past, 0.0
     own, variances, *_ = estimate or errors_seen(matches, count, sums, rules)
-    known, degrees = float(past[1].sum()), float(own[1].sum())
+    known, degrees = sum(past[1].tolist()), sum(own[1].tolist())
     if known >= model.known and degrees >= 1:
-        ratio = float((own[0] / pooled(past, rules, 0.0)).sum()) / degrees
+        ratio = sum((own[0] / pooled(past, rules, 0.0)).tolist()) / degrees
         ratio /= float(fdtri(degrees, known, model.by_chance))
-    told = sums + own / [[max(ratio, 1.0)], [1.0]]
+    told = sums + own
     if ratio > 1:
+        told[0] = sums[0] + own[0] / ratio
         sums = np.zeros_like(past)
         own, variances, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
-    degrees = float(sums[1].sum())
+    degrees = sum(sums[1].tolist())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
     return variances, scale, told, degrees, ratio
 
 
-def _fields_of(found: Matches, shares: Floats, J: Floats) -> tuple[Floats, Floats]:
+def _fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[Floats, Floats]:
     """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
 
     Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
     about their middle (kind 2); of each marker what it is off by along the axes of the world (3).
     """
     L, N = shares.shape
-    total = np.maximum(shares.sum(axis=1), 1e-6)[:, None]
+    total = np.maximum(met, 1e-6)[:, None]
     away = found.places - ((shares[:, None] @ found.places)[:, 0] / total)[:, None]
     spread = np.vecdot(shares, np.vecdot(away, away))
     size = np.sqrt(spread / (found.dimensions * total[:, 0]))
-    by_feature = np.ones((L, N, 3))
-    by_feature[..., 1:] = away / np.maximum(size, 1e-6)[:, None, None]
-    by_feature *= np.sqrt(shares)[..., None]
+    by_feature, roots = np.empty((L, N, 3)), np.sqrt(shares)
+    by_feature[..., 0] = roots
+    by_feature[..., 1:] = away * (roots / np.maximum(size, 1e-6)[:, None])[..., None]
     columns, markers, kinds = _columns(tuple(found.dimensions.tolist()), N)
     of_sensors = by_feature[:, :, None, None, None] * columns
     # in units of how features move with the body, the root mean square of those in view
     by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
-    moved = math.sqrt(float(np.vecdot(by_place, by_place).sum()) / max(float(counts), 1.0))
+    moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
     of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * markers
     both = of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)
     return np.concatenate(both, axis=1), kinds
@@ -216,14 +217,15 @@ def _lasting(
     biases = {names: shown, **dict(others[:3])}  # of the last sets of sensors
     A, v = shown[:, :-1], shown[:, -1]
     if model.bias:
-        known = A + np.eye(len(v)) / model.bias**2
+        known = A.copy()
+        known.reshape(-1)[:: len(v) + 1] += 1 / model.bias**2
         mean = dposv(known, v)[1]
         # seldom as large as chance makes it for the least degrees of freedom
         if v @ mean > chdtri(1.0, 1 - model.by_chance):
             S = inverted(known)
             if v @ mean > chdtri(max(float((S * A).sum()), 1.0), 1 - model.by_chance):
                 return biases, mean, S + np.outer(mean, mean)
-    return biases, np.zeros_like(v), np.zeros_like(A)
+    return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
 def _normal_equations(
@@ -286,20 +288,19 @@ def inverted(information: Floats) -> Floats:
 
 
 def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (K, 6, 6) over the met features, for noise (K, L) in σ_ε².
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (..., 6, 6) over the met features, for noise (..., L) in σ_ε².
 
-    What features tell that are off by `spreads` (K, N, 3, 3) in the world is less.
+    What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
     """
-    frames, sensors, n, m, _ = found.J.shape
-    by_feature, weights = (frames, n, sensors * m, 6), found.shares / variances[..., None]
+    *poses, sensors, n, m, _ = found.J.shape
+    by_feature, weights = (*poses, n, sensors * m, 6), found.shares / variances[..., None]
     rows = found.J, weights[..., None, None] * found.J
-    J, scaled = (one.swapaxes(1, 2).reshape(by_feature) for one in rows)
-    information = scaled.swapaxes(2, 3) @ J
+    J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]
+    information = scaled.swapaxes(-2, -1) @ J
     if spreads is not None:
-        place = information[..., :3, :3]
-        taken = spreads @ np.linalg.inv(np.eye(3) + place @ spreads)
+        taken = spreads @ np.linalg.inv(np.eye(3) + information[..., :3, :3] @ spreads)
         information = information - information[..., :3] @ taken @ information[..., :3, :]
-    return np.asarray(information.sum(axis=1))
+    return np.asarray(information.sum(axis=-3))
 
 
 def invert_information(information: Floats, free: Mask) -> Floats:

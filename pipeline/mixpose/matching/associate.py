@@ -66,7 +66,7 @@ def associate(
             *mixture, match.sampled[k, 0, of, : 1 + m], amplitude, rules, all(is_grid)
         )
     J, merged = J / sigmas[:, None, None, None], (partner >= 0).sum(axis=1) // 2
-    if merged.any():
+    if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
@@ -210,7 +210,7 @@ def _surroundings(
     count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
-    if missing.any():
+    if np.count_nonzero(missing):
         half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
         near = np.abs(detections - middle[:, None]) <= half[:, None]
         beside = np.count_nonzero(near.all(axis=2), axis=1) - shares.sum(axis=1)

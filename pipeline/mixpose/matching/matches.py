@@ -54,7 +54,7 @@ class Matches:
             name: None if (array := getattr(self, name)) is None else array[index]
             for name in _BY_POSE
         }
-        return replace(self, **arrays)
+        return Matches(self.names, self.dimensions, self.sigmas, **arrays)
 
     def of_sensors(self, chosen: Sequence[int] | Mask | Indices) -> Matches:
         """Some of the sensors, by numbers or a mask, at one pose."""
@@ -187,10 +187,10 @@ def errors_seen(
     given = before, matches, free, known, rules
     at = np.ones(len(before))
     wide = _seen_at(at, *given)
-    while (wide[2] <= 0.9 * at).any():
+    while np.count_nonzero(wide[2] <= 0.9 * at):
         at = np.minimum(wide[2], at)
         wide = _seen_at(at, *given)
-    if (wide[2] <= 1.2 * before).all():
+    if not np.count_nonzero(wide[2] > 1.2 * before):
         return wide
     at, narrow = before, _seen_at(before, *given)
     for _ in range(3):  # as a rule it takes one
@@ -210,7 +210,7 @@ def _seen_at(
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
     weights = matches.shares * welsch(matches.squared, blurs)
-    sums = weights.sum(axis=1).tolist(), np.vecdot(weights, matches.squared).tolist()
+    sums = map(sum, weights.tolist()), np.vecdot(weights, matches.squared).tolist()
     coordinates, squares, degrees = [], [], []
     for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):
         coordinates.append(m * weight + 1e-12)
@@ -224,7 +224,8 @@ def _seen_at(
     most = sum(degrees)
     is_enough = most - free > 0.5
     left = 1 - free / most if is_enough else 0.0
-    own = np.array([squares, degrees]) * [[float(is_enough)], [left]]
+    own = float(is_enough) * np.array([squares, degrees])
+    own[1] *= left
     variances = pooled(known + own, rules, rules.typical_degrees)
     # narrower only where this frame alone allows it, too: it may not be like those before it
     wide = np.maximum(variances, pooled(own, rules, 0.0))
@@ -260,4 +261,4 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     common = (sum(squares) + typical * rules.typical**2) / max(most, 1e-12)
     pull = min(rules.typical_degrees, most)
     drawn = [(s + pull * common) / max(d + pull, 1e-12) for s, d in zip(squares, degrees)]
-    return np.maximum(drawn, LEAST_VARIANCE)
+    return np.array([max(variance, LEAST_VARIANCE) for variance in drawn])

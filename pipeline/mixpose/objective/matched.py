@@ -52,11 +52,11 @@ def overlaps(
     else:
         pairs = close_pairs(y.reshape(-1, n, 2), variances.repeat(y.shape[1]))
     i, j = pairs.T
-    away = y[:, :, i] - y[:, :, j]
+    away = y.take(i, axis=2) - y.take(j, axis=2)
     exponents = np.vecdot(away, away) * (-0.5 / variances)[..., None]
-    if not exponents.max(initial=-np.inf) > -DRAWING.negligible:
-        return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
     overlap = exponents > -DRAWING.negligible
+    if not np.count_nonzero(overlap):
+        return np.maximum(norm, _NONE), pairs[:0], exponents[..., :0], away[:, :, :0]
     near = np.flatnonzero(overlap.any(axis=(0, 1)))
     products = (weights[:, :, i] * weights[:, :, j])[..., near]
     bells = overlap[..., near] * products * np.exp(exponents[..., near]) * tops[..., None]
@@ -75,7 +75,7 @@ def slopes(match: Match, variances: Floats, tops: Floats, scales: Floats) -> Qua
     product = np.vecdot(match.sampled[..., 0], match.weights)
     amplitude = product / match.norm
     strength = 2 * scales * amplitude
-    value = (scales * product * amplitude).sum(axis=0)
+    value = 0.5 * np.vecdot(strength.T, product.T)
     gradient = (strength[..., None] * rest).sum(axis=0)
     drawn = (strength / variances)[..., None] * (match.sampled[..., 0] * match.weights)
     curvature = _gram(match.J, drawn[..., None, None] * match.J).sum(axis=0)

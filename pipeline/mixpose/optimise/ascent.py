@@ -116,9 +116,10 @@ class _Climb:
 
     def __init__(self, states: Any, here: Quadratic, free: Mask, options: NewtonOptions) -> None:
         count = len(here.value)
-        self.states, self._here, self._options, self._free = states, here, options, free
+        self.states, self._here, self._options = states, here, options
+        self._free = free.astype(np.float64)
         self._damping = [options.damping] * count
-        self.steps, self.gains = _steps(here, free, self._damping, options)
+        self.steps, self.gains = _steps(here, self._free, self._damping, options)
         self._before = [0.0] * count  # gains of the steps before these
         self._is_taken = [options.unchecked] * count  # whether the step is taken unseen
 
@@ -176,14 +177,17 @@ class _Climb:
 
 
 def _steps(
-    here: Quadratic, free: Mask, damping: list[float], options: NewtonOptions
+    here: Quadratic, free: Floats, damping: list[float], options: NewtonOptions
 ) -> tuple[Floats, list[float]]:
-    """Damped Newton steps (H, q), and the gains that the models expect of them."""
-    both = free & free[:, None]
+    """Damped Newton steps (H, q), and the gains that the models expect of them.
+
+    `free` (q,) is 1 along directions that may change, and 0.
+    """
+    both = free * free[:, None]
     C, g = here.curvature * both, here.gradient * free
     if here.hessian is not None:
         hessian = here.hessian * both
-        rest = hessian - options.least_curvature * C + np.diag(~free)
+        rest = hessian - options.least_curvature * C + np.diag(1 - free)
         definite = [dpotrf(one)[1] == 0 for one in rest]
         C = np.where(np.array(definite)[:, None, None], hessian, C)
     return _step(C[0], g[0], damping[0]) if len(g) == 1 else _many_steps(C, g, damping)

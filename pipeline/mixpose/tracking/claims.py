@@ -56,8 +56,9 @@ class Claims:
 
     def features(self, body: Body, T_world_object: Floats) -> Floats:
         """Where the sensors have the features of a body at a pose (n, 3)."""
-        sensors = tuple(view.sensor for view in self.views)
-        at = project_body(sensors, body).project(T_world_object[None])
+        at = project_body(tuple(view.sensor for view in self.views), body).project(
+            T_world_object[None]
+        )
         rows, features = np.nonzero(at.seen[:, 0])
         sigmas = np.array([view.observation.sigma for view in self.views])
         return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])

@@ -60,13 +60,16 @@ def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
 
 def is_known(data: Frame, judged: ScoredPose) -> bool:
     """Whether a pose is the body's, by what it meets or by where it was expected."""
-    are_ranges = (judged.matches.dimensions == 1).any()  # which are no markers in space
-    others = np.sort(judged.matches.met_by)[:-3]
+    are_ranges = 1 in judged.matches.dimensions.tolist()  # which are no markers in space
+    others = sorted(judged.matches.met_by.tolist())[:-3]
     # one sensor of several may meet a marker by chance
-    if are_ranges or not len(others) or others.sum() >= max(len(data.views) / 2, 1):
+    if are_ranges or not others or sum(others) >= max(len(data.views) / 2, 1):
         return True
-    is_followed = data.track.known and not data.track.misses
-    return is_followed and bool((data.prior(judged.T_world_object)[1] < data.anywhere[1]).all())
+    return (
+        data.track.known
+        and not data.track.misses
+        and bool((data.prior(judged.T_world_object)[1] < data.anywhere[1]).all())
+    )
 
 
 def is_reflection(data: Frame, judged: ScoredPose) -> bool:
@@ -78,7 +81,7 @@ def is_reflection(data: Frame, judged: ScoredPose) -> bool:
         return False
     ahead, met = rules.acceptance.standing_out, seen.met_by
     # of these the mirror image may meet more than the body
-    if np.minimum(seen.missed, seen.unmatched_nearby).sum() > 0.5:
+    if sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -76,7 +76,7 @@ class Frame(Setup):
         """σ_ε of each view."""
         return [view.observation.sigma for view in self.views]
 
-    @cached_property
+    @property
     def noise(self) -> Floats:
         """What is remembered of each view's noise: squares in σ_ε², degrees of freedom (2, L)."""
         return self.rules.judgement.noise.memory * self.track.residuals.of(
@@ -119,7 +119,7 @@ class Frame(Setup):
             terms.append(math.log(weight) + one.log_density(T, self.free, rules))
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
-        return float(np.logaddexp.reduce(terms)), spreads[terms.index(max(terms))]
+        return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

@@ -71,8 +71,7 @@ class MatchedLikelihood:
             return frame.together[0]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
-        is_bent = self.knows_detections and frame.body.spread
-        spread = given(frame, T) if is_bent else 0.0
+        spread = given(frame, T) if self.knows_detections and frame.body.spread else 0.0
 
         def climb(seen: Frame, T_start: Floats, beside: float = 0.0) -> Fit:
             return fit_near(

@@ -168,7 +168,7 @@ def _congruent(frame: Frame, best: ScoredPose) -> Sequence[LookAlike]:
     """Motions under which what is met at a pose lies like other features of the body."""
     body = frame.body
     # single ranges do not say what is met
-    if len(body.nodes.points) != len(body) or (best.matches.dimensions == 1).any():
+    if len(body.nodes.points) != len(body) or 1 in best.matches.dimensions.tolist():
         return ()
     met, rules = met_features(best), frame.rules.look_alikes
     return like_features(body, met, body, tolerance_of(body, body, rules.alike))
@@ -238,7 +238,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     """Least squares with the middle of two features that run into each other in one detection."""
     at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
-        if not seen.merged.any():
+        if not np.count_nonzero(seen.merged):
             break
         J, offsets = seen.rows()
         rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
@@ -253,7 +253,7 @@ def _paired(seen: Matches, reach: float) -> Matches:
 
     `reach` is how far that may be, squared, in variances of C.
     """
-    if not seen.missed.any():
+    if not np.count_nonzero(seen.missed):
         return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
     merged = seen.merged.copy()

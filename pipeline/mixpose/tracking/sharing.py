@@ -205,8 +205,9 @@ class Sharing:
 
     def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
         """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
-        reach = self.bodies[k].rules.judgement.noise.errors.reach
-        return self._nobody.are_near(chosen, places, reach)
+        return self._nobody.are_near(
+            chosen, places, self.bodies[k].rules.judgement.noise.errors.reach
+        )
 
 
 def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:

@@ -39,7 +39,7 @@ class Branch:
         """Of a pose before the frame that this predicts, in the directions that are free."""
         u = self.uncertainty[free]
         scaled = twist_between(self.T_world_object, T_world_object)[free] / u
-        count, volume = len(u), float(np.log(u).sum())
+        count, volume = len(u), float(sum(np.log(u).tolist()))
         if self.spread is not None:
             return float(-0.5 * scaled @ scaled) - 0.5 * count * math.log(2 * math.pi) - volume
         n = rules.known_from  # from a step or two: errors are Student's

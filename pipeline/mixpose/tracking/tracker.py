@@ -224,10 +224,9 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     for one, weight in verdict.kept:
         # what may be mere clutter counts as little in the next frame
         belief = weight * float(expit(one.log_evidence))
-        momentary = (one.covariance - one.persistent).diagonal()
-        deviation = np.sqrt(momentary) if data.is_timed else None
+        momentary = np.sqrt((one.covariance - one.persistent).diagonal()) if data.is_timed else None
         spread = one.spread if data.options.fuse else None
-        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=deviation))
+        found.append(Branch(one.T_world_object, belief, spread=spread, deviation=momentary))
     used = best.used
     counts, least = (used.shares > 0, used.weights > 0), data.rules.acceptance.agreeing
     tallies = list(zip(*[one.sum(axis=1).tolist() for one in counts], strict=True))
