@@ -72,6 +72,7 @@ def matches_of(*sensors: Seen) -> Matches:
         count=np.array([n if one.count is None else one.count for one, n in counts]),
         crowd=of_each("crowd") * sigmas**dimensions,
         unmatched_nearby=of_each("unmatched_nearby"),
+        beside=np.full(arrays["weights"].shape, np.nan),
         finest=of_each("finest"),
     )
 

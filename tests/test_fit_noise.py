@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -110,7 +109,7 @@ def test_a_false_spot_beside_a_feature_does_not_draw_the_pose(
     assert drawn > 1.5
 
 
-def test_a_false_spot_is_seen_beside_features_that_share_a_detection(
+def test_the_nearest_detection_but_its_own_is_seen_beside_each_feature(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     clean = detect(pinhole_cameras[:2], EIGHT, TRUTH, noise=NOISE_PX, seed=2)
@@ -119,16 +118,30 @@ def test_a_false_spot_is_seen_beside_features_that_share_a_detection(
     # in place of the first feature's own spot, one that is as near to it and no feature's
     points = seen.pattern.points.copy()
     points[0] += [2.5 * seen.sigma, 0.0]
-    views = [view_of("0", clean[0].sensor, points), clean[1]]
-    objective, _ = at_sigma(views, EIGHT)
-    found, reach = matched(objective, TRUTH), np.full(2, 3.0 * seen.sigma)
-    assert found.detections[0].tolist().count(-1) == 1
-    others = found.detections.max(axis=1, keepdims=True)
-    shared = np.where(found.detections == -1, others, found.detections)
-    merged = replace(found, detections=shared, shares=found.weights)
-    assert near._are_drawn(views, merged, reach)
-    assert not near._are_drawn(views, merged, reach / 3)
-    assert not near._are_drawn(clean, matched(at_sigma(clean, EIGHT)[0], TRUTH), reach)
+    objective, _ = at_sigma([view_of("0", clean[0].sensor, points), clean[1]], EIGHT)
+    found = matched(objective, TRUTH)
+    missed = int(np.flatnonzero(found.detections[0] == -1)[0])
+    assert found.beside[0, missed] == pytest.approx(2.5, abs=0.2)
+    others = np.delete(found.beside, missed, axis=1)
+    spots, places = clean[1].observation.points, found.places[1]
+    assert spots is not None
+    for i, place in enumerate(places):
+        away = np.linalg.norm(np.delete(spots, found.detections[1, i], axis=0) - place, axis=1)
+        assert found.beside[1, i] == pytest.approx(away.min() / found.sigmas[1])
+    assert others.min() > 3.0
+
+
+def test_neighbours_that_pull_send_a_fit_on_to_narrower_blurs(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    pairs = np.repeat(EIGHT.means[::2], 2, axis=0) + np.tile([[0.0] * 3, [0.0, 3.0, 4.0]], (4, 1))
+    body = Body("pairs", tuple(PointFeature(point) for point in pairs))
+    views = bent(detect(pinhole_cameras[:2], body, TRUTH, noise=NOISE_PX, seed=2), 0.9)
+    objective, _ = at_sigma(views, body)
+    assert np.nanmin(matched(objective, TRUTH).beside) < 3.0
+    spread, samples = np.repeat([2.0, 0.01], 3), body.means[:, None]
+    fit = fit_near(views, body, TRUTH, spread, EstimatorOptions(), samples)
+    assert len(fit.blurs) > 1
 
 
 def test_how_far_narrower_blurs_move_the_pose_is_known_before(

@@ -27,6 +27,7 @@ from mixpose.records import Estimate, Floats, PointPattern
 from mixpose.search import SearchResult, search_frame
 from mixpose.tracking import Scene, Track
 from mixpose.tracking.claims import Claims, places_of
+from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Sharing
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "several_bodies"
@@ -256,6 +257,17 @@ def test_a_detection_belongs_to_the_body_that_it_lies_nearer_to() -> None:
     first, second = (np.array([0, 1]), np.array([0.16, 0.0])), (np.array([0]), np.array([0.01]))
     assert claims.taken({0: first, 1: second}).owners.tolist() == [1, 0]
     assert claims.taken({1: second, 0: first}).owners.tolist() == [1, 0]
+
+
+def test_a_spot_between_two_bodies_is_neither_ones_and_one_that_is_met_closely_is() -> None:
+    claims, rules = spots([0.0, 0.0], [50.0, 0.0], [99.0, 0.0]), SceneRules()
+    loosely, closely = (np.array([0, 2]), np.array([2.25, 2.25])), (np.array([1]), np.array([0.01]))
+    places = {0: np.array([[-1.5, 0.0, 0.0], [97.5, 0.0, 0.0]]), 1: np.array([[1.5, 0.0, 0.0]])}
+    taken = claims.taken({0: loosely, 1: closely})
+    left = taken.without_merged({0: loosely, 1: closely}, places, rules)
+    # what lies beside no other body's feature is off for another reason
+    assert left.owners.tolist() == [-2, 1, 0]
+    assert left.left(0).tolist() == [False, False, True]
 
 
 def test_detections_are_expected_to_be_of_the_nearest_feature_of_all() -> None:

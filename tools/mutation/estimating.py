@@ -45,9 +45,9 @@ _NEAR = (
     Mutant(
         "fit-false-spots-draw-unnoticed",
         "fit/near.py",
-        "places) < reach[k]).any()",
-        "places) < 0).any()",
-        "the pose is drawn to a false spot beside a feature that is met",
+        "np.count_nonzero(matches.beside < errors.met",
+        "np.count_nonzero(matches.beside < 0 * errors.met",
+        "the pose is drawn to a false spot beside a feature that is met, or to a neighbour's",
     ),
     Mutant(
         "fit-prior-around-the-answer",

@@ -330,4 +330,23 @@ _STATIC = (
     ),
 )
 
-MUTANTS = (*_PREDICTION, *_MOTION, *_GATING, *_RANGE_POSTERIOR, *_TRACKER, *_STATIC)
+_SHARING = (
+    Mutant(
+        "tracking-merged-spots-stay-with-one-body",
+        "tracking/claims.py",
+        "owners[loose[near]] = -2",
+        "owners[loose[near]] = k",
+        "a spot that is two bodies' pulls at one of them",
+        ("test_several_bodies_scene.py",),
+    ),
+    Mutant(
+        "tracking-merged-spots-met-closely",
+        "tracking/claims.py",
+        "(squared > rules.pulled) & (self",
+        "(squared < rules.pulled) & (self",
+        "spots that are met closely are taken from their body beside another",
+        ("test_several_bodies_scene.py",),
+    ),
+)
+
+MUTANTS = (*_PREDICTION, *_MOTION, *_GATING, *_RANGE_POSTERIOR, *_TRACKER, *_STATIC, *_SHARING)

@@ -44,6 +44,13 @@ _ERRORS = (
 
 _MET = (
     Mutant(
+        "matching-own-detection-is-another",
+        "matching/associate.py",
+        "squared[*own, by[own]] = np.nan",
+        "squared[*own, by[own]] = 0.0",
+        "every feature is pulled by a detection beside it, it seems, and fits never end early",
+    ),
+    Mutant(
         "matching-detection-met-twice",
         "matching/associate.py",
         "if by[k, i] < 0 and (k, j) not in taken:",

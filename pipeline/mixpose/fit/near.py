@@ -15,7 +15,6 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.fit.probable import FitRules, believed
@@ -237,7 +236,8 @@ def _to_the_noise(
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = not np.count_nonzero(matches.squared > errors.outlying**2 * variances[:, None])
-        is_noise = is_noise and not _are_drawn(finest.views, matches, errors.met * blurs * sigmas)
+        # nor do other detections pull
+        is_noise &= not np.count_nonzero(matches.beside < errors.met * blurs[:, None])
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
         if best is None and not is_end:
             # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
@@ -263,18 +263,6 @@ def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]
         replace(view, observation=view.observation.around(y[seen, :m], reach))
         for view, y, seen, m in near
     ]
-
-
-def _are_drawn(views: Sequence[View], matches: Matches, reach: Floats) -> bool:
-    """Whether features have detections of none within a reach (L,), in sensor units."""
-    for k, view in enumerate(views):
-        # merged features share a detection
-        taken = set(matches.detections[k][matches.shares[k] > 0].tolist())
-        if matches.count[k] > len(taken) and (points := view.observation.points) is not None:
-            places = matches.places[k, matches.weights[k] > 0, : matches.dimensions[k]]
-            if (cdist(np.delete(points, [*taken], axis=0), places) < reach[k]).any():
-                return True
-    return False
 
 
 def _moved(matches: Matches, free: Mask, narrower: Floats, variances: Floats) -> float:

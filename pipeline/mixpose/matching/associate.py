@@ -57,7 +57,8 @@ def associate(
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
     shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    _to_nearest(y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met)
+    given = detections, rules.reach_squared * reach, is_open, rules.merged
+    others = _to_nearest(y, weights, *given, met)
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
@@ -86,6 +87,7 @@ def associate(
         count=count,
         crowd=crowd,
         unmatched_nearby=unmatched,
+        beside=np.where(seen, np.sqrt(others) / sigmas[:, None], np.nan),
         finest=np.fmin(np.maximum(narrowest, finest), 1.0),
         by_calibration=_by_calibration(objective, T_world_object),
     )
@@ -110,8 +112,11 @@ def _to_nearest(
     is_open: Mask,
     merged: bool,
     met: tuple[Floats, Floats, Indices, Indices],
-) -> None:
-    """Write what the nearest detections meet, each taken once or by a pair of features."""
+) -> Floats:
+    """Write what the nearest detections meet, each taken once or by a pair of features.
+
+    Returns squared distances (L, n) to the nearest detections but these.
+    """
     shares, offsets, by, _ = met
     away = detections[:, None] - y[:, :, None]
     squared = np.vecdot(away, away)
@@ -125,6 +130,9 @@ def _to_nearest(
         # only a feature near a detection that is taken can share it
         for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
             _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
+    own = (by >= 0).nonzero()
+    squared[*own, by[own]] = np.nan
+    return np.asarray(np.fmin.reduce(squared, axis=2))
 
 
 def _run_together(

@@ -45,6 +45,7 @@ class Matches:
     count: Floats  # (..., L) number of detections
     crowd: Floats  # (..., L) of them per m-th power of σ_ε, around the prediction
     unmatched_nearby: Floats  # (..., L) of no feature, about the body, where some feature is missed
+    beside: Floats  # (..., L, N) how far the nearest detection but its own is, σ_ε; NaN for none
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
 

@@ -161,6 +161,7 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         count=nothing + [len(one.points) for one in sensors],
         crowd=crowd,
         unmatched_nearby=nothing,
+        beside=np.full(seen.shape, np.nan),
         finest=nothing + 1.0,
     )
 

@@ -17,6 +17,7 @@ from mixpose.body import Body
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask
+from mixpose.tracking.rules import SceneRules
 
 Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
 
@@ -31,7 +32,7 @@ class Claims:
     views: tuple[View, ...]  # of L sensors
     places: Floats  # (D, 3)
     begins: Indices  # (L + 1,), where the detections of each sensor begin
-    owners: Indices  # (D,), the number of a body; -1: nobody's so far
+    owners: Indices  # (D,), the number of a body; -1: nobody's so far, -2: two bodies'
 
     @classmethod
     def none(cls, views: Sequence[View]) -> Claims:
@@ -88,9 +89,17 @@ class Claims:
             owners[numbers[nearer]], nearest[numbers[nearer]] = k, squared[nearer]
         return replace(self, owners=owners)
 
-    def are_near(self, chosen: Mask, places: Floats, reach: float) -> bool:
-        """Whether any of some detections (D,) lies within reach, in σ_ε, of places (n, 3)."""
-        return bool((cdist(self.places[chosen], places) < reach).any())
+    def without_merged(
+        self, met: Mapping[int, Met], places: Mapping[int, Floats], rules: SceneRules
+    ) -> Claims:
+        """Without what a body meets loosely beside another's feature, at places (n, 3): both's."""
+        owners = self.owners.copy()
+        for k, (numbers, squared) in met.items():
+            loose = numbers[(squared > rules.pulled) & (self.owners[numbers] == k)]
+            others = np.concatenate([self.places[:0], *(places[j] for j in places if j != k)])
+            near = cdist(self.places[loose], others).min(axis=1, initial=np.inf) < rules.touching
+            owners[loose[near]] = -2
+        return replace(self, owners=owners)
 
 
 def places_of(sensors: int | Indices, y: Floats) -> Floats:

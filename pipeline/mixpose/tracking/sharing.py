@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from mixpose.fit import Fit, fit_together
 from mixpose.judgement import Case, ScoredPose, Verdict, convinces, is_possible, judge_together
@@ -153,8 +154,10 @@ class Sharing:
         return Explanation(data, left, self.bodies[k].explain(data))
 
     def _judge_again(self) -> None:
-        """Judge poses for which other detections are left by now."""
-        claims = self._claims()
+        """Fit poses again for which other detections are left by now, without merged ones."""
+        places = {k: self._features(k, self.found[k].ranked[0]) for k in self.claimed}
+        met = {k: self._met(k) for k in self.claimed}
+        claims = self._nobody.taken(met).without_merged(met, places, self.rules)
         for k, one in self.found.items():
             if not np.array_equal(left := claims.left(k), one.left):
                 data = self._frame(k, left, beside=one.frame.beside, searches=one.frame.searches)
@@ -205,9 +208,8 @@ class Sharing:
 
     def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
         """Whether detections (D,) pull at features of body k that are at places (n, 3)."""
-        return self._nobody.are_near(
-            chosen, places, self.bodies[k].rules.judgement.noise.errors.reach
-        )
+        reach = self.bodies[k].rules.judgement.noise.errors.reach
+        return bool((cdist(self._nobody.places[chosen], places) < reach).any())
 
 
 def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
