@@ -49,6 +49,7 @@ _MET = (
         "squared[*own, by[own]] = np.nan",
         "squared[*own, by[own]] = 0.0",
         "every feature is pulled by a detection beside it, it seems, and fits never end early",
+        ("test_fit_noise.py",),
     ),
     Mutant(
         "matching-detection-met-twice",
