@@ -340,6 +340,14 @@ _SHARING = (
         ("test_several_bodies_scene.py",),
     ),
     Mutant(
+        "tracking-merged-spots-are-left-out-of-evidence-alone",
+        "tracking/sharing.py",
+        "are_fitted = -2 in claims.owners",
+        "are_fitted = False",
+        "a pose stays where a spot of two bodies has pulled it",
+        ("test_several_bodies_scene.py",),
+    ),
+    Mutant(
         "tracking-merged-spots-met-closely",
         "tracking/claims.py",
         "(squared > rules.pulled) & (self",

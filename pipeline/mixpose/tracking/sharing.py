@@ -154,14 +154,17 @@ class Sharing:
         return Explanation(data, left, self.bodies[k].explain(data))
 
     def _judge_again(self) -> None:
-        """Fit poses again for which other detections are left by now, without merged ones."""
+        """Judge poses for which other detections are left by now; without merged ones, fit them."""
         places = {k: self._features(k, self.found[k].ranked[0]) for k in self.claimed}
         met = {k: self._met(k) for k in self.claimed}
         claims = self._nobody.taken(met).without_merged(met, places, self.rules)
+        are_fitted = -2 in claims.owners
         for k, one in self.found.items():
             if not np.array_equal(left := claims.left(k), one.left):
                 data = self._frame(k, left, beside=one.frame.beside, searches=one.frame.searches)
-                self.found[k] = Explanation(data, left, judged_again(data, one.ranked))
+                self.found[k] = Explanation(
+                    data, left, judged_again(data, one.ranked, fitted=are_fitted)
+                )
 
     def _companion(self, k: int) -> Branch | None:
         """Where the body is expected beside that sure one which tells most."""

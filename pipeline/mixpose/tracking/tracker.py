@@ -200,11 +200,13 @@ def estimate_pose(
     return replace(estimate, latency_ms=1e3 * (time.perf_counter() - began))
 
 
-def judged_again(data: Frame, poses: Sequence[ScoredPose]) -> list[ScoredPose]:
-    """Poses that were fitted to other detections, judged by a frame, the most evident first."""
+def judged_again(
+    data: Frame, poses: Sequence[ScoredPose], *, fitted: bool = False
+) -> list[ScoredPose]:
+    """Poses of other detections, judged by a frame and `fitted` to it, the most evident first."""
     likelihood, ranked = likelihood_of(data), list[ScoredPose]()
     for one in poses if data.views else ():
-        start = Start(one.T_world_object, left_out=one.left_out)
+        start = Start(one.T_world_object, data.close if fitted else None, left_out=one.left_out)
         fit = likelihood.fit(start)
         judged = replace(
             likelihood.judge(fit, start), proposer=one.proposer, blurs=fit.blurs or one.blurs
