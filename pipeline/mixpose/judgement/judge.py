@@ -223,10 +223,12 @@ def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:
 
 @lru_cache(maxsize=64)
 def _flat_prior(body: Body, free: tuple[bool, ...], room: float) -> Prior:
+    wide = np.array([room] * 3 + [math.pi] * 3)
+    wide.flags.writeable = False  # all frames have the same
     shifts, turns = sum(free[:3]), sum(free[3:])
     rotations = 8 * math.pi**2 if turns == 3 else (2 * math.pi) ** turns
     volume = room**shifts * rotations / len(body.symmetries)
-    return -math.log(volume), np.array([room] * 3 + [math.pi] * 3)
+    return -math.log(volume), wide
 
 
 def log_evidence(

@@ -57,8 +57,9 @@ def associate(
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
     shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
-    given = detections, rules.reach_squared * reach, is_open, rules.merged
-    others = _to_nearest(y, weights, *given, met)
+    others = _to_nearest(
+        y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met
+    )
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
         of, m, amplitude = seen[k], dimensions[k], float(product[k] / match.norm[k, 0])
