@@ -185,15 +185,28 @@ def test_frames_simulated_by_other_processes_are_those_of_this_one() -> None:
     assert here.statuses == there.statuses
 
 
-def test_sensors_are_weighed_by_sigma_and_not_by_what_they_err_by() -> None:
-    """Of two beams that see the same, the one that errs four times as much counts as much."""
+def test_ranges_alone_are_weighed_by_sigma_and_not_by_what_they_err_by() -> None:
+    """Of two ranges that see the same, the one that errs four times as much counts as much."""
+    first, second = (RangeSensor(np.array(place)) for place in ([0.0, -900.0, 0.0], [900.0, 0, 0]))
+    ranges = (first, first, second, second)
+    unlike = (0.1, 0.4, 0.1, 0.4)
+    plan = Plan(("a", "b", "c", "d"), ranges, unlike, (1.0,) * 4, body_of(POINTS), ALL)
+    mean = np.sqrt((0.1**2 + 0.4**2) / 4)  # of two measurements with equal weights
+    alone = Plan(("a", "c"), (first, second), (mean, mean), (1.0, 1.0), plan.body, ALL)
+    expected = predict(alone, POSE[None]).covariances
+    np.testing.assert_allclose(predict(plan, POSE[None]).covariances, expected, rtol=1e-9)
+
+
+def test_sensors_are_weighed_by_sigma_and_by_the_noise_that_they_show() -> None:
     first, second, _ = three_beams()
     beams = (first, first, second, second)
     unlike = (0.1, 0.4, 0.1, 0.4)
     plan = Plan(("a", "b", "c", "d"), beams, unlike, (1.0,) * 4, body_of(POINTS), ALL)
-    mean = np.sqrt((0.1**2 + 0.4**2) / 4)  # of two measurements with equal weights
-    alone = Plan(("a", "c"), (first, second), (mean, mean), (1.0, 1.0), plan.body, ALL)
-    expected = predict(alone, POSE[None]).covariances
+    alone = Plan(("a", "c"), (first, second), (1.0, 1.0), (1.0, 1.0), plan.body, ALL)
+    # a quarter of the noise is that of all sensors: variances of 0.75 s² and a quarter of 0.085
+    shares = 1 / (0.75 * np.square(unlike[:2]) + 0.25 * 0.085)
+    mean = float(np.sqrt((shares * unlike[:2]) @ (shares * unlike[:2])) / shares.sum())
+    expected = predict(replace(alone, noises=(mean, mean)), POSE[None]).covariances
     np.testing.assert_allclose(predict(plan, POSE[None]).covariances, expected, rtol=1e-9)
     # with sigma in proportion, as of one measurement whose information is the sum
     weighed = replace(plan, sigmas=unlike)

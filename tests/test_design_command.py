@@ -36,13 +36,13 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     one = text[: text.index('[[sensor]]\nname = "right"')].replace('"tracker"', '"other"')
     (tmp_path / "one.toml").write_text(one, encoding="utf-8")
     options = ("--count", "6", "--tip", "0,0,-100", "--json", "d.json", "--plot", "d.png")
-    noise = ("--noise", "one:left=0.1", "--noise", "two:right=1.2")
+    noise = ("--noise", "one:left=0.1", "--noise", "two:left=0.03", "--noise", "two:right=1.2")
     done = run("two.toml", "one.toml", *options, *noise, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "two: features err by left 0.3 px, right 1.2 px" in done.stdout
+    assert "two: features err by left 0.03 px, right 1.2 px" in done.stdout
     assert "one: features err by left 0.1 px" in done.stdout
     assert (
-        "weights   sigma in proportion to what features err by (left 0.25, right 1)" in done.stdout
+        "weights   sigma in proportion to what features err by (left 0.025, right 1)" in done.stdout
     )
     assert "sigma     features err by much of sigma: right 0.8 of it" in done.stdout
     assert "moving mark" in done.stdout

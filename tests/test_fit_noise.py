@@ -85,12 +85,13 @@ def test_an_outlier_among_many_detections_is_left_where_it_moves_nothing(
         return matched_objective(views, body, sigmas)
 
     monkeypatch.setattr(near, "matched_objective", recorded)
-    T = fitted(views, MANY)
+    half = FitRules(moved=0.5)
+    T = fitted(views, MANY, half)
     assert drawn == [[1.5, 1.5]]
     narrow = fitted(views, MANY, ALWAYS)
     assert len(drawn) > 2
     # foreseen by two steps of several
-    assert 0 < apart(views, MANY, T, narrow) < FitRules().moved * 1.4
+    assert 0 < apart(views, MANY, T, narrow) < half.moved * 1.4
 
 
 @pytest.mark.parametrize("away", [1.8, 2.4])
@@ -192,3 +193,28 @@ def test_the_noise_of_frames_before_counts(pinhole_cameras: list[PinholeCamera])
     # where detections erred by 0.6 px so far, one that is 0.4 px off is no outlier
     off = [apart(views, EIGHT, end, TRUTH) for end in ends]
     assert off[1] < off[0] / 2
+
+
+def test_sensors_weigh_by_the_noise_that_they_showed_and_not_by_what_calibrations_err_by(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    spread, samples = np.repeat([2.0, 0.01], 3), EIGHT.means[:, None]
+    deviations = np.array([0.02, 0.4]) / 1.5
+    known = np.array([200 * deviations**2, [200.0, 200.0]])
+    covariance, _ = expected_covariance(pinhole_cameras, [0.4, 0.4], EIGHT, TRUTH, ALL_FREE)
+    squared = {0.0: 0.0, 1.0: 0.0}
+    for seed in range(20):
+        views = [
+            detect(pinhole_cameras, EIGHT, TRUTH, noise=noise, seed=seed)[k]
+            for k, noise in enumerate((0.02, 0.4))
+        ]
+        rest = views, EIGHT, TRUTH, spread, EstimatorOptions(), samples
+        for fields in squared:
+            end = fit_near(*rest, noise=known, fields=fields).T_world_object
+            twist = twist_between(TRUTH, end)
+            squared[fields] += float(twist @ np.linalg.solve(covariance, twist)) / (6 * 20)
+    # of two that weigh the same, errors of one count half: a quarter of 0.4² over 0.4² / 2
+    assert 0.3 < squared[1.0] < 0.8
+    # a quarter of the noise is taken for common, so that weights are 1 : 7 at most; each camera
+    # alone tells of what lies along the other's line of sight
+    assert squared[0.0] < 0.5 * squared[1.0]

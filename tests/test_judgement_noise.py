@@ -189,3 +189,14 @@ def test_markers_off_in_all_sensors_alike_are_in_the_covariance() -> None:
     # where they are said to be is believed as surely as one frame of twenty tells
     assert np.mean(plain[20:]) > 2.5
     assert 0.8 < np.mean(errors[20:]) < 1.4
+
+
+def test_what_features_of_a_sensor_are_off_by_in_common_is_told_from_their_noise() -> None:
+    for common, least, most in ((0.0, 0.0, 0.2), (0.5, 0.8, 1.0)):
+        rng, residuals = np.random.default_rng(8), RememberedNoise()
+        assert residuals.fields == 1.0  # nothing is known of a sensor's own noise
+        for _ in range(20):
+            found = [sensor(name, rng, np.zeros((12, 2))) for name in "01"]
+            made = [rng.normal(0, common, 2) + rng.normal(0, 0.1, (12, 2)) for _ in found]
+            _, residuals = judged(fitted(found, made)[0], residuals)
+        assert least <= residuals.fields < most

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from detections import (
@@ -17,6 +19,7 @@ from detections import (
 from mixpose.body import Body, PointFeature
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
+from mixpose.judgement import RememberedNoise
 from mixpose.objective import View
 from mixpose.objective.matched import STEPS_PER_SIGMA
 from mixpose.records import PointPattern
@@ -34,6 +37,29 @@ from mixpose.tracking import Tracker, estimate_pose
 @pytest.fixture
 def body() -> Body:
     return EIGHT
+
+
+def test_a_camera_that_showed_little_noise_so_far_weighs_more(
+    body: Body, pinhole_cameras: list[PinholeCamera]
+) -> None:
+    tracker = Tracker.create(body, EstimatorOptions(), TRUTH)
+    known = np.array([200 * np.array([0.02, 0.4]) ** 2 / 1.5**2, [200.0, 200.0]])
+    off = []
+    # by each camera's own noise, and by noise that may as well be what calibrations err by
+    for fields in (0.0, 1.0):
+        before = RememberedNoise(("0", "1"), known, fields=fields)
+        track = replace(tracker.begin(), residuals=before)
+        squared = 0.0
+        for seed in range(8):
+            exact, noisy = (
+                detect(pinhole_cameras, body, TRUTH, noise=noise, seed=seed)
+                for noise in (0.02, 0.4)
+            )
+            T = tracker.advance(track, 0, None, [exact[0], noisy[1]])[1].T_world_object
+            assert T is not None
+            squared += float(rotation_angle_deg(T, TRUTH)) ** 2
+        off.append(squared)
+    assert off[0] < 0.6 * off[1]
 
 
 def test_hidden_markers_and_clutter_do_not_move_the_pose(

@@ -45,8 +45,8 @@ _NEAR = (
     Mutant(
         "fit-false-spots-draw-unnoticed",
         "fit/near.py",
-        "np.count_nonzero(matches.beside < errors.met",
-        "np.count_nonzero(matches.beside < 0 * errors.met",
+        "far | (matches.beside < errors.met",
+        "far | (matches.beside < 0 * errors.met",
         "the pose is drawn to a false spot beside a feature that is met, or to a neighbour's",
     ),
     Mutant(
@@ -62,8 +62,8 @@ _NARROW = (
     Mutant(
         "fit-ends-at-sigma",
         "fit/near.py",
-        "not np.count_nonzero(matches.squared > errors.outlying**2 * variances[:, None])",
-        "True",
+        "return not np.count_nonzero(far | (matches.beside < errors.met * blurs[:, None]))",
+        "return True",
         "a cut spot bends the pose",
         ("test_fit_noise.py",),
     ),
@@ -73,6 +73,22 @@ _NARROW = (
         "< rules.moved**2",
         "< 0.0",
         "fits of large bodies draw every density three times",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-sensors-weigh-the-same",
+        "fit/near.py",
+        "objective.weighed_by(blurs * blurs / weighed)",
+        "objective",
+        "a camera that finds spots to 0.02 px counts no more than one that errs by 0.4 px",
+        ("test_fit_noise.py",),
+    ),
+    Mutant(
+        "fit-errors-of-calibration-are-noise",
+        "fit/near.py",
+        "max(fields, errors.common)",
+        "errors.common",
+        "a camera that was turned after its calibration hardly counts",
         ("test_fit_noise.py",),
     ),
     Mutant(

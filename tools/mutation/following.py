@@ -330,6 +330,25 @@ _STATIC = (
     ),
 )
 
+_NOISE = (
+    Mutant(
+        "tracking-no-noise-is-a-sensor-s-own",
+        "tracking/likelihood.py",
+        "fields=seen.track.residuals.fields",
+        "fields=1.0",
+        "sensors weigh the same, whatever noise they showed",
+        ("test_tracking.py",),
+    ),
+    Mutant(
+        "tracking-merged-spots-pull-by-all-that-they-are-off",
+        "tracking/proposers.py",
+        "seen.shares * welsch(seen.squared, blurs)",
+        "seen.shares",
+        "a spot of two features that is cut bends the pose",
+        ("test_tracking_proposers.py",),
+    ),
+)
+
 _SHARING = (
     Mutant(
         "tracking-merged-spots-stay-with-one-body",
@@ -357,4 +376,13 @@ _SHARING = (
     ),
 )
 
-MUTANTS = (*_PREDICTION, *_MOTION, *_GATING, *_RANGE_POSTERIOR, *_TRACKER, *_STATIC, *_SHARING)
+MUTANTS = (
+    *_PREDICTION,
+    *_MOTION,
+    *_GATING,
+    *_RANGE_POSTERIOR,
+    *_TRACKER,
+    *_STATIC,
+    *_NOISE,
+    *_SHARING,
+)

@@ -72,10 +72,18 @@ _FIELDS = (
         "sensors that see a marker off in the same way count as independent",
     ),
     Mutant(
+        "judgement-share-of-fields-forgotten",
+        "judgement/noise.py",
+        "RememberedNoise(names, sums, moments, biases, share)",
+        "RememberedNoise(names, sums, moments, biases)",
+        "sensors weigh the same, whatever noise they showed",
+        ("test_judgement_noise.py",),
+    ),
+    Mutant(
         "judgement-fields-that-the-pose-takes-are-seen",
         "judgement/noise.py",
-        "left = fields - J @ drawn",
-        "left = fields",
+        "left = fields - J @ (drawn :=",
+        "left = fields - 0 * J @ (drawn :=",
         "offsets that a pose takes for its own are thought to be small",
     ),
     Mutant(

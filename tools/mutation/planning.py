@@ -100,9 +100,16 @@ _DESIGN = (
     Mutant(
         "design-weighed-by-what-features-err-by",
         "design/prediction.py",
-        "wide = sigma**2 * np.eye(A.shape[-2])",
-        "wide = noise**2 * np.eye(A.shape[-2])",
-        "the prediction is better than a run that weighs by sigma",
+        "all(sensor.dimension == 1 for sensor in self.sensors)",
+        "False",
+        "the prediction of ranges is better than a run, which weighs them by sigma",
+    ),
+    Mutant(
+        "design-weighed-by-sigma-alone",
+        "design/prediction.py",
+        "shown + common * (shown.mean() - shown)",
+        "1 + 0 * shown",
+        "the prediction is worse than a run that has seen the noise of its sensors",
     ),
     Mutant(
         "design-tip-turned-the-other-way",

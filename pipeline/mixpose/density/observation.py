@@ -198,10 +198,7 @@ def peak(variance: Any, dimension: Any) -> Any:
 
 
 def close_pairs(places: Floats, variances: Floats) -> Indices:
-    """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m) at least.
-
-    At the variance of each.
-    """
+    """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m), each blurred."""
     reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
     each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
     return np.unique(np.concatenate(each), axis=0).astype(np.intp)

@@ -6,11 +6,11 @@ place, and the weights W_li that a run gives it, a least-squares fit errs by
     H⁻¹ (Σ_l Σ_i J_liᵀ W_li σ_l² W_li J_li + Σ_i G_i Σ_i G_iᵀ) H⁻¹,
     H = Σ_l Σ_i J_liᵀ W_li J_li,    G_i = Σ_l J_liᵀ W_li A_li .
 
-W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹ with the sensor's `sigma` s_l; what features err by, σ_l, may be
-something else.  A marker that is off its place is off in all sensors alike, which is why its terms
-are summed over sensors before they are squared.  Where s_l is in proportion to σ_l and markers are
-exact it is the inverse information.  For points that are measured in three directions alike it is
-the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
+W_li = (s_l² I + A_li Σ_i A_liᵀ)⁻¹, with s_l between the sensor's `sigma` and what features err by,
+σ_l (`Plan.weighed`).  A marker that is off its place is off in all sensors alike, which is why its
+terms are summed over sensors before they are squared.  Where s_l is in proportion to σ_l and
+markers are exact it is the inverse information.  For points that are measured in three directions
+alike it is the target registration error of Fitzpatrick, West and Maurer (1998, equation 46).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from mixpose.body import Body
 from mixpose.checking import noise_of
 from mixpose.fit import free_mask
 from mixpose.judgement import invert_information
+from mixpose.matching import ErrorRules
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
@@ -42,7 +43,7 @@ class Plan:
     noises : tuple of float
         Standard deviation of a measured feature along each coordinate, px or length units.
     sigmas : tuple of float
-        σ_ε of the sensors, by which a run weighs them against each other.
+        σ_ε of the sensors, by which a run weighs them against each other at first.
     body : Body
         Spreads of its features are errors of markers.
     free : (6,) bool
@@ -55,6 +56,18 @@ class Plan:
     sigmas: tuple[float, ...]
     body: Body
     free: Mask
+
+    def weighed(self) -> Floats:
+        """Variances s_l² (L,) by which a run weighs sensors once frames have shown their noise.
+
+        Single ranges alone are weighed by `sigma`.
+        """
+        stated = np.square(self.sigmas)
+        shown, common = np.square(self.noises) / stated, ErrorRules().common
+        if not shown.all() or all(sensor.dimension == 1 for sensor in self.sensors):
+            return stated
+        own = shown + common * (shown.mean() - shown)
+        return np.asarray(stated * own * (1 / own).mean())
 
 
 @dataclass(frozen=True)
@@ -106,14 +119,14 @@ def predict(plan: Plan, poses: Floats) -> Prediction:
     H, V = np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     G = np.zeros((count, len(points), 6, 3))
     seen = np.zeros((count, len(plan.sensors), len(points)), dtype=np.bool_)
-    rows = zip(plan.sensors, plan.noises, plan.sigmas, strict=True)
-    for k, (sensor, noise, sigma) in enumerate(rows):
+    rows = zip(plan.sensors, plan.noises, plan.weighed().tolist(), strict=True)
+    for k, (sensor, noise, variance) in enumerate(rows):
         _, A, visible = sensor.linearise(world)
         visible = visible & facing(sensor, poses, world, plan.body.normals)
         seen[:, k] = visible
         A = A * visible[..., None, None]
         J = pose_jacobian(A, arms)
-        wide = sigma**2 * np.eye(A.shape[-2])
+        wide = variance * np.eye(A.shape[-2])
         W = np.linalg.inv(wide + A @ spread @ A.swapaxes(-1, -2))
         JW = J.swapaxes(-1, -2) @ W
         H += (JW @ J).sum(axis=1)

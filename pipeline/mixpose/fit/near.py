@@ -139,6 +139,7 @@ def fit_near(
     climbed: list[Fit] | None = None,  # to the same views with the same noise; this is added
     blur: float = 1.0,  # in σ_ε, where the start is as close as that: what is coarser is left out
     noise: Floats = np.zeros((2, 1)),  # (2, L) squares in σ_ε² and degrees of freedom before
+    fields: float = 1.0,  # share of it that is errors of calibration, in no sensor's own noise
     beside: float = 0.0,  # standard deviation of what else features are off by, in σ_ε
     errors: ErrorRules = ErrorRules(),
     association: AssociationRules = AssociationRules(),
@@ -146,7 +147,7 @@ def fit_near(
 ) -> Fit:
     """Climb the objective from coarse blurs to the noise, or take the fit that begins alike."""
     free, sigmas = free_mask(options), [view.observation.sigma for view in views]
-    levels = list[list[float]]()
+    levels, begins = list[list[float]](), [blur * sigma for sigma in sigmas]
 
     def descended(last: MatchedObjective | None, newton: NewtonOptions) -> Ascent:
         states, spread = T_start[None], np.where(free, uncertainty, 0.0)
@@ -165,16 +166,15 @@ def fit_near(
         prior = NormalPrior(T_start, uncertainty, free)
         T, is_freed = believed(finest, fit.T_world_object, prior, rules)
         return replace(fit, T_world_object=T, freed=is_freed)
-    level = [blur * sigma for sigma in sigmas]
-    first = finest if blur == 1 else matched_objective(views, body, level)
+    first = finest if blur == 1 else matched_objective(views, body, begins)
     ascent = begun or _at_once(first, T_start, free, rules, blur != 1)
     ascent = ascent or descended(first, rules.sharp)
     known = climbed if climbed is not None and blur == 1 else []
     for fit in known:
         if fit.begins_at(ascent, rules.sharp.tolerance):
             return fit
-    rest = finest, free, noise, beside, errors, association, rules
-    known.append(_to_the_noise(ascent, [*levels, level], blur, *rest))
+    rest = finest, free, noise, fields, beside, errors, association, rules
+    known.append(_to_the_noise(ascent, [*levels, begins], blur, first, *rest))
     return known[-1]
 
 
@@ -211,49 +211,58 @@ def _to_the_noise(
     ascent: Ascent,
     levels: list[list[float]],
     blur: float,
+    objective: MatchedObjective,  # that was climbed
     finest: MatchedObjective,
     free: Mask,
     known: Floats,
+    fields: float,
     beside: float,
     errors: ErrorRules,
     association: AssociationRules,
     rules: FitRules,
 ) -> Fit:
-    """The ascent from a blur in σ_ε on, while offsets that are no noise move the pose."""
+    """The ascent from a blur in σ_ε on, while offsets that are no noise, or weights, move the pose.
+
+    Near its maximum a sensor's value falls by r²/4σ², and its log-likelihood by r²/2s².
+    """
     sigmas = np.array([view.observation.sigma for view in finest.views])
     blurs, count, first = np.array([blur] * len(sigmas)), int(np.count_nonzero(free)), ascent
     likeliest, best = -np.inf, None
     while True:
         matches = wide = associate(finest, ascent.states[0], association, errors.narrowest)
         if beside:
-            least = np.minimum(np.maximum(errors.blur * beside, matches.finest), 1.0)
-            wide = replace(matches, finest=least)
+            wide = replace(matches, finest=np.clip(matches.finest, errors.blur * beside, 1.0))
         seen = _, variances, narrow, before = errors_seen(wide, count, known, errors)
         noise = None if beside else seen
         fit = Fit.of(ascent, finest.views, levels, matches=matches, noise=noise, first=first)
-        # offsets of a bent pose hide how small the noise is
+        # offsets of a bent pose hide how small noise is
         variances = np.minimum(variances, (before / errors.blur) ** 2)
+        weighed = variances + max(fields, errors.common) * (variances.mean() - variances)
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
-        is_noise = not np.count_nonzero(matches.squared > errors.outlying**2 * variances[:, None])
-        # nor do other detections pull
-        is_noise &= not np.count_nonzero(matches.beside < errors.met * blurs[:, None])
+        is_noise = _are_noise(matches, variances, blurs, errors)
         is_end = is_noise or bool((narrower > rules.narrower * blurs).all())
-        if best is None and not is_end:
-            # blurs that shrink unlike each other make sensors weigh otherwise than by their σ_ε
-            alike = (end / blurs).min() > rules.narrower * (end / blurs).max()
-            is_end = alike and _moved(matches, free, end, variances) < rules.moved**2
-        if best is None and is_end:
-            return fit
-        likelihood = log_likelihood(narrow, matches, count, errors)
+        if best is None:
+            is_end &= bool(weighed.min() > rules.narrower**2 * weighed.max())  # weights are right
+            is_end = is_end or _moved(matches, free, end, variances) < rules.moved**2
+        is_only = best is None and is_end
+        likelihood = np.inf if is_only else log_likelihood(narrow, matches, count, errors)
         if best is None or likelihood > likeliest:
             likeliest, best = likelihood, fit
         if is_end:
             return best
-        blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]
-        views = _around(finest.views, matches, errors.reach)
-        objective = matched_objective(views, finest.projection.body, levels[-1])
-        ascent = ascend(objective, ascent.states, perturb, free, rules.sharp)
+        if not is_noise:
+            blurs, levels = narrower, [*levels, (narrower * sigmas).tolist()]
+            views = _around(finest.views, matches, errors.reach)
+            objective = matched_objective(views, finest.projection.body, levels[-1])
+        by_noise = objective.weighed_by(blurs * blurs / weighed)
+        ascent = ascend(by_noise, ascent.states, perturb, free, rules.sharp)
+
+
+def _are_noise(matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules) -> bool:
+    """Whether no offset is too large for noise (L,), and no other detection pulls at blurs (L,)."""
+    far = matches.squared > errors.outlying**2 * variances[:, None]
+    return not np.count_nonzero(far | (matches.beside < errors.met * blurs[:, None]))
 
 
 def _around(views: Sequence[View], matches: Matches, reach: float) -> list[View]:

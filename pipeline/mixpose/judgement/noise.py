@@ -72,6 +72,7 @@ class RememberedNoise:
     moments: Floats = field(default_factory=lambda: np.zeros((4, 5)))
     # (q, q + 1) sums [A | v] of fields that last, by sets of sensors, the last seen first
     biases: Biases = field(default_factory=dict)
+    fields: float = 1.0  # share of the variance that is fields of sensors; not known before
 
     @property
     def total(self) -> Floats:
@@ -111,8 +112,7 @@ def noise_of(
     J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, met, rows)
     inverse = inverted(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
-    drawn = inverse @ (J.T @ fields)
-    left = fields - J @ drawn
+    left = fields - J @ (drawn := inverse @ (J.T @ fields))
     # those of the sensors may last
     q = fields.shape[1] - 3 * shares.shape[1]
     lasting = left[:, :q] / (sizes := noise.repeat(q // len(noise)))
@@ -125,6 +125,7 @@ def noise_of(
     own = _normal_equations(rest, float(met @ found.dimensions) - count, fields, left, pulls, kinds)
     moments = model.memory * before.moments + own
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
+    share = float(by_kind[1:3].sum() / by_kind[:3].sum())
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
@@ -132,10 +133,10 @@ def noise_of(
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
     others = [k for k, name in enumerate(before.names) if name not in found.names]
-    names = found.names + tuple([before.names[k] for k in others])
+    names = (*found.names, *[before.names[k] for k in others])
     sums = np.concatenate([sums, before.sums[:, others]], axis=1) if others else sums
-    remembered = RememberedNoise(names, sums, moments, biases)
-    return variances, covariance + steady, steady, remembered, ratio
+    after = RememberedNoise(names, sums, moments, biases, share)
+    return variances, covariance + steady, steady, after, ratio
 
 
 def _level(

@@ -71,7 +71,6 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
-    count, crowd, unmatched, finest = _surroundings(objective, y, seen, shares, detections, rules)
     return Matches(
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
@@ -85,11 +84,8 @@ def associate(
         explained=np.minimum(explained, 1.0),
         unseen=(match.faced[:, 0] & ~seen) @ body.nodes.weights,
         merged=merged,
-        count=count,
-        crowd=crowd,
-        unmatched_nearby=unmatched,
         beside=np.where(seen, np.sqrt(others) / sigmas[:, None], np.nan),
-        finest=np.fmin(np.maximum(narrowest, finest), 1.0),
+        **_surroundings(objective, y, seen, shares, detections, rules, narrowest),
         by_calibration=_by_calibration(objective, T_world_object),
     )
 
@@ -203,10 +199,9 @@ def _surroundings(
     shares: Floats,
     detections: Floats,
     rules: AssociationRules,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Number of detections of L sensors, and around features in view at places y (L, n, 2), their
-    density, those of no feature, and the finest blur.
-    """
+    narrowest: float,
+) -> dict[str, Floats]:
+    """What `Matches` says (L,) of detections around features in view at places y (L, n, 2)."""
     observations = [view.observation for view in objective.views]
     sigmas = np.array([one.sigma for one in observations])
     is_flat = objective.projection.dimensions == 1
@@ -231,7 +226,8 @@ def _surroundings(
             count[k] = objective.tops[k, 0] / objective.energies[k, 0]
             crowd[k] = count[k] / np.maximum(far - near, rules.min_region).prod()
             finest[k] = 1.0
-    return count, crowd, unmatched, finest
+    finest = np.fmin(np.maximum(narrowest, finest), 1.0)
+    return {"count": count, "crowd": crowd, "unmatched_nearby": unmatched, "finest": finest}
 
 
 def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | float) -> Floats:

@@ -154,6 +154,11 @@ class ErrorRules:
     narrowest: float = constant(0.05, "of σ_ε, the last blur: centres err by 0.03 σ_ε at best")
     astray: float = constant(0.1, "chance that an offset within `met` is no noise: a cut spot")
     met: float = constant(3.0, "σ_ε within which detections may be a feature's: pull 1/10")
+    common: float = constant(
+        0.25,
+        "of the noise is that of all sensors, at least: half of it costs 10 % beside ranges, and "
+        "none of it 20 % where a body is off",
+    )
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 
     @property

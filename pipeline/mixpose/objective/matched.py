@@ -146,6 +146,10 @@ class MatchedObjective:
             parts.append(own)
         return np.concatenate(parts, axis=1)
 
+    def weighed_by(self, factors: Floats) -> MatchedObjective:
+        """The same with weights ω_l times factors (L,), of which only the ratios count."""
+        return replace(self, weights=self.weights * (factors / factors.mean())[:, None])
+
     def match(self, poses: Floats) -> Match:
         """What is predicted at poses (H, 4, 4), and what is there."""
         if self.at_hand and len(poses) == 1 and np.array_equal(poses[0], self.at_hand[0]):

@@ -81,10 +81,7 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
 
 
 def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tuple[Floats, Floats]:
-    """Distinct detections (L, H) of each camera that poses (H, 4, 4) explain, and how nearly (H,).
-
-    That is nearness, 0 to 1, summed over features, for ranking equals.
-    """
+    """Distinct detections (L, H) that poses explain, and nearness (H,), 0 to 1 of each feature."""
     counts, near = np.zeros((len(images), len(poses))), np.zeros(len(poses))
     size = max(2**17 // len(body), 1)  # so many numbers stay in the cache
     for part in (slice(k, k + size) for k in range(0, len(poses), size)):
@@ -111,10 +108,7 @@ def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tu
 
 
 def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
-    """Log odds (H,) of poses (H, 4, 4) against clutter, paid by count, and shares of the body met.
-
-    All sensors are cameras.
-    """
+    """Log odds (H,) of poses against clutter, paid by count, and shares met; all are cameras'."""
     body, free, rules = problem.body, problem.free, problem.rules
     matches = _matches_of(problem, poses)
     met = matches.measurements
@@ -201,11 +195,7 @@ class Descent:
         return self._objectives[key]
 
     def refine(self, poses: Floats, stages: Sequence[Stage]) -> Floats:
-        """Poses (K, 4, 4) that are left of H after all stages.
-
-        Where they are too many, the best: by the cosine between observed and predicted densities,
-        summed over sensors.
-        """
+        """Poses (K, 4, 4) that are left of H after all stages; of too many, those of most value."""
         # directions without any curvature stay
         for factors, steps, survivors in stages if len(poses) else ():
             objective = self.objective(factors)

@@ -133,10 +133,7 @@ def is_pointlike(body: Body) -> bool:
 
 
 def peaks(pattern: GridPattern, sigma: float) -> Floats:
-    """Local maxima (M, 2) of an image, highest first, in sensor coordinates.
-
-    It is blurred by `sigma`, a standard deviation in sensor units.
-    """
+    """Local maxima (M, 2), highest first, of an image that is blurred by `sigma`, sensor units."""
     spread = max(sigma / pattern.step, 0.5)
     blurred: Singles = cv2.GaussianBlur(  # type: ignore[assignment]
         np.asarray(pattern.values, dtype=np.float32), (0, 0), spread, borderType=cv2.BORDER_CONSTANT

@@ -65,10 +65,7 @@ class Claims:
         return places_of(rows, at.y[rows, 0, features] / sigmas[rows, None])
 
     def expected(self, places: Mapping[int, Floats], gate: float) -> Claims:
-        """Each detection is that of the nearest feature, `gate` σ_ε off at most.
-
-        `places` (n, 3), where features are expected, are by body.
-        """
+        """Each detection is that of the nearest feature of bodies, `gate` σ_ε off at most."""
         whose = np.array([-1, *(k for k, some in places.items() for _ in some)], dtype=np.intp)
         away = cdist(self.places, np.concatenate([self.places[:0], *places.values()]))
         return replace(self, owners=whose[np.insert(away, 0, gate, axis=1).argmin(axis=1)])

@@ -13,6 +13,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
 from mixpose.judgement import AcceptanceRules, Prior, ScoredPose, flat_prior, nearest_alike
+from mixpose.matching import pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
 from mixpose.rigid import twist_between
@@ -82,6 +83,12 @@ class Frame(Setup):
         return self.rules.judgement.noise.memory * self.track.residuals.of(
             [view.name for view in self.views]
         )
+
+    @cached_property
+    def variances(self) -> Floats:
+        """Of each view's noise (L,), σ_ε², as the frames before tell it."""
+        errors = self.rules.judgement.noise.errors
+        return pooled(self.noise, errors, errors.typical_degrees)
 
     @property
     def close(self) -> Floats:

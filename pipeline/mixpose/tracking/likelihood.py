@@ -86,6 +86,7 @@ class MatchedLikelihood:
                 climbed=climbed,
                 blur=start.blur,
                 noise=seen.noise,
+                fields=seen.track.residuals.fields,
                 beside=max(beside, spread),
                 errors=model.noise.errors,
                 association=model.association,

@@ -20,7 +20,7 @@ from scipy.special import fdtri
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.fit import blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
-from mixpose.matching import LEAST_VARIANCE, Matches, pooled
+from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
@@ -240,7 +240,8 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
         if not np.count_nonzero(seen.merged):
             break
-        J, offsets = seen.rows()
+        blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
+        J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
         rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
         start = Start(perturb(at.T_world_object, least_squares(rest, free=frame.free).states[0]))
         at = likelihood.judge(likelihood.fit(start), start)
@@ -281,9 +282,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     if not judged.is_unlike or has_cells:
         return
     errors = frame.rules.judgement.noise.errors
-    variances = pooled(frame.noise, errors, errors.typical_degrees)
-    largest = errors.outlying**2 * variances[:, None]
-    narrowest = errors.blur * float(np.sqrt(variances.max()))
+    largest = errors.outlying**2 * frame.variances[:, None]
+    narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
     for one, blur in product(frame.predictions, blurs):
         start = Start(one.T_world_object, one.uncertainty, blur=blur)
