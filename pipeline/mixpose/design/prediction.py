@@ -22,8 +22,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.checking import noise_of
 from mixpose.fit import free_mask
-from mixpose.judgement import invert_information
-from mixpose.matching import ErrorRules
+from mixpose.judgement import NoiseModel, invert_information
 from mixpose.objective import pose_jacobian
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
@@ -63,7 +62,7 @@ class Plan:
         Single ranges alone are weighed by `sigma`.
         """
         stated = np.square(self.sigmas)
-        shown, common = np.square(self.noises) / stated, ErrorRules().common
+        shown, common = np.square(self.noises) / stated, NoiseModel().errors.common
         if not shown.all() or all(sensor.dimension == 1 for sensor in self.sensors):
             return stated
         own = shown + common * (shown.mean() - shown)
