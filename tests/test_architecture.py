@@ -53,7 +53,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND
     | {"sensors", "body", "extraction", "objective", "optimise", "search", "fit", "frames"}
-    | {"session", "simulation", "runner"},
+    | {"matching", "judgement", "tracking", "session", "simulation", "runner"},
     "runner": GROUND
     | {"sensors", "body", "density", "extraction", "objective", "matching", "tracking"}
     | {"frames", "session"},

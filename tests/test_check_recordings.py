@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import mixpose
-from mixpose.checking import Survey, judge, told_apart
+from mixpose.body import Body, PointFeature
+from mixpose.checking import Survey, expected_count, fewest_count, judge, told_apart
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
 from mixpose.simulation import SimulationOptions, simulate
@@ -138,7 +139,6 @@ def test_sensors_whose_numbers_do_not_pair_are_told(
 @pytest.mark.parametrize(
     ("line", "hint"),
     [
-        ('polarity = "dark"', 'with polarity = "bright" in [extract]'),
         ("min_area = 400", "with min_area = 3 in [extract]"),
         ("threshold = 250", 'with threshold = "auto" in [extract]'),
     ],
@@ -240,6 +240,31 @@ def test_no_value_is_advised_that_leaves_as_many_features_but_not_the_body(
     assert statuses(tmp_path / "bright" / "session.toml") == ["ok"] * 3
 
 
+def test_the_other_polarity_is_said_once_in_place_of_keys_that_find_as_many_features(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = report_on(with_extract(recording, 'polarity = "dark"'), capsys, quick=True)
+    assert "too few features" not in report
+    assert report.count("warning ") == 1
+    assert (
+        'features are bright in the images: with polarity = "bright" in [extract], 4 of 4 frames '
+        "are explained"
+    ) in report
+
+
+def test_a_side_of_the_body_with_few_features_is_not_too_few(tmp_path: Path) -> None:
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    corners = [[x, y, z] for x in (0.0, 40.0) for y in (0.0, 40.0) for z in (0.0, 40.0)]
+    points = np.array([*corners, [20.0, 20.0, 45.0]])
+    normals = np.array([[0, 0, -1.0 if z == 0 else 1.0] for _, _, z in points])
+    body = Body("box", tuple(PointFeature(p) for p in points), normals)
+    box = replace(session, body=body, start=None)
+    assert expected_count(box.sensors[0], box) == 5
+    assert fewest_count(box.sensors[0], box) == 4
+    assert judge(4, 12, 4) is None
+    assert judge(2, 12, 4) == "too few"
+
+
 def test_a_look_at_a_few_frames_passes_over_the_others(
     recording: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -294,12 +319,12 @@ def test_files_that_are_given_to_two_sensors_are_told(
     [
         (
             [("left*.png", "x*.png"), ("right*.png", "left*.png"), ("x*.png", "right*.png")],
-            "'left' and 'right' are swapped: with the source of each given to the other, frames 0 "
-            "and 3 would be ok",
+            "'left' and 'right' are swapped: with the source of each given to the other, 4 of 4 "
+            "frames are explained",
         ),
         (
             [("[[812.4, 0.0, 322.7], [0.0, 811.9", "[[912.4, 0.0, 322.7], [0.0, 911.9")],
-            "frames 0 and 3: two sensors contradict each other: is one of them out of step",
+            "the calibration of 'left' is not that of its images: with about fx = 812.",
         ),
     ],
 )

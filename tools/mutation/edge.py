@@ -119,7 +119,57 @@ _SIMULATION = (
     ),
 )
 
+_DIAGNOSIS = ("test_check_diagnosis.py",)
+
 _CHECKING = (
+    Mutant(
+        "checking-clutter-explains-nothing",
+        "checking/evidence.py",
+        "return 0.0 if pose is None else max(pose.log_evidence, 0.0)",
+        "return 0.0 if pose is None else min(pose.log_evidence, 0.0)",
+        "what explains frames counts as little as what does not, and nothing is told",
+        _DIAGNOSIS,
+    ),
+    Mutant(
+        "checking-values-cost-nothing-and-have-no-prior",
+        "checking/adjusted.py",
+        "b[-k:] = np.eye(k), -values / unknown.deviations",
+        "b[-k:] = 1e9 * np.eye(k), -values / unknown.deviations",
+        "values stay where they are, and no size is found",
+        _DIAGNOSIS,
+    ),
+    Mutant(
+        "checking-rivals-are-not-told",
+        "checking/trials.py",
+        'words = {"is": "may be", "are": "may be"} if rivals else',
+        'words = {"is": "may be", "are": "may be"} if not rivals else',
+        "one of two causes that nobody can tell apart is said for sure",
+        _DIAGNOSIS,
+    ),
+    Mutant(
+        "checking-many-values-are-as-simple-as-one",
+        "checking/trials.py",
+        "near.sort(key=lambda each: each[0].change.values)",
+        "near.sort(key=lambda each: -each[0].change.values)",
+        "a camera is said to stand elsewhere where the body is of another size",
+        _DIAGNOSIS,
+    ),
+    Mutant(
+        "checking-displaced-images-are-not-met",
+        "checking/meetings.py",
+        "if _count(pairs) < _MISSED * expected:",
+        "if _count(pairs) < 0:",
+        "a camera with the principal point of another is not found out",
+        _DIAGNOSIS,
+    ),
+    Mutant(
+        "checking-normals-negated-by-nothing",
+        "checking/changes.py",
+        "body=lambda body: of_points(body, body.means, -normals),",
+        "body=lambda body: of_points(body, body.means, normals),",
+        "normals that point inwards are not found out",
+        _DIAGNOSIS,
+    ),
     Mutant(
         "checking-symmetries-are-news",
         "checking/lookalikes.py",
@@ -172,8 +222,8 @@ _CHECKING = (
     Mutant(
         "checking-one-of-two-is-too-few",
         "checking/advice.py",
-        "if count < min(_FEW * expected, expected - 1):",
-        "if count < _FEW * expected:",
+        "if count < min(_FEW * least, least - 1):",
+        "if count < _FEW * least:",
         "a single hidden feature of two is warned about",
     ),
     Mutant(

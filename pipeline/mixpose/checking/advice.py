@@ -23,9 +23,13 @@ _ADVISED = re.compile(rf"with (\w+) = (\S+) {re.escape(_SHARED)}")
 _MANY, _MANY_MORE = 5.0, 20  # times as many as expected, and so many more, are too many
 
 
-def judge(count: float, expected: int) -> str | None:
-    """Whether a number of features is "too few" or "too many" for a body; None if neither."""
-    if count < min(_FEW * expected, expected - 1):
+def judge(count: float, expected: int, fewest: int | None = None) -> str | None:
+    """Whether a number of features is "too few" or "too many" for a body; None if neither.
+
+    `fewest` are in view where it is turned so; None: as many as are expected.
+    """
+    least = expected if fewest is None else fewest
+    if count < min(_FEW * least, least - 1):
         return "too few"
     return "too many" if count > _MANY * expected and count > expected + _MANY_MORE else None
 

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
+from mixpose.body import Body
 from mixpose.checking.advice import judge
-from mixpose.checking.placement import expected_count
+from mixpose.checking.changes import Change, of_units
+from mixpose.checking.evidence import Frames, evidence_of, pose_near
+from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
-from mixpose.checking.trials import explanation
+from mixpose.checking.rules import DiagnosisRules
+from mixpose.checking.trials import diagnosis
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
 from mixpose.records import FrameSet
 from mixpose.runner import begin, observe
-from mixpose.session import Session
+from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.session import SensorSetup, Session
 
 CAUSES = (
     "is one of them out of step, or its calibration, T_sensor_world or source that of another? Or "
@@ -24,16 +31,31 @@ CAUSES = (
 )
 """Why sensors may contradict each other."""
 
-_TRIED = 2  # frames
-_FIRST = 40  # frames among which they are: to get far into a video takes as long as to read it
+_FIRST = 40  # frames of videos among which they are: to get far into one takes as long as all of it
 
 
-def geometry_warnings(
+@dataclass(frozen=True)
+class Doubts:
+    """What frames tell of a session.
+
+    Attributes
+    ----------
+    warnings : tuple of str
+    explains : bool
+        Whether a change was found with which frames are explained: numbers of features that are
+        unlike what the body has are no more odd then.
+    """
+
+    warnings: tuple[str, ...] = ()
+    explains: bool = False
+
+
+def geometry_doubts(
     session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
-) -> list[str]:
-    """What sensors that contradict each other are most likely told wrong.
+) -> Doubts:
+    """What of a session is most likely wrong, by a few frames of its recording.
 
-    Nothing is said of several bodies, of one sensor, and of streams, which are read once.
+    Nothing is said of several bodies, and of streams, which are read once.
 
     Parameters
     ----------
@@ -47,41 +69,117 @@ def geometry_warnings(
         each.kind == "live" or (isinstance(each, Video) and each.size is None)
         for each in sources.values()
     )
-    if len(sources) < 2 or len(session.labels) > 1 or streams:
-        return []
-    frames, doubt = [], None
-    for frame_set in _shared(sources, surveys):
-        views = observe(session, frame_set)
+    cameras = any(isinstance(s.sensor, PinholeCamera | FisheyeCamera) for s in session.sensors)
+    if len(session.labels) > 1 or streams or not (cameras or len(sources) > 1):
+        return Doubts()
+    chosen = list(_shared(session, sources, surveys))
+    frames = [(each.number, observe(session, each)) for each in chosen]
+    if not frames:
+        return Doubts()
+    found = diagnosis(session, frames, _otherwise(session, surveys, chosen))
+    if found.change:
+        return Doubts((f"{found.change}, {found.gain}",), explains=True)
+    if not found.good and len(sources) > 1:
+        return Doubts(_contradiction(session, frames))
+    return _at_the_start(session, sources, surveys)
+
+
+def _at_the_start(
+    session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
+) -> Doubts:
+    """Whether the first frame has the body at [start] only if points are in another unit."""
+    rules, start = DiagnosisRules(), session.start
+    first = next(_read(sources, _numbers(session, surveys, sources)[:1]), None)
+    if start is None or first is None:
+        return Doubts()
+    number, views, T = first.number, observe(session, first), start.T_world_object
+
+    def evidence(body: Body) -> float:
+        return evidence_of(pose_near(session, body, number, views, T))
+
+    if evidence(session.body) > rules.sure:
+        return Doubts()
+    for change in of_units(session.body):
+        if evidence(change.body(session.body)) > rules.sure + rules.margin:
+            what = "points and translation of [start] are in two units of length"
+            where = f"the body is at [start] in frame {number}"
+            return Doubts((f"{what}: {change.remedy}, {where}",), explains=True)
+    return Doubts()
+
+
+def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
+    """Why no frame is ok, where it is that sensors contradict each other."""
+    doubt, frames = "", frames[:2]
+    for number, views in frames:
         tracker, track = begin(session)
-        _, estimate = tracker.advance(track, frame_set.number, frame_set.time_s, views)
+        _, estimate = tracker.advance(track, number, None, views)
         if estimate.status == "ok":
-            return []
+            return ()
         doubt = estimate.doubt or doubt
-        frames.append((frame_set.number, views))
-    if not frames or (doubt is None and not _is_seen(session, surveys)):
-        return []
-    numbers = " and ".join(str(number) for number, _ in frames)
+    numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
-    change = explanation(session, frames)
-    if change is not None:
-        return [f"{change}, {where} would be ok"]
-    return [] if doubt is None else [f"{where}: {doubt}: {CAUSES}"]
+    return (f"{where}: {doubt}: {CAUSES}",) if doubt else ()
 
 
-def _is_seen(session: Session, surveys: Mapping[str, Survey]) -> bool:
-    """Whether each sensor finds about as many features as the body shows."""
-    for setup in session.sensors:
-        counts = surveys[setup.name].counts
-        if not counts or judge(float(np.median(counts)), expected_count(setup, session)):
-            return False
-    return True
+def _otherwise(
+    session: Session, surveys: Mapping[str, Survey], chosen: Sequence[FrameSet]
+) -> list[tuple[Change, Frames]]:
+    """The other polarity, where images hold too few features or too many."""
+    odd = [
+        setup
+        for setup in session.sensors
+        if (counts := surveys[setup.name].counts)
+        and surveys[setup.name].size is not None
+        and setup.extract.method in ("blobs", "log")
+        and judge(float(np.median(counts)), *_expected(setup, session)) is not None
+    ]
+    if len(odd) < len(session.sensors):
+        return []
+    polarity: Literal["bright", "dark"] = (
+        "dark" if odd[0].extract.polarity == "bright" else "bright"
+    )
+    setups = [replace(s, extract=replace(s.extract, polarity=polarity)) for s in session.sensors]
+    changed = replace(session, sensors=tuple(setups))
+    change = Change(
+        f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
+    )
+    return [(change, [(each.number, observe(changed, each)) for each in chosen])]
 
 
-def _shared(sources: Mapping[str, Source], surveys: Mapping[str, Survey]) -> Iterator[FrameSet]:
-    """A few frames in which every sensor sees something."""
-    seen = [{*each.numbers} - {*each.empty} for each in surveys.values()]
-    numbers = sorted(set.intersection(*seen))[:_FIRST]
-    for number in numbers[:: max(len(numbers) // _TRIED, 1)][:_TRIED]:
+def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
+    return expected_count(setup, session), fewest_count(setup, session)
+
+
+def _shared(
+    session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
+) -> Iterator[FrameSet]:
+    """A few frames all over the recording, in which sensors see most, the richest first."""
+    shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
+    numbers = _numbers(session, surveys, sources)
+
+    def richness(number: int) -> float:
+        return sum(each[number] for each in shown)
+
+    parts = np.array_split(np.array(numbers, dtype=int), DiagnosisRules().frames)
+    best = [max(part.tolist(), key=richness) for part in parts if len(part)]
+    yield from _read(sources, sorted(best, key=lambda n: (-richness(n), n)))
+
+
+def _numbers(
+    session: Session, surveys: Mapping[str, Survey], sources: Mapping[str, Source]
+) -> list[int]:
+    """Frames in which all sensors see something, or that they have."""
+    shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
+    full = [{n for n, count in each.items() if count} for each in shown]
+    numbers = sorted(set.intersection(*full) or set.intersection(*[{*each} for each in shown]))
+    if any(isinstance(source, Video) for source in sources.values()):
+        numbers = numbers[:_FIRST]
+    return numbers
+
+
+def _read(sources: Mapping[str, Source], numbers: Sequence[int]) -> Iterator[FrameSet]:
+    """Frames by their numbers; none after one that cannot be read."""
+    for number in numbers:
         frames = {}
         for name, source in sources.items():
             try:
@@ -91,3 +189,13 @@ def _shared(sources: Mapping[str, Source], surveys: Mapping[str, Survey]) -> Ite
                 return
         times = [each.time_s for each in frames.values() if each.time_s is not None]
         yield FrameSet(number, min(times, default=None), frames)
+
+
+def _shown(session: Session, found: Survey, setup: SensorSetup) -> dict[int, float]:
+    """How much of the body each frame may show."""
+    counts = found.counts or [1] * len(found.numbers)
+    most, empty = expected_count(setup, session), {*found.empty}
+    return {
+        n: 0.0 if n in empty else float(min(count, most))
+        for n, count in zip(found.numbers, counts, strict=True)
+    }

@@ -20,6 +20,7 @@ Looking: TypeAlias = PinholeCamera | FisheyeCamera | ParallelBeam
 _SAME_ANGLE_DEG = 0.01
 _MAPS = "it maps world to sensor coordinates, x_sensor = T_sensor_world x_world"
 _LENSES_APART_M = 3e-3  # in metres: nearer to each other two lenses do not fit
+_AVERTED = 0.2  # cosine: a feature that is turned away further is hardly seen
 _SMALL = 3.0  # times sigma: a body whose image is smaller has no orientation to see
 
 
@@ -219,6 +220,14 @@ def expected_count(setup: SensorSetup, session: Session) -> int:
     T = session.start.T_world_object
     seen = _seen(setup.sensor, session, T) & facing(setup.sensor, session.body, T)
     return int(seen.sum()) if seen.sum() >= count / 2 else count
+
+
+def fewest_count(setup: SensorSetup, session: Session) -> int:
+    """Features that a sensor should see at least: as `expected_count`, of the poorest side."""
+    normals = session.body.normals
+    if normals is None or session.start is not None:
+        return expected_count(setup, session)
+    return int(np.count_nonzero(normals @ normals.T > _AVERTED, axis=1).min())
 
 
 def _seen(sensor: Sensor, session: Session, T_world_object: Floats) -> Mask:

@@ -1,44 +1,97 @@
-"""What a session would have to say for its frames to be explained: inverted, swapped, other sizes.
+"""What a session would have to say for its frames to be explained.
 
-Each change is tried by itself on a few frames that are not explained as they are.
+A few frames are estimated by the session as it is and by each of its changes; a change is told by
+which they are explained with far more evidence.  Changes without values are tried where frames are
+not explained; values are fitted to the matches of all frames, those that promise most first.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, pairwise
-from typing import Any, TypeAlias
+from itertools import chain
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from mixpose.body import Body, PointFeature
-from mixpose.fit import free_mask
-from mixpose.objective import View
-from mixpose.records import Floats, PointPattern
-from mixpose.rigid import inverse
-from mixpose.runner import begin
-from mixpose.sensors import FisheyeCamera, PinholeCamera
-from mixpose.session import SensorSetup, Session
-
-Views: TypeAlias = Sequence[View]
-
-PATIENCE_S = 20.0  # of processor time, for all trials together
-_TRIED = 2  # frames that a change must explain
-_OTHER_SIZE = (1e-3, 20.0)  # least change of the body's size that is tried, and largest factor
+from mixpose.body import Body
+from mixpose.checking.adjusted import Adjustment, Unknown, adjusted, promise
+from mixpose.checking.changes import Change, changes, of_points, with_sensor
+from mixpose.checking.evidence import (
+    Explained,
+    Frames,
+    Views,
+    anywhere,
+    best_pose,
+    evidence_of,
+    is_well_explained,
+    pose_near,
+)
+from mixpose.checking.late import late_sensor
+from mixpose.checking.meetings import beside, seen_by
+from mixpose.checking.other_sizes import other_sizes
+from mixpose.checking.rules import DiagnosisRules
+from mixpose.checking.values import unknowns
+from mixpose.records import Floats
+from mixpose.session import Session
 
 
 @dataclass(frozen=True)
-class Trial:
-    """A change and what it would mean."""
+class Diagnosis:
+    """What a few frames say of a session.
 
-    meaning: str
-    views: Callable[[Views], Views] = lambda views: views
-    points: Callable[[Floats], Floats] | None = None
+    Attributes
+    ----------
+    change : str
+        What is wrong, and with what change frames are explained; empty where nothing is.
+    gain : str
+        What is explained by it.
+    good : int
+        How many frames are explained as the session is.
+    """
+
+    change: str = ""
+    gain: str = ""
+    good: int = 0
 
 
-def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | None:
+class _Tried(NamedTuple):
+    """A change, by which frames are explained so much better."""
+
+    change: Change
+    explained: Explained
+    gain: float
+
+
+def diagnosis(
+    session: Session, frames: Frames, others: Sequence[tuple[Change, Frames]] = ()
+) -> Diagnosis:
+    """What is most likely wrong with a session, by frames of its recording.
+
+    Parameters
+    ----------
+    session : Session
+        Of one body.
+    frames : sequence of (int, sequence of View)
+        By number; those that show most first.
+    others : sequence of (Change, sequence of (int, sequence of View))
+        Changes of how features are extracted, with what is extracted then.
+    """
+    rules, began = DiagnosisRules(), time.process_time()
+
+    def is_late() -> bool:
+        return time.process_time() - began > rules.patience_s
+
+    session = anywhere(session)
+    before = _explained(session, session.body, frames)
+    is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
+    tried = list(_with_values(session, frames, before, is_late))  # they take less time
+    if before.good(rules) < len(frames) or 2 * is_good < len(frames):
+        tried += _without_values(session, frames, before, others, is_late)
+    return _told(tried, before, rules)
+
+
+def explanation(session: Session, frames: Frames) -> str | None:
     """The change that explains frames, in words; None where none of those tried does.
 
     Parameters
@@ -49,167 +102,172 @@ def explanation(session: Session, frames: Sequence[tuple[int, Views]]) -> str | 
         Frames, by number, that are not explained as they are; three in a row tell of a sensor that
         is one late.
     """
-    began = time.process_time()
-    late = _late(session, frames)
-    if late is not None:
-        return late
-    frames = frames[:_TRIED]
-    for trial in _trials(session, frames):
-        if time.process_time() - began > PATIENCE_S:
+    return late_sensor(session, frames) or diagnosis(session, frames).change or None
+
+
+def _explained(session: Session, body: Body, frames: Frames) -> Explained:
+    return Explained(tuple(best_pose(session, body, n, views) for n, views in frames))
+
+
+def _without_values(
+    session: Session,
+    frames: Frames,
+    before: Explained,
+    others: Sequence[tuple[Change, Frames]],
+    is_late: Callable[[], bool],
+) -> Iterator[_Tried]:
+    """Changes that explain the first frame better than it is, and then the others."""
+    of_seen = [(change, frames) for change in changes(session)]
+    rules, some, waiting = DiagnosisRules(), 0, list[tuple[Change, Frames]]()
+    for change, seen in [*others, *of_seen]:
+        if is_late():
+            return
+        tried = _by_frames(session, before, change, seen)
+        if tried is None:
+            waiting.append((change, seen))
+        elif tried:
+            is_all = tried[0].explained.good(rules) == len(frames)
+            some += is_all and tried[0].gain > rules.margin
+            yield tried[0]
+    # what explains as little of the first frame as it is may explain the second
+    sizes = ((change, frames) for change in other_sizes(session, frames[:2]))
+    for change, seen in chain(waiting, sizes) if not some else ():
+        if is_late():
+            return
+        yield from _by_frames(session, before, change, seen, skipped=1) or ()
+
+
+def _by_frames(
+    session: Session, before: Explained, change: Change, seen: Frames, skipped: int = 0
+) -> list[_Tried] | None:
+    """A change by which frames are explained better; None where the first tells nothing."""
+    body, poses, gain = change.body(session.body), list(before.poses[:0]), 0.0
+    order = [*range(skipped, len(seen)), *range(skipped)]
+    for place, k in enumerate(order):
+        number, views = seen[k]
+        poses.append(best_pose(session, body, number, change.views(views)))
+        gain += evidence_of(poses[-1]) - evidence_of(before.poses[k])
+        if gain == 0 and place == 0:
             return None
-        body = session.body if trial.points is None else _of(session.body, trial.points)
-        changed = replace(_anywhere(session), body=body)
-        if frames and all(_explains(changed, n, trial.views(views)) for n, views in frames):
-            return trial.meaning
-    return None
+        if gain <= 0:
+            return []
+    by_frame = dict(zip(order, poses))
+    explained = Explained(tuple(by_frame[k] for k in range(len(seen))))
+    return [_Tried(change, explained, gain - change.cost)]
 
 
-def _anywhere(session: Session) -> Session:
-    """The session without a start, where none is needed: it may be what is wrong."""
-    return replace(session, start=None) if free_mask(session.estimator).all() else session
-
-
-def _late(session: Session, frames: Sequence[tuple[int, Views]]) -> str | None:
-    """The sensor whose frames belong to those before, in words."""
-    numbers = [number for number, _ in frames[: _TRIED + 1]]
-    in_a_row = len(numbers) > _TRIED and len({*np.diff(numbers).tolist()}) == 1
-    if not in_a_row:
-        return None
-    anywhere = _anywhere(session)
-    for setup in session.sensors:
-        given = [
-            _with_next(now, after, setup.name)
-            for (_, now), (_, after) in pairwise(frames[: _TRIED + 1])
-        ]
-        if all(_explains(anywhere, n, views) for n, views in zip(numbers, given)):
-            return (
-                f"{setup.name!r} is a frame late: with each of its frames given to the one before"
-            )
-    return None
-
-
-def _with_next(views: Views, after: Views, name: str) -> Views:
-    """The views of a frame, that of one sensor from the frame after."""
-    return [view for view in views if view.name != name] + [v for v in after if v.name == name]
-
-
-def _explains(session: Session, number: int, views: Views) -> bool:
-    tracker, track = begin(session)
-    with np.errstate(all="ignore"):  # a body of another size may be anywhere
-        _, estimate = tracker.advance(track, number, None, views)
-    shares = [one.explained or 0.0 for one in estimate.sensors.values() if one.used]
-    return estimate.status == "ok" and min(shares, default=0.0) > 0.1
-
-
-def _trials(session: Session, frames: Sequence[tuple[int, Views]]) -> Iterator[Trial]:
-    cameras = [s for s in session.sensors if s.sensor.unit == "px" and s.sensor.dimension == 2]
-    yield from _inversions(cameras)
-    for a, b in combinations([setup.name for setup in cameras], 2):
-        text = f"{a!r} and {b!r} are swapped: with the source of each given to the other"
-        yield Trial(text, lambda views, a=a, b=b: _swapped(views, a, b))  # type: ignore[misc]
-    if not all(isinstance(feature, PointFeature) for feature in session.body.features):
+def _with_values(
+    session: Session, frames: Frames, before: Explained, is_late: Callable[[], bool]
+) -> Iterator[_Tried]:
+    """Values that suit the matches of all frames better than those given."""
+    rules = DiagnosisRules()
+    known = [k for k, pose in enumerate(before.poses) if evidence_of(pose) > 0]
+    posed = [(frames[k][1], pose) for k in known if (pose := before.poses[k]) is not None]
+    if not posed:
         return
-    middle = session.body.means.mean(axis=0)
-    yield Trial(
-        "the body of [object] is mirrored: with one coordinate of all points negated",
-        points=lambda means: middle + (means - middle) * [1, 1, -1],
+    given = Adjustment(
+        session.body.means,
+        {setup.name: setup.sensor for setup in session.sensors},
+        seen_by(posed),
+        [pose.T_world_object for _, pose in posed],
+        beside(posed),
     )
-    for factor, where in ((1000.0, "1000 times as large"), (0.001, "a thousandth as large")):
-        text = f"points and translations are in two units of length: with points {where}"
-        yield Trial(text, points=lambda means, factor=factor: factor * means)  # type: ignore[misc]
-    for setup in cameras:
-        if setup.resolution is not None:
-            text = f"images of {setup.name!r} are mirrored: with left and right of them exchanged"
-            width, name = setup.resolution[0], setup.name
-            yield Trial(text, lambda views, n=name, w=width: _mirrored(views, n, w))  # type: ignore[misc]
-    size = _size(session, frames)
-    if size is not None:
-        yield Trial(
-            "the body of [object] is not of the size that was seen, or translations are in another "
-            f"unit than points: with points {size:.3g} times as large",
-            points=lambda means: size * means,
+    promises = [(promise(unknown, given), unknown) for unknown in unknowns(session)]
+    promising = [each for each in promises if each[0] > rules.promise]
+    promising.sort(key=lambda each: -each[0] + each[1].cost)
+    for _, unknown in promising[: rules.most]:
+        if is_late():
+            return
+        yield from _fitted(session, frames, before, known, given, unknown)
+
+
+def _fitted(
+    session: Session,
+    frames: Frames,
+    before: Explained,
+    known: Sequence[int],
+    given: Adjustment,
+    unknown: Unknown,
+) -> Iterator[_Tried]:
+    """A change by values, fitted twice: matches are better known by then."""
+    found: list[Any] = []
+    for _ in range(2):
+        fitted = adjusted(unknown, given)
+        if fitted is None:
+            return
+        values, poses = fitted
+        body = of_points(
+            session.body, unknown.points(session.body.means, values), session.body.normals
         )
-
-
-def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Trial]:
-    """Cameras of which the session has their own poses in the world: all of them, or one."""
-    placed = [s.name for s in cameras if not np.allclose(s.sensor.T_sensor_world, np.eye(4))]  # type: ignore[attr-defined]
-    groups = [placed] if placed else []
-    groups += [[name] for name in placed] if len(placed) > 1 else []
-    for names in groups:
-        called = " and ".join(repr(name) for name in names)
-        text = (
-            f"T_sensor_world of {called} {'is' if len(names) == 1 else 'are'} inverted (it maps "
-            "world to sensor coordinates): with the inverse"
+        found = [
+            pose_near(session, body, frames[k][0], _by(unknown, values, frames[k][1]), T)
+            for k, T in zip(known, poses)
+        ]
+        if any(pose is None for pose in found):
+            return
+        seen = seen_by(
+            [(_by(unknown, values, frames[k][1]), pose) for k, pose in zip(known, found)]
         )
-        yield Trial(text, lambda views, names=names: _turned_round(views, names))  # type: ignore[misc]
+        given = replace(
+            given, frames=seen, poses=[pose.T_world_object for pose in found], beside=[]
+        )
+    after = list(before.poses)
+    for k, pose in zip(known, found):
+        after[k] = pose
+    for k, (number, views) in enumerate(frames):
+        # a pose that wrong values led to may be another one
+        if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]):
+            again = best_pose(session, body, number, _by(unknown, values, views))
+            after[k] = max(again, after[k], key=evidence_of) if k in known else again
+    explained, count = Explained(tuple(after)), len(values)
+    unlikely = float(((values / unknown.deviations) ** 2).sum())
+    cost = 0.5 * (count * math.log(max(2 * explained.met, 2.0)) + unlikely)
+    change = Change(unknown.what, unknown.remedy(values), cost=cost, values=count)
+    yield _Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
 
 
-def _turned_round(views: Views, names: Sequence[str]) -> Views:
-    return [_inverted(view) if view.name in names else view for view in views]
+def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
+    """Views by sensors of other values."""
+    return [with_sensor(view, unknown.sensor(view.name, view.sensor, values)) for view in views]
 
 
-def _inverted(view: View) -> View:
-    sensor: Any = view.sensor
-    return replace(view, sensor=replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world)))
-
-
-def _size(session: Session, frames: Sequence[tuple[int, Views]]) -> float | None:
-    """How many times as large as given the body looks to several cameras together.
-
-    Each alone finds it as far away as its size has it; p_b = R p_a + t / size relates the places
-    in two cameras that stand at (R, t) to each other.
-    """
-    middle = np.append(session.body.means.mean(axis=0), 1.0)
-    found = []
-    for number, views in frames:
-        places = [(view.sensor, _alone(session, number, view)) for view in views]
-        seen = [(each, T) for each, T in places if T is not None]
-        for (a, T_a), (b, T_b) in combinations(seen, 2):
-            T_ba = b.T_sensor_world @ inverse(a.T_sensor_world)  # type: ignore[attr-defined]
-            p_a = (a.T_sensor_world @ T_a @ middle)[:3]  # type: ignore[attr-defined]
-            p_b = (b.T_sensor_world @ T_b @ middle)[:3]  # type: ignore[attr-defined]
-            apart = p_b - T_ba[:3, :3] @ p_a
-            found.append(float(apart @ T_ba[:3, 3] / max(float(apart @ apart), 1e-300)))
-    if not found:
-        return None
-    size, (least, most) = float(np.median(found)), _OTHER_SIZE
-    return size if abs(size - 1) > least and 1 / most < size < most else None
-
-
-def _alone(session: Session, number: int, view: View) -> Floats | None:
-    """T_world_object (4, 4) that one camera finds by itself."""
-    if not isinstance(view.sensor, PinholeCamera | FisheyeCamera):
-        return None
-    tracker, track = begin(_anywhere(session))
-    with np.errstate(all="ignore"):
-        _, estimate = tracker.advance(track, number, None, [view])
-    return estimate.T_world_object
-
-
-def _of(body: Body, points: Callable[[Floats], Floats]) -> Body:
-    normals: Any = None  # what is seen from where is not what is asked
-    return Body(body.name, tuple(PointFeature(point) for point in points(body.means)), normals)
-
-
-def _swapped(views: Views, a: str, b: str) -> Views:
-    seen = {view.name: view.observation for view in views}
-    other = {a: b, b: a}
-    return [
-        replace(view, observation=seen[other.get(view.name, view.name)])
-        for view in views
-        if other.get(view.name, view.name) in seen
+def _told(tried: Sequence[_Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
+    """The simplest of the changes that explain most, and another that is as simple and good."""
+    good = before.good(rules)
+    told = [(one, _gain(one.explained, before, rules)) for one in tried]
+    told = [(one, gain) for one, gain in told if gain and one.gain > rules.margin]
+    if not told:
+        return Diagnosis(good=good)
+    most = max(one.gain for one, _ in told)
+    near = [
+        each for each in told if each[0].gain > most - max(rules.rival, rules.share * abs(most))
     ]
+    near.sort(key=lambda each: each[0].change.values)
+    (best, gain), *others = near
+    rivals = [one for one, _ in others if one.change.values == best.change.values]
+    change = best.change
+    words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
+    text = f"{change.what.format(**words)}: {change.remedy}"
+    if rivals:
+        text = f"{change.what.format(**words)}, or {rivals[0].change.what.format(**words)}: " + (
+            f"{change.remedy}, or {rivals[0].change.remedy}"
+        )
+    return Diagnosis(text, gain, good)
 
 
-def _mirrored(views: Views, name: str, width: int) -> Views:
-    return [_flipped(view, width) if view.name == name else view for view in views]
-
-
-def _flipped(view: View, width: int) -> View:
-    pattern = view.observation.pattern
-    if not isinstance(pattern, PointPattern):
-        return view
-    points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
-    flipped = PointPattern(np.asarray(points), pattern.weights)
-    return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))
+def _gain(after: Explained, before: Explained, rules: DiagnosisRules) -> str:
+    """What is better by a change, in words; empty where that is little."""
+    count, now, then = len(before.poses), after.good(rules), before.good(rules)
+    if after.met < before.met:
+        return ""  # what meets less is near some detections, as a body that is far too small
+    if now > then:
+        as_is = f", {then} as it is" if then else ""
+        return f"{now} of {count} frames are explained{as_is}"
+    if after.rms() < rules.clearer * before.rms():
+        return (
+            f"features are met to {after.rms():.2g} sigma in place of {before.rms():.2g} in "
+            f"{count} frames"
+        )
+    more = round(after.met - before.met)
+    least = max(2.0, rules.more * before.met)
+    return f"{more} more features are met in {count} frames" if more >= least else ""

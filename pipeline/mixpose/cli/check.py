@@ -17,7 +17,8 @@ from mixpose.checking import (
     advice,
     depends_on_distance,
     expected_count,
-    geometry_warnings,
+    fewest_count,
+    geometry_doubts,
     image_of,
     judge,
     key_warnings,
@@ -54,6 +55,7 @@ class _Report:
 
     lines: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    of_counts: list[str] = field(default_factory=list)  # of features
     untested: str = ""
     of: str = ""  # of several bodies, which one is spoken of
 
@@ -107,7 +109,6 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
             )
     for setup in session.sensors:
         _say_sensor(report, session, setup, sources[setup.name], surveys)
-    report.warnings = told_apart(report.warnings)
     report.warnings += shared_source_warnings(session, {}) + _pairing_warnings(sources)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
@@ -116,7 +117,10 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
         _say_accuracy(report, sized.alone(one.body.name))
     report.of = ""
     report.warnings += shared_part_warnings(sized)
-    report.warnings += geometry_warnings(session, sources, surveys)
+    doubts = geometry_doubts(session, sources, surveys)
+    report.warnings += doubts.warnings
+    if not doubts.explains:
+        report.warnings = told_apart(report.of_counts) + report.warnings
     report.untested = _untested(surveys)
     report.write()
     damage = [text for each in surveys.values() for text in each.damage]
@@ -221,13 +225,14 @@ def _say_features(
         f"features per frame: {low} / {middle:g} / {high} (least / median / most), expected: "
         f"{expected}",
     )
-    judgement = judge(middle, expected)
+    fewest = min(fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
+    judgement = judge(middle, expected, fewest if len(session.labels) == 1 else None)
     if judgement is not None:
         number = found.typical_frame
         assert number is not None, "there are counts"
         image = image_of(source, number)
         count = found.counts[found.numbers.index(number)]
-        report.warnings.append(
+        report.of_counts.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
             f"{expected} are expected: {advice(session, setup, number, image, expected)}"
         )

@@ -1,0 +1,169 @@
+"""Values that a session should have said, by least squares over the matches of several frames.
+
+Poses of all frames and the unknown values are fitted together to what the features were met by;
+outlying matches are weighed down as by Huber's loss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from mixpose.checking.meetings import Seen
+from mixpose.records import Floats
+from mixpose.rigid import perturb
+from mixpose.sensors import Sensor
+
+_ITERATIONS = 8
+_OUTLYING = 3.0  # deviations from which a match counts less
+_STEP = 1e-4  # of a deviation, for derivatives
+_FEWEST = 4  # coordinates beyond those of poses and values that are asked for
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Values of a session that may be other than it says, 0 where it is right.
+
+    Attributes
+    ----------
+    what : str
+        What is wrong, as in `Change`.
+    remedy : callable
+        What values (k,) explain the frames by, in words.
+    deviations : (k,) array
+        How far off they may be.
+    points : callable
+        Points (N, 3) of the body by those given and values (k,).
+    sensor : callable
+        A sensor by its name, the one given and values (k,).
+    feature : int or None
+        The only one that is changed.
+    cost : float
+        Nats against it, beside what its values cost.
+    """
+
+    what: str
+    remedy: Callable[[Floats], str]
+    deviations: Floats
+    points: Callable[[Floats, Floats], Floats] = lambda points, _: points
+    sensor: Callable[[str, Any, Floats], Any] = lambda _, sensor, __: sensor
+    feature: int | None = None
+    cost: float = 0.0
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """Frames to which poses and values are fitted."""
+
+    points: Floats  # (N, 3) of the body as it is given
+    sensors: Mapping[str, Sensor]  # as they are given, by name
+    frames: Sequence[Sequence[Seen]]
+    poses: Sequence[Floats]  # (4, 4) where to begin, one of each frame
+    beside: Sequence[Sequence[Seen]] = field(default_factory=list)  # for a feature by itself
+
+    def of(self, unknown: Unknown) -> Adjustment:
+        """With what may have met a feature that was missed, for values of that feature."""
+        endless = {name: _endless(sensor) for name, sensor in self.sensors.items()}
+        frames = [list(frame) for frame in self.frames]
+        for own, others in zip(frames, self.beside):
+            for seen in others if unknown.feature is not None else ():
+                is_it = seen.features == unknown.feature
+                if is_it.any():
+                    own.append(
+                        replace(seen, features=seen.features[is_it], observed=seen.observed[is_it])
+                    )
+        return replace(self, sensors=endless, frames=frames)
+
+    @property
+    def count(self) -> int:
+        """Number of coordinates that are met."""
+        return 2 * sum(len(seen.features) for frame in self.frames for seen in frame)
+
+
+def promise(unknown: Unknown, given: Adjustment) -> float:
+    """Nats that values are likely to gain, by one step of least squares at the noise as it is."""
+    given, k = given.of(unknown), len(unknown.deviations)
+    if given.count < 6 * len(given.frames) + k + _FEWEST:
+        return 0.0
+    without, r = _normal(unknown, given, given.poses, np.zeros(k))
+    (A, b), n = without, len(without[1]) - k
+    noise = max(float(np.median(np.abs(r))) / 0.6745, 0.1)
+    left = A[n:, n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), A[:n, n:])
+    pull = b[n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), b[:n])
+    return float(pull @ np.linalg.solve(left + 1e-9 * np.eye(k), pull)) / (2 * noise**2)
+
+
+def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:
+    """Values (k,) and poses (4, 4) that suit the matches best; None where these are too few."""
+    given, k = given.of(unknown), len(unknown.deviations)
+    if given.count < 6 * len(given.frames) + k + _FEWEST:
+        return None
+    poses, values = list(given.poses), np.zeros(k)
+    for _ in range(_ITERATIONS):
+        (A, b), _ = _normal(unknown, given, poses, values)
+        step = np.linalg.solve(A + 1e-9 * np.eye(len(b)), b)
+        scales = _scales(unknown, given)
+        step = step * scales
+        if not np.isfinite(step).all():
+            return None
+        poses = [perturb(T, step[6 * f : 6 * f + 6]) for f, T in enumerate(poses)]
+        values = values + step[-k:]
+        if np.abs(step / scales).max() < 1e-4:
+            break
+    return values, poses
+
+
+def _scales(unknown: Unknown, given: Adjustment) -> Floats:
+    """Units (6 F + k,) in which poses and values are fitted: the body's size, radians."""
+    size = float(np.linalg.norm(given.points - given.points.mean(axis=0), axis=1).max())
+    pose = np.array([size] * 3 + [1.0] * 3)
+    return np.concatenate([np.tile(pose, len(given.frames)), unknown.deviations])
+
+
+def _normal(
+    unknown: Unknown, given: Adjustment, poses: Sequence[Floats], values: Floats
+) -> tuple[tuple[Floats, Floats], Floats]:
+    """Normal equations of poses and values, in their scales, and residuals in the noise."""
+    k, F = len(values), len(poses)
+    A, b = np.zeros((6 * F + k, 6 * F + k)), np.zeros(6 * F + k)
+    A[-k:, -k:], b[-k:] = np.eye(k), -values / unknown.deviations
+    scales, all_residuals = _scales(unknown, given), []
+    for f in range(F):
+        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
+        r, J = _linearised(unknown, given, f, poses[f], values, scales[own])
+        w = _OUTLYING / np.maximum(np.abs(r), _OUTLYING)
+        A[np.ix_(own, own)] += J.T @ (w[:, None] * J)
+        b[own] -= J.T @ (w * r)
+        all_residuals.append(r)
+    return (A, b), np.concatenate(all_residuals)
+
+
+def _linearised(
+    unknown: Unknown, given: Adjustment, f: int, T: Floats, values: Floats, scales: Floats
+) -> tuple[Floats, Floats]:
+    """Residuals (R,) of a frame in the noise, and their derivatives (R, 6 + k), in scales."""
+
+    def residuals(step: Floats) -> Floats:
+        at, moved = values + step[6:] * scales[6:], perturb(T, step[:6] * scales[:6])
+        world = unknown.points(given.points, at) @ moved[:3, :3].T + moved[:3, 3]
+        parts = [np.zeros(0)]
+        for seen in given.frames[f]:
+            sensor = unknown.sensor(seen.name, given.sensors[seen.name], at)
+            y, visible = sensor.project(world[seen.features])
+            parts.append(np.where(visible[:, None], (y - seen.observed) / seen.noise, 0.0).ravel())
+        return np.concatenate(parts)
+
+    steps = _STEP * np.eye(len(scales))
+    columns = [(residuals(step) - residuals(-step)) / (2 * _STEP) for step in steps]
+    return residuals(np.zeros(len(scales))), np.array(columns).T
+
+
+def _endless(sensor: Any) -> Sensor:
+    """A camera without the bounds of its images."""
+    endless: Sensor = sensor
+    if hasattr(sensor, "resolution"):
+        endless = replace(sensor, resolution=None)
+    return endless

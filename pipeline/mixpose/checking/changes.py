@@ -1,0 +1,178 @@
+"""What a session may have said wrong as a whole: inverted, swapped, mirrored, in another unit.
+
+A change is of the body, of sensors, or of what they see; those with values to be found are in
+`values`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from mixpose.body import Body, PointFeature
+from mixpose.checking.evidence import Views
+from mixpose.objective import View
+from mixpose.records import Floats, PointPattern
+from mixpose.rigid import inverse
+from mixpose.sensors import FisheyeCamera, PinholeCamera
+from mixpose.session import SensorSetup, Session
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of a session, and what it would mean.
+
+    Attributes
+    ----------
+    what : str
+        What is wrong, with a verb that "may be" can replace in ``{is}`` or ``{are}``.
+    remedy : str
+        What explains the frames: "with ...".
+    views : callable
+        What is seen, and by which sensors, by what is given.
+    body : callable
+        The body by the one given.
+    cost : float
+        Nats that the choice of its values costs.
+    """
+
+    what: str
+    remedy: str
+    views: Callable[[Views], Views] = lambda views: views
+    body: Callable[[Body], Body] = lambda body: body
+    cost: float = 0.0
+    values: int = 0
+
+
+def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
+    """A body of other points; one whose features have an extent is of points, too."""
+    return Body(body.name, tuple(PointFeature(point) for point in points), normals)
+
+
+def changes(session: Session) -> Iterator[Change]:
+    """Changes without values, those that are simple first."""
+    cameras = [s for s in session.sensors if isinstance(s.sensor, PinholeCamera | FisheyeCamera)]
+    are_points = all(isinstance(feature, PointFeature) for feature in session.body.features)
+    if are_points:
+        yield from _of_the_body(session.body)
+    yield from _inversions(cameras)
+    for a, b in combinations([setup.name for setup in cameras], 2):
+        yield Change(
+            f"{a!r} and {b!r} {{are}} swapped",
+            "with the source of each given to the other",
+            lambda views, a=a, b=b: _swapped(views, a, b),  # type: ignore[misc]
+        )
+    sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
+    for names in _all_or_one(list(sized)):
+        yield Change(
+            f"images of {_called(names)} {{are}} mirrored",
+            "with left and right of them exchanged",
+            lambda views, names=names: [  # type: ignore[misc]
+                _flipped(view, sized[view.name]) if view.name in names else view for view in views
+            ],
+        )
+    for names in _all_or_one([setup.name for setup in cameras]):
+        for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
+            yield Change(
+                f"camera_matrix of {_called(names)} {{is}} that of images {images} as large",
+                f"with fx, fy, cx and cy {done}",
+                lambda views, names=names, factor=factor: [  # type: ignore[misc]
+                    with_sensor(view, scaled(view.sensor, factor)) if view.name in names else view
+                    for view in views
+                ],
+            )
+
+
+def scaled(sensor: Any, factor: float) -> Any:
+    """A camera of images that are so many times as large."""
+    K = np.array(sensor.camera_matrix) * np.array([[factor], [factor], [1.0]])
+    return replace(sensor, camera_matrix=K)
+
+
+def with_sensor(view: View, sensor: Any) -> View:
+    """A view as if by another sensor."""
+    return view if sensor is view.sensor else replace(view, sensor=sensor)
+
+
+def _of_the_body(body: Body) -> Iterator[Change]:
+    middle, normals = body.means.mean(axis=0), body.normals
+    other_side = np.array([1.0, 1.0, -1.0])
+    turned = None if normals is None else normals * other_side
+    yield Change(
+        "the body of [object] {is} mirrored",
+        "with one coordinate of all points negated",
+        body=lambda body: of_points(body, middle + (body.means - middle) * other_side, turned),
+    )
+    if normals is not None:
+        yield Change(
+            "normals of [object] {are} of the wrong sign",
+            "with all of them negated",
+            body=lambda body: of_points(body, body.means, -normals),
+        )
+    yield from of_units(body)
+
+
+def of_units(body: Body) -> Iterator[Change]:
+    """Points in metres for millimetres, and the reverse."""
+    for factor, where in ((1000.0, "1000 times as large"), (0.001, "a thousandth as large")):
+        yield Change(
+            "points and translations {are} in two units of length",
+            f"with points {where}",
+            body=lambda body, k=factor: of_points(body, k * body.means, body.normals),  # type: ignore[misc]
+        )
+
+
+def _all_or_one(names: Sequence[str]) -> list[list[str]]:
+    """All of some sensors, or one of them."""
+    return ([list(names)] if names else []) + ([[n] for n in names] if len(names) > 1 else [])
+
+
+def _called(names: Sequence[str]) -> str:
+    return " and ".join(repr(name) for name in names)
+
+
+def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
+    """Cameras of which the session has their own poses in the world: all of them, or one."""
+    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
+    far = [
+        n
+        for n, each in sensors.items()
+        if not np.allclose(each.T_sensor_world, np.eye(4), atol=1e-5)
+    ]
+    for names in _all_or_one(far):
+        yield Change(
+            f"T_sensor_world of {_called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
+            "(it maps world to sensor coordinates)",
+            "with the inverse",
+            lambda views, names=names: [  # type: ignore[misc]
+                _inverted(view) if view.name in names else view for view in views
+            ],
+        )
+
+
+def _inverted(view: View) -> View:
+    sensor: Any = view.sensor
+    return replace(view, sensor=replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world)))
+
+
+def _swapped(views: Views, a: str, b: str) -> Views:
+    seen = {view.name: view.observation for view in views}
+    other = {a: b, b: a}
+    return [
+        replace(view, observation=seen[other.get(view.name, view.name)])
+        for view in views
+        if other.get(view.name, view.name) in seen
+    ]
+
+
+def _flipped(view: View, width: int) -> View:
+    pattern = view.observation.pattern
+    if not isinstance(pattern, PointPattern):
+        return view
+    points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
+    flipped = PointPattern(np.asarray(points), pattern.weights)
+    return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))

@@ -1,0 +1,37 @@
+"""Numbers by which it is told what is wrong with a session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mixpose.constants import constant
+
+
+@dataclass(frozen=True)
+class DiagnosisRules:
+    """When a change of the session is told."""
+
+    frames: int = constant(4, "that are estimated: a fault shows in all, a hidden body in some")
+    sure: float = constant(7.0, "log odds of a frame that is explained, as where a pose is ok")
+    met: float = constant(
+        0.5, "of what a sensor could meet, at least: beside a hand 0.6, by wrong normals 0.4"
+    )
+    noise: float = constant(
+        0.75, "of sigma: right sessions of real recordings meet features to 0.65, others to 1"
+    )
+    margin: float = constant(
+        12.0,
+        "nats by which a change explains frames better: right sessions gain up to 5 after what "
+        "values cost, of 80 changes; a marker that is found again gains 9 in a frame",
+    )
+    rival: float = constant(
+        10.0, "nats within which another change is as good: frames differ by 5 by chance"
+    )
+    share: float = constant(0.05, "of what is gained, as well: errors of frames are alike")
+    promise: float = constant(8.0, "nats that least squares foretell, for a change to be tried")
+    most: int = constant(5, "changes of values that are tried, the most promising first")
+    clearer: float = constant(
+        0.65, "of the offsets left by a change that is told for that: right rigs gain down to 0.79"
+    )
+    more: float = constant(0.02, "of the features met by a change that is told for more of them")
+    patience_s: float = constant(20.0, "of processor time, for all trials together")

@@ -1,0 +1,251 @@
+"""What `mixpose check` takes for wrong about a session, by a few frames of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mixpose.body import Body, PointFeature
+from mixpose.checking import geometry_doubts, survey
+from mixpose.checking.adjusted import Adjustment, adjusted, promise
+from mixpose.checking.meetings import Seen
+from mixpose.checking.trials import diagnosis
+from mixpose.checking.values import unknowns
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import PointPattern
+from mixpose.rigid import from_rotation_vector, inverse, transform
+from mixpose.runner import open_sources
+from mixpose.sensors import PinholeCamera
+from mixpose.session import Session, load_session
+from mixpose.session.setup import Start
+
+SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
+SIGMA, NOISE = 1.5, 0.1
+Frames = list[tuple[int, list[View]]]
+
+
+def poses() -> list[np.ndarray]:
+    rng = np.random.default_rng(4)
+    return [
+        from_rotation_vector(rng.normal(0, 1, 3), rng.normal([10, -8, 5], 25)) for _ in range(4)
+    ]
+
+
+@pytest.fixture
+def right() -> Session:
+    session = load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    return replace(session, start=None)
+
+
+def recorded(session: Session) -> dict[str, list[np.ndarray]]:
+    """What the cameras of a session see, shuffled."""
+    rng = np.random.default_rng(5)
+    seen: dict[str, list[np.ndarray]] = {}
+    for setup in session.sensors:
+        for T in poses():
+            y, visible = setup.sensor.project(transform(T, session.body.means))
+            if session.body.normals is not None:
+                world = transform(T, session.body.means)
+                towards = setup.sensor.towards(world)
+                facing = ((session.body.normals @ T[:3, :3].T) * towards).sum(axis=1) > 0
+                visible = visible & facing
+            y = y[visible] + rng.normal(0, NOISE, y[visible].shape)
+            seen.setdefault(setup.name, []).append(rng.permutation(y))
+    return seen
+
+
+def frames_of(session: Session, seen: dict[str, list[np.ndarray]]) -> Frames:
+    """The same as a session takes it for."""
+    count = len(next(iter(seen.values())))
+    return [
+        (
+            f,
+            [
+                View(setup.name, setup.sensor, Observation(of_points(seen[setup.name][f]), SIGMA))
+                for setup in session.sensors
+            ],
+        )
+        for f in range(count)
+    ]
+
+
+def of_points(points: np.ndarray) -> PointPattern:
+    return PointPattern(points, np.ones(len(points)))
+
+
+def with_points(session: Session, points: np.ndarray, normals: Any = None) -> Session:
+    body = Body(session.body.name, tuple(PointFeature(p) for p in points), normals)
+    return replace(session, body=body)
+
+
+def with_cameras(session: Session, change: Callable[[Any], Any]) -> Session:
+    setups = [replace(s, sensor=change(s.sensor)) for s in session.sensors]
+    return replace(session, sensors=tuple(setups))
+
+
+def enlarged(sensor: PinholeCamera) -> PinholeCamera:
+    return replace(sensor, camera_matrix=sensor.camera_matrix * [[0.5], [0.5], [1.0]])
+
+
+def inverted(sensor: PinholeCamera) -> PinholeCamera:
+    return replace(sensor, T_sensor_world=inverse(sensor.T_sensor_world))
+
+
+def bare(sensor: PinholeCamera) -> PinholeCamera:
+    return replace(sensor, distortion=np.zeros(0))
+
+
+def told(session: Session, seen: dict[str, list[np.ndarray]]) -> str:
+    return diagnosis(session, frames_of(session, seen)).change
+
+
+def test_a_right_session_has_nothing_wrong(right: Session) -> None:
+    found = diagnosis(right, frames_of(right, recorded(right)))
+    assert (found.change, found.good) == ("", 4)
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        (lambda s: with_points(s, s.body.means * [1, -1, 1]), "the body of [object] is mirrored: "),
+        (lambda s: with_points(s, s.body.means / 1000), "with points 1000 times as large"),
+        (lambda s: with_points(s, s.body.means * 1.02), "with points 0.98 times as large"),
+        (lambda s: with_cameras(s, inverted), "T_sensor_world of 'left' and 'right' are inverted"),
+        (lambda s: with_cameras(s, enlarged), "'left' and 'right' is that of images half as large"),
+        (lambda s: with_cameras(s, bare), "distortion of 'left' and 'right' is left out: "),
+    ],
+    ids=["mirrored", "metres", "too large", "inverted", "half the matrix", "no distortion"],
+)
+def test_what_a_session_says_wrong_all_along_is_told(
+    right: Session, fault: Callable[[Session], Session], said: str
+) -> None:
+    bent = with_cameras(right, lambda s: replace(s, distortion=np.array([-0.24, 0.1, 0.0, 0.0])))
+    assert said in told(fault(bent), recorded(bent))
+
+
+def test_one_marker_that_is_measured_wrong_is_named_with_its_place(right: Session) -> None:
+    wrong = right.body.means.copy()
+    wrong[2] += [3.0, -4.0, 0.0]
+    text = told(with_points(right, wrong), recorded(right))
+    assert text.startswith(f"marker {right.body.labels[2]} of [object] is measured wrong: ")
+    assert "with it 5 mm away" in text
+
+
+def test_sources_that_are_swapped_are_told(right: Session) -> None:
+    seen = recorded(right)
+    assert told(right, {"left": seen["right"], "right": seen["left"]}) == (
+        "'left' and 'right' are swapped: with the source of each given to the other"
+    )
+
+
+def test_images_that_are_mirrored_are_told_of_all_cameras(right: Session) -> None:
+    flipped = {
+        name: [y * [-1, 1] + [639, 0] for y in frames] for name, frames in recorded(right).items()
+    }
+    assert told(right, flipped).startswith("images of 'left' and 'right' are mirrored: ")
+
+
+def test_one_camera_cannot_tell_its_images_mirrored_from_the_body(right: Session) -> None:
+    alone = replace(right, sensors=right.sensors[:1])
+    centred = with_cameras(
+        alone, lambda s: replace(s, camera_matrix=[[810.0, 0, 319.5], [0, 810, 255.5], [0, 0, 1]])
+    )
+    mirrored = with_points(centred, centred.body.means * [1, 1, -1])
+    text = told(mirrored, recorded(centred))
+    assert text.startswith(
+        "the body of [object] may be mirrored, or images of 'left' may be mirrored: with one "
+    )
+
+
+def test_a_calibration_that_two_cameras_share_is_that_of_one_of_them(right: Session) -> None:
+    left, other = right.sensors
+    camera: Any = left.sensor
+    moved = camera.camera_matrix + np.array([[9.0, 0, 17.0], [0, 9.0, -14.0], [0, 0, 0]])
+    true = replace(
+        right, sensors=(replace(left, sensor=replace(camera, camera_matrix=moved)), other)
+    )
+    copied: Any = other.sensor
+    wrong = replace(
+        camera, camera_matrix=copied.camera_matrix, distortion=np.array(copied.distortion)
+    )
+    given = replace(right, sensors=(replace(left, sensor=wrong), other))
+    text = told(given, recorded(true))
+    assert text.startswith(
+        "the calibration of 'left' is not that of its images, but that of 'right': with about fx = "
+    )
+
+
+def test_normals_that_point_inwards_are_told(right: Session) -> None:
+    means = right.body.means
+    normals = means - means.mean(axis=0)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    outwards = with_points(right, means, normals)
+    text = told(with_points(right, means, -normals), recorded(outwards))
+    assert text == "normals of [object] are of the wrong sign: with all of them negated"
+
+
+def test_points_in_another_unit_than_the_start_are_told_of_one_camera(
+    right: Session, tmp_path: Path
+) -> None:
+    left = right.sensors[0]
+    rows = [
+        f"{f},{u},{v}" for f, frame in enumerate(recorded(right)["left"]) for u, v in frame.tolist()
+    ]
+    (tmp_path / "left.csv").write_text("\n".join(["frame,u,v", *rows, ""]), encoding="utf-8")
+    alone = replace(
+        with_points(right, right.body.means / 1000),
+        path=tmp_path / "session.toml",
+        sensors=(replace(left, source="left.csv", times=None, fps=None),),
+        start=Start(poses()[0]),
+    )
+    sources = open_sources(alone, {})
+    surveys = {"left": survey(alone, alone.sensors[0], sources["left"])}
+    found = geometry_doubts(alone, sources, surveys)
+    assert found.warnings == (
+        "points and translation of [start] are in two units of length: with points 1000 times as "
+        "large, the body is at [start] in frame 0",
+    )
+
+
+def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:
+    """What the cameras meet of a body without noise."""
+    return [
+        [
+            Seen(s.name, np.arange(7), s.sensor.project(transform(T, points))[0], 0.3)
+            for s in session.sensors
+        ]
+        for T in poses()
+    ]
+
+
+def given_to(session: Session, frames: Sequence[Sequence[Seen]]) -> Adjustment:
+    sensors = {setup.name: setup.sensor for setup in session.sensors}
+    return Adjustment(session.body.means, sensors, frames, poses())
+
+
+def test_least_squares_find_the_size_of_what_was_met(right: Session) -> None:
+    middle = right.body.means.mean(axis=0)
+    larger = middle + 1.03 * (right.body.means - middle)
+    size = next(iter(unknowns(right)))
+    given = given_to(right, exact(right, larger))
+    found = adjusted(size, given)
+    assert found is not None
+    np.testing.assert_allclose(found[0], [0.03], atol=1e-5)
+    assert promise(size, given) > 15
+    assert promise(size, given_to(right, exact(right, right.body.means))) < 1e-3
+
+
+def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
+    size = next(iter(unknowns(right)))
+    few = [
+        [Seen(one.name, one.features[:2], one.observed[:2], one.noise) for one in frame[:1]]
+        for frame in exact(right, right.body.means)
+    ]
+    assert adjusted(size, given_to(right, few)) is None
+    assert promise(size, given_to(right, few)) == 0.0
