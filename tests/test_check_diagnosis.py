@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from mixpose.body import Body, PointFeature
 from mixpose.checking import geometry_doubts, survey
 from mixpose.checking.adjusted import Adjustment, adjusted, promise
+from mixpose.checking.changes import Change
 from mixpose.checking.meetings import Seen
-from mixpose.checking.trials import diagnosis
+from mixpose.checking.rules import DiagnosisRules
+from mixpose.checking.trials import Tried, diagnosis, simplest
 from mixpose.checking.values import unknowns
 from mixpose.density import Observation
 from mixpose.objective import View
@@ -249,3 +252,20 @@ def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
     ]
     assert adjusted(size, given_to(right, few)) is None
     assert promise(size, given_to(right, few)) == 0.0
+
+
+def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:
+    def explained(good: int, rms: float) -> Any:
+        return SimpleNamespace(poses=[None] * 4, met=50.0, good=lambda _: good, rms=lambda: rms)
+
+    other_size = Change("the body {is} of another size", "with it larger", values=1)
+    elsewhere = Change("a camera {is} elsewhere", "with it moved", values=6)
+    rules, before = DiagnosisRules(), explained(0, 0.6)
+    tried = [
+        Tried(elsewhere, explained(4, 0.1), 105.0),
+        Tried(other_size, explained(4, 0.1), 100.0),
+    ]
+    assert simplest(tried, before, rules).change.startswith("the body is of another size")
+    # far more is worth more values
+    tried[0] = tried[0]._replace(gain=130.0)
+    assert simplest(tried, before, rules).change.startswith("a camera is elsewhere")

@@ -55,7 +55,7 @@ class Diagnosis:
     good: int = 0
 
 
-class _Tried(NamedTuple):
+class Tried(NamedTuple):
     """A change, by which frames are explained so much better."""
 
     change: Change
@@ -88,7 +88,7 @@ def diagnosis(
     tried = list(_with_values(session, frames, before, is_late))  # they take less time
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
         tried += _without_values(session, frames, before, others, is_late)
-    return _told(tried, before, rules)
+    return simplest(tried, before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -115,7 +115,7 @@ def _without_values(
     before: Explained,
     others: Sequence[tuple[Change, Frames]],
     is_late: Callable[[], bool],
-) -> Iterator[_Tried]:
+) -> Iterator[Tried]:
     """Changes that explain the first frame better than it is, and then the others."""
     of_seen = [(change, frames) for change in changes(session)]
     rules, some, waiting = DiagnosisRules(), 0, list[tuple[Change, Frames]]()
@@ -139,7 +139,7 @@ def _without_values(
 
 def _by_frames(
     session: Session, before: Explained, change: Change, seen: Frames, skipped: int = 0
-) -> list[_Tried] | None:
+) -> list[Tried] | None:
     """A change by which frames are explained better; None where the first tells nothing."""
     body, poses, gain = change.body(session.body), list(before.poses[:0]), 0.0
     order = [*range(skipped, len(seen)), *range(skipped)]
@@ -153,12 +153,12 @@ def _by_frames(
             return []
     by_frame = dict(zip(order, poses))
     explained = Explained(tuple(by_frame[k] for k in range(len(seen))))
-    return [_Tried(change, explained, gain - change.cost)]
+    return [Tried(change, explained, gain - change.cost)]
 
 
 def _with_values(
     session: Session, frames: Frames, before: Explained, is_late: Callable[[], bool]
-) -> Iterator[_Tried]:
+) -> Iterator[Tried]:
     """Values that suit the matches of all frames better than those given."""
     rules = DiagnosisRules()
     known = [k for k, pose in enumerate(before.poses) if evidence_of(pose) > 0]
@@ -188,7 +188,7 @@ def _fitted(
     known: Sequence[int],
     given: Adjustment,
     unknown: Unknown,
-) -> Iterator[_Tried]:
+) -> Iterator[Tried]:
     """A change by values, fitted twice: matches are better known by then."""
     found: list[Any] = []
     for _ in range(2):
@@ -223,7 +223,7 @@ def _fitted(
     unlikely = float(((values / unknown.deviations) ** 2).sum())
     cost = 0.5 * (count * math.log(max(2 * explained.met, 2.0)) + unlikely)
     change = Change(unknown.what, unknown.remedy(values), cost=cost, values=count)
-    yield _Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
+    yield Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
 
 
 def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
@@ -231,7 +231,7 @@ def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
     return [with_sensor(view, unknown.sensor(view.name, view.sensor, values)) for view in views]
 
 
-def _told(tried: Sequence[_Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
+def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
     """The simplest of the changes that explain most, and another that is as simple and good."""
     good = before.good(rules)
     told = [(one, _gain(one.explained, before, rules)) for one in tried]
