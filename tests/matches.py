@@ -74,6 +74,7 @@ def matches_of(*sensors: Seen) -> Matches:
         unmatched_nearby=of_each("unmatched_nearby"),
         beside=np.full(arrays["weights"].shape, np.nan),
         finest=of_each("finest"),
+        extra=np.zeros(arrays["weights"].shape),
     )
 
 

@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from matches import Seen, matches_of
 from numpy.typing import NDArray
+from scipy.special import fdtri
 
 from mixpose.judgement import NoiseModel, RememberedNoise
 from mixpose.judgement.noise import noise_of
+from mixpose.matching import ErrorRules
 
 Floats = NDArray[np.float64]
 
 FREE = np.ones(6, dtype=np.bool_)
 MODEL = NoiseModel()
-ALONE = replace(MODEL, confidence=0.0, lasting=0.0)
-"""Nothing is enlarged, and nothing believed to last before it is seen."""
+ALONE = replace(MODEL, confidence=0.0, lasting=0.0, errors=ErrorRules(cut=0.0))
+"""Nothing is enlarged or cut, and nothing believed to last before it is seen."""
 
 
 def judged(
@@ -93,16 +95,28 @@ def test_the_noise_of_a_frame_is_joined_with_what_is_remembered() -> None:
 
 def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
     rng = np.random.default_rng(1)
-    one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))  # 0.1 σ; ten degrees of freedom
+    one = sensor("0", rng, rng.normal(0, 0.2, (16, 2)))  # 0.1 σ; 26 degrees of freedom
     before = known(40 * 0.02**2, 40.0)
     covariance, found = judged([one], before, ALONE)
     covariance_alone, own = judged([one], model=ALONE)
     np.testing.assert_allclose(covariance, covariance_alone)
-    # remembered as the largest that chance makes: F of 10 and 40 degrees is 3.87 at 99.9 %
+    # remembered as the largest that chance makes
     kept, alone = of_first(found), of_first(own)
     assert kept[1] == pytest.approx(0.95 * 40.0 + alone[1], rel=0.02)
-    limit = 3.87 * 0.02**2 * alone[1]
+    limit = fdtri(26, 40, 0.999) * 0.02**2 * alone[1]
     assert kept[0] == pytest.approx(0.95 * 40 * 0.02**2 + limit, rel=0.02)
+
+
+def test_a_few_detections_farther_off_than_those_before_are_cut_and_change_no_noise() -> None:
+    rng = np.random.default_rng(1)
+    one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))
+    variances, _, _, found, ratio = noise_of(
+        matches_of(one), FREE, known(40 * 0.02**2, 40.0), ALONE
+    )
+    assert ratio > 1
+    # 40 degrees of freedom of 0.02 σ and ten of 0.1 σ, which is usual
+    assert variances[0] == pytest.approx((40 * 0.02**2 + 10 * 0.1**2) / 50, rel=0.01)
+    assert of_first(found) == pytest.approx([0.95 * 40 * 0.02**2, 0.95 * 40.0])
 
 
 def test_a_detection_far_off_does_not_make_the_others_unsure() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matches import Seen, matches_of
@@ -39,6 +41,18 @@ def test_an_eighth_of_offsets_far_off_changes_little() -> None:
     away[::8] += rng.uniform(0.5, 1.5, (50, 2))
     _, variances, _, _ = errors_seen(offsets_of(away), 0, NOTHING, RULES)
     assert variances[0] == pytest.approx(0.05**2, rel=0.15)
+
+
+def test_what_may_err_by_more_than_others_tells_little_of_the_noise() -> None:
+    rng = np.random.default_rng(4)
+    away = rng.normal(0, 0.05, (60, 2))
+    away[::3] += rng.normal(0, 0.2, (20, 2))
+    extra = np.where(np.arange(60) % 3, 0.0, 0.2**2)[None]
+    known = np.array([[400 * 0.05**2], [400.0]])
+    own, *_ = errors_seen(replace(offsets_of(away), extra=extra), 0, known, RULES)
+    # 40 of them, and 20 that weigh a seventeenth
+    assert own[1, 0] == pytest.approx(2 * 41, rel=0.1)
+    assert own[0, 0] / own[1, 0] == pytest.approx(0.05**2, rel=0.3)
 
 
 def test_the_blur_stays_wide_where_a_frame_is_not_like_those_before_it() -> None:

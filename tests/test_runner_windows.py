@@ -153,7 +153,11 @@ def test_a_body_that_jumps_out_of_its_window_is_found_in_the_same_frame(
     assert windows[4] is not None
     assert windows[5] is None
     expected = on_whole_frames(monkeypatch, camera, order, jump)
-    assert [one.status for one in found] == [one.status for one in expected] == ["ok"] * 7
+    statuses = [one.status for one in found]
+    assert statuses == [one.status for one in expected]
+    # moved without its distortion, the image fits the lens no more: frame 4 is of another kind
+    assert statuses[:5] == ["ok"] * 4 + ["ambiguous"]
+    assert "lost" not in statuses
     same = [np.array_equal(a.T_world_object, b.T_world_object) for a, b in zip(found, expected)]  # type: ignore[arg-type]
     assert same[4], "a whole look from the same track gives the very same pose"
 

@@ -9,7 +9,7 @@ integers) for cameras, lengths for ranges.  A camera has m = 2 coordinates, a ra
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, TypeAlias
 
@@ -33,6 +33,8 @@ class PointPattern:
         Feature positions in sensor coordinates.
     weights : (M,) float64
         Positive weight of each point; 1 for a plain detection.
+    deviations : (M,) float64
+        By how much more than others each may err, in sensor units; 0 but for blobs that are cut.
 
     Raises
     ------
@@ -42,6 +44,9 @@ class PointPattern:
 
     points: Floats
     weights: Floats
+    deviations: Floats = field(default_factory=lambda: np.zeros(()))
+
+    is_even: bool = field(init=False, default=True)  # whether none errs by more than others
 
     @property
     def size(self) -> int:
@@ -53,11 +58,21 @@ class PointPattern:
         """Sum of the weights."""
         return float(self.weights.sum())
 
+    def only(self, chosen: Mask) -> PointPattern:
+        """Some of the points (M,)."""
+        return PointPattern(self.points[chosen], self.weights[chosen], self.deviations[chosen])
+
+    def weighed(self, deviation: float) -> PointPattern:
+        """With weights as exact as detections are beside those that err by a deviation."""
+        return replace(self, weights=self.weights / (1 + (self.deviations / deviation) ** 2))
+
     def __post_init__(self) -> None:
         points = np.asarray(self.points, dtype=np.float64)
         weights = np.asarray(self.weights, dtype=np.float64)
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "deviations", np.broadcast_to(self.deviations, weights.shape))
+        object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(
                 f"points: found the shape {points.shape}; allowed: (M, 2) for pixels, (M, 1) for "

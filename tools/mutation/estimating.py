@@ -94,7 +94,7 @@ _NARROW = (
     Mutant(
         "fit-move-without-the-noise",
         "fit/near.py",
-        "(weights / variances[:, None]).repeat(2)",
+        "(weights / (variances[:, None] + matches.extra)).repeat(2)",
         "weights.repeat(2)",
         "how far narrower blurs move the pose is told in σ_ε, not in standard deviations",
         ("test_fit_noise.py",),

@@ -10,6 +10,30 @@ _CORNERS = "test_extraction_corners.py"
 
 _LEVELS = (
     Mutant(
+        "extraction-cut-disks-are-whole",
+        "extraction/blobs.py",
+        "elif rim.coverage < rules.whole or rim.residual > rules.exact * residual:",
+        "elif rim.coverage < 0:",
+        "what is cut counts as much as what is whole",
+        ("test_extraction_deviations.py",),
+    ),
+    Mutant(
+        "extraction-oblique-disks-are-cut",
+        "extraction/blobs.py",
+        "longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5",
+        "longer = blob.length - 1 - rules.rough / radius**1.5",
+        "spots seen aslant count little",
+        ("test_extraction_deviations.py",),
+    ),
+    Mutant(
+        "extraction-slivers-are-whole",
+        "extraction/blobs.py",
+        "longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5",
+        "longer = 0.0",
+        "what is left of a small spot counts as much as a whole one",
+        ("test_extraction_deviations.py",),
+    ),
+    Mutant(
         "extraction-broken-level-rounded-up",
         "extraction/threshold.py",
         "whole = math.floor(level)",

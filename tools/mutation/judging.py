@@ -22,7 +22,7 @@ _NOISE = (
     Mutant(
         "judgement-noise-of-another-kind-joined",
         "judgement/noise.py",
-        "ratio /= float(fdtri(degrees, known, model.by_chance))",
+        "ratio = residual_ratio(own, known, model.by_chance, rules)",
         "ratio = 0.0",
         "a frame of large residuals is as sure as those before it",
     ),
@@ -74,8 +74,8 @@ _FIELDS = (
     Mutant(
         "judgement-share-of-fields-forgotten",
         "judgement/noise.py",
-        "RememberedNoise(names, sums, moments, biases, share)",
-        "RememberedNoise(names, sums, moments, biases)",
+        "sums, moments, biases, share)",
+        "sums, moments, biases)",
         "sensors weigh the same, whatever noise they showed",
         ("test_judgement_noise.py",),
     ),
@@ -89,9 +89,60 @@ _FIELDS = (
     Mutant(
         "judgement-outliers-in-the-covariance",
         "judgement/noise.py",
-        "np.where(is_noise, found.shares, 0.0)",
-        "found.shares",
+        "np.where(is_noise, found.shares * scale[:, None] / wide, 0.0)",
+        "found.shares * scale[:, None] / wide",
         "a cut spot makes a frame unsure",
+    ),
+)
+
+_CUT = (
+    Mutant(
+        "judgement-nothing-is-cut",
+        "judgement/cut.py",
+        "chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < outside",
+        "chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < 1",
+        "a pose of few spots is as sure as if none of them could be cut",
+        ("test_judgement_cut.py",),
+    ),
+    Mutant(
+        "judgement-cut-as-told-along-rows",
+        "judgement/cut.py",
+        "(half + np.hypot(apart, told[:, 0, 1])).max(initial=0.0)",
+        "told[:, 0, 0].max(initial=0.0)",
+        "that nothing else tells of a spot along a slant is not seen",
+        ("test_judgement_cut.py",),
+    ),
+    Mutant(
+        "judgement-cut-not-beyond-the-ellipsoid",
+        "judgement/cut.py",
+        "(beyond > outside)[:-1].sum()",
+        "(beyond > 1)[:-1].sum()",
+        "of few spots one in a hundred poses is out of its ellipsoid",
+        ("test_judgement_cut.py",),
+    ),
+    Mutant(
+        "judgement-a-few-cut-spots-are-a-change-of-noise",
+        "judgement/noise.py",
+        "if sum(matches.met.tolist()) < model.fewest:",
+        "if sum(matches.met.tolist()) < 0:",
+        "a pose that cut spots pull is as likely as its own residuals make it",
+        ("test_judgement_noise.py",),
+    ),
+    Mutant(
+        "judgement-open-poses-are-ok",
+        "judgement/acceptance.py",
+        "return ratio > rules.open and by_usual > 2 * len(C)",
+        "return ratio > rules.open and by_usual > 1e9",
+        "a direction that slivers alone tell is ok",
+        ("test_judgement_cut.py",),
+    ),
+    Mutant(
+        "judgement-open-however-precise",
+        "judgement/acceptance.py",
+        "return ratio > rules.open and by_usual > 2 * len(C)",
+        "return ratio > rules.open",
+        "precise poses of half of the features are doubted",
+        ("test_judgement_cut.py",),
     ),
 )
 
@@ -142,8 +193,8 @@ _EVIDENCE = (
     Mutant(
         "judgement-offsets-cost-nothing",
         "judgement/judge.py",
-        "rarity[..., None] - _costs(found, roots, spreads)",
-        "rarity[..., None]",
+        "np.maximum(rarity - _costs(found, roots, spreads), 0.0)",
+        "np.maximum(rarity, 0.0)",
         "a pose that meets features loosely is as good as one that meets them",
     ),
     Mutant(
@@ -331,4 +382,4 @@ _JUDGE = (
     ),
 )
 
-MUTANTS = (*_NOISE, *_FIELDS, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
+MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)

@@ -15,9 +15,17 @@ _ERRORS = (
     Mutant(
         "matching-errors-of-all-detections-alike",
         "matching/matches.py",
-        "weights = matches.shares * welsch(matches.squared, blurs)",
-        "weights = matches.shares",
+        "weights = matches.shares * alike * welsch(squared, blurs)",
+        "weights = matches.shares * alike",
         "a cut spot is noise of all others",
+    ),
+    Mutant(
+        "matching-cut-spots-are-noise",
+        "matching/matches.py",
+        "alike = expected / (expected + matches.extra)",
+        "alike = np.ones(matches.shares.shape)",
+        "noise is taken to be as large as what cut spots are off by",
+        ("test_judgement_noise.py", "test_matching_errors.py"),
     ),
     Mutant(
         "matching-errors-of-a-frame-forgotten",

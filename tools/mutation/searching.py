@@ -68,8 +68,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "best.log_evidence - gained > rules.acceptance.sure",
-        "best.log_evidence > rules.acceptance.sure",
+        "best.log_evidence - gained <= data.rules.acceptance.sure",
+        "best.log_evidence <= data.rules.acceptance.sure",
         "another body that looks alike to one camera is ok after a frame or two",
         (_STARTS,),
     ),
@@ -116,8 +116,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-narrow-fits-choose-a-sensor",
         "tracking/proposers.py",
-        "> np.count_nonzero(met, axis=1) / 2",
-        "> np.count_nonzero(met, axis=1)",
+        "<= met / 2",
+        "<= met",
         "of sensors that are out of step the one that is right by itself is believed",
         (_PROPOSERS,),
     ),

@@ -260,7 +260,8 @@ class Findings:
         doubted = sum(each.count for each in self._doubts.values())
         frozen = sum(each.count for each in self._same.values())
         few = self._ok <= (self._places + 1) / 2 and self._agreed_before < _LONG
-        if not few or doubted < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
+        bad = self._places + 1 - self._ok if doubted else 0
+        if not few or bad < max(_LONG, frozen + 1) or len(self._session.labels) > 1:
             return None
         return explanation(self._session, self._frames)
 

@@ -34,6 +34,9 @@ class DrawingRules:
         "from a detection to where it is drawn: what is farther draws it by less than 1e-3 σ_ε",
     )
     paper_reach: float = constant(4.0, "from predicted samples to the end of their window")
+    exact: float = constant(
+        0.14, "of a blur: what detections that may err by more are as high beside others as"
+    )
     cut: float = constant(5.0, "at which sums end: the tail holds 6e-7")
     negligible: float = constant(16.0, "exponent at which two features do not overlap: 1e-7")
     tile: int = constant(

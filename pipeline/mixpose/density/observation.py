@@ -104,8 +104,7 @@ class Observation:
     def only(self, chosen: Mask) -> Observation:
         """With some of its detections (M,)."""
         assert isinstance(self.pattern, PointPattern)
-        part = PointPattern(self.pattern.points[chosen], self.pattern.weights[chosen])
-        return replace(self, pattern=part)
+        return replace(self, pattern=self.pattern.only(chosen))
 
     @cached_property
     def cell(self) -> float | None:
@@ -177,8 +176,9 @@ class Observation:
         if self.is_empty:
             return 0.0
         if isinstance(self.pattern, PointPattern):
-            overlap = self_overlap(self.pattern.points, self.pattern.weights, 2 * sigma**2)
-            return overlap / self.weight**2
+            part, blur = self.pattern, DRAWING.exact * self.blur(sigma, matched=True)
+            part = part if part.is_even else part.weighed(blur)
+            return self_overlap(part.points, part.weights, 2 * sigma**2) / part.total**2
         g = self.density(sigma, (np.array(-np.inf), np.array(np.inf)))
         squared = np.einsum("ij,ij->", g.values, g.values, dtype=np.float64)
         return float(squared * g.window.step**self.dimension)

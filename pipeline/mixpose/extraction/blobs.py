@@ -14,6 +14,7 @@ again at higher levels, so that blobs are found on it too.
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,13 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mixpose.constants import constant
-from mixpose.extraction.conics import Ellipse, distances, together
+from mixpose.extraction.conics import distances, together
 from mixpose.extraction.contours import (
     Box,
     Contour,
     ContourRules,
     cut_out,
     filled_area,
+    length_by_width,
     neighbours,
     on_border,
     outlines,
@@ -39,7 +41,7 @@ from mixpose.extraction.options import ExtractOptions
 from mixpose.extraction.single_spots import all_spots
 from mixpose.extraction.spots import SpotRules, come_apart
 from mixpose.extraction.threshold import Foreground, ThresholdRules, Window, above, foreground
-from mixpose.records import Image, PointPattern
+from mixpose.records import Floats, Image, PointPattern
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,10 @@ class BlobRules:
     core_ratio: float = constant(
         3.0, "peak by median from which a core may be the feature, the rest what it lights"
     )
+    whole: float = constant(0.97, "of the rim that is seen of whole disks")
+    exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
+    rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
+    off_centre: float = constant(1.5, "radii per length by width beyond 1: of a cut disk, in 68 %")
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,8 @@ class Blob:
     u: float
     v: float
     area: float
-    rim: Ellipse | None = None
+    length: float = 1.0  # by width
+    rim: Rim | None = None
 
 
 def extract_blobs(
@@ -95,7 +102,28 @@ def extract_blobs(
     """
     blobs = find_blobs(foreground(image, options, window, rules.threshold), options, rules)
     points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
-    return PointPattern(points + window[:2], np.ones(len(points)))
+    return PointPattern(points + window[:2], np.ones(len(points)), deviations_of(blobs, rules))
+
+
+def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floats:
+    """By how much more than others the centres of blobs (M,) may err, px: of those that are cut.
+
+    A disk of which something is hidden, or that is merged with something, is longer than wide by as
+    much as its centre is off, in radii.  So are oblique ones, but all alike, and with all of a rim.
+    """
+    deviations, rims = np.zeros(len(blobs)), [blob.rim for blob in blobs if blob.rim]
+    residual = statistics.median_low([rim.residual for rim in rims] or [0.0])
+    typical = sorted([blob.length for blob in blobs])[: (len(blobs) + 3) // 4][-1:]
+    for k, blob in enumerate(blobs):
+        radius, rim = math.sqrt(blob.area / math.pi), blob.rim
+        if rim is None:
+            longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5
+        elif rim.coverage < rules.whole or rim.residual > rules.exact * residual:
+            longer = blob.length - 1
+        else:
+            continue
+        deviations[k] = rules.off_centre * radius * max(longer, 0.0)
+    return deviations
 
 
 def find_blobs(
@@ -146,8 +174,9 @@ def _search(
     blobs += [disk for disk in disks if disk is not None]
     shapeless = [contour for contour, disk in zip(large, disks, strict=True) if disk is None]
     found = all_spots(scene, small, small_areas, level, rules.spots)
-    for area, spots in zip(small_areas, found, strict=True):
-        blobs += [Blob(u, v, area / len(spots)) for u, v in spots]
+    for contour, area, spots in zip(small, small_areas, found, strict=True):
+        length = length_by_width(contour) if len(spots) == 1 else 1.0
+        blobs += [Blob(u, v, area / len(spots), length) for u, v in spots]
     for group in neighbours(shapeless, rules.contours):
         parts = [np.concatenate(group)] if len(group) > 1 else []
         whole = [disk for disk in _disks(scene, parts, level, rules) if disk is not None]
@@ -165,7 +194,7 @@ def _disks(
     """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
     rims = find_rims(scene.grey, contours, scene.level, rules.rims)
     return [
-        Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse)
+        Blob(*rim.ellipse.centre, rim.ellipse.area, rim.ellipse.length, rim)
         if rim is not None and _is_disk(scene, contour, rim, rules)
         else None
         for contour, rim in zip(contours, rims, strict=True)
@@ -227,7 +256,7 @@ def _hull_blob(contour: Contour) -> Blob:
     """The blob of an outline, its centre that of the hull: holes may have broken the outline."""
     moments = cv2.moments(cv2.convexHull(contour))
     centre = (moments["m10"] / moments["m00"], moments["m01"] / moments["m00"])
-    return Blob(*centre, filled_area(contour))
+    return Blob(*centre, filled_area(contour), length_by_width(contour))
 
 
 def _brightness(
@@ -251,7 +280,7 @@ def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:
 
 def _outside_disks(blobs: list[Blob]) -> list[Blob]:
     """Blobs without those inside of a larger disk: scraps of its own broken rim."""
-    disks = [(blob.rim, blob.area) for blob in blobs if blob.rim is not None]
+    disks = [(blob.rim.ellipse, blob.area) for blob in blobs if blob.rim is not None]
     if not disks:
         return blobs
     rims, disk_areas = zip(*disks, strict=True)

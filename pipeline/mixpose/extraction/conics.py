@@ -29,6 +29,11 @@ class Ellipse:
         """Enclosed area in px."""
         return math.pi * self.half_axes[0] * self.half_axes[1]
 
+    @property
+    def length(self) -> float:
+        """By width."""
+        return max(self.half_axes) / min(self.half_axes)
+
 
 @dataclass(frozen=True)
 class Ellipses:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -75,6 +76,17 @@ def filled_area(contour: Contour) -> float:
     if len(contour) == 1:
         return 1.0
     return float(cv2.contourArea(contour)) + len(contour) / 2 + 1
+
+
+def length_by_width(contour: Contour) -> float:
+    """Of the ellipse that has the moments of a contour."""
+    # The contour runs through the centres of the outermost pixels: it is half a pixel inside.
+    m = cv2.moments(contour)
+    if m["m00"] <= 0:  # a line
+        return float(len(contour))
+    middle, half = (m["mu20"] + m["mu02"]) / 2, math.hypot((m["mu20"] - m["mu02"]) / 2, m["mu11"])
+    long, short = (4 * max(v, 0.0) / m["m00"] for v in (middle + half, middle - half))
+    return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
 
 
 def cut_out(

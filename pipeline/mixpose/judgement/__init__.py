@@ -10,6 +10,7 @@ from mixpose.judgement.acceptance import (
     decide as decide,
     insert as insert,
     is_far_off as is_far_off,
+    is_open as is_open,
     is_possible as is_possible,
     is_sure as is_sure,
     nearest_alike as nearest_alike,
@@ -26,10 +27,12 @@ from mixpose.judgement.judge import (
     odds_of as odds_of,
     paid_by_count as paid_by_count,
 )
+from mixpose.judgement.expected import (
+    expected_covariance as expected_covariance,
+    invert_information as invert_information,
+)
 from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,
     RememberedNoise as RememberedNoise,
-    expected_covariance as expected_covariance,
     inverted as inverted,
-    invert_information as invert_information,
 )

@@ -14,7 +14,7 @@ from scipy.special import fdtri
 from mixpose.body import Body
 from mixpose.constants import constant
 from mixpose.judgement.judge import ScoredPose
-from mixpose.judgement.noise import NoiseModel
+from mixpose.judgement.noise import NoiseModel, information_of, inverted
 from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import rotation_angle_deg, twist_between
@@ -41,6 +41,8 @@ class AcceptanceRules:
     convincing: float = constant(0.75, "share of the body to look nowhere else: a slip meets less")
     agreeing: float = constant(0.5, "share that a sensor that agrees, and a sure pose, must meet")
     disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
+    open: float = constant(300.0, "sum of variances by those if all in view were met, and whole")
+    changed: float = constant(10.0, "times the residuals that chance makes: frames have up to 7")
     same: float = constant(0.02, "of the body's radius, and rad: nearer poses are one")
     same_peak: float = constant(3.0, "deviations of their distance within which poses are one")
     same_peak_deg: float = constant(5.0, "turn of two poses all the same: tilts of a flat body")
@@ -118,6 +120,25 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
     return Verdict("ok" if clear else "ambiguous", best, kept)
 
 
+def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseModel) -> bool:
+    """Whether what would fix some direction is hidden or cut.
+
+    The sum of variances is compared with that if all features in view were met, and whole, by this
+    noise and by what is usual.
+    """
+    used = pose.used
+    if not (np.count_nonzero(used.shares < used.weights) or np.count_nonzero(used.extra)):
+        return False
+    inner = np.ix_(free, free)
+    whole = replace(used, shares=used.weights, extra=np.zeros(used.extra.shape))
+    C = inverted(information_of(used, pose.variances)[inner])
+    usual = np.full(len(used.names), model.usual**2)
+    ratio, by_usual = (
+        float(np.vdot(C, information_of(whole, noise)[inner])) for noise in (pose.variances, usual)
+    )
+    return ratio > rules.open and by_usual > 2 * len(C)
+
+
 def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> bool:
     """Whether the first pose meets most of the body and is far likelier than all others.
 
@@ -155,7 +176,7 @@ def _alike(a: ScoredPose, b: ScoredPose, body: Body, free: Mask, rules: Acceptan
     T_b = nearest_alike(b.T_world_object, body, T_a)
     away = twist_between(T_a, T_b)[free]
     both = (a.covariance + b.covariance + a.bent)[np.ix_(free, free)]
-    inside = bool(away @ np.linalg.solve(both, away) < rules.same_peak**2)
+    inside = bool(away @ inverted(both) @ away < rules.same_peak**2)
     if a.spread is not None:
         return inside  # of the likelihood, drawn to different priors
     turned = float(rotation_angle_deg(T_a, T_b))
@@ -179,6 +200,7 @@ def contradict(
     used = judged.used
     if used.dimensions.tolist() != [2, 2]:
         return False
+    variance = _variance(before, model, model.errors.typical)
     # one meets most of the body; the other misses it, and sees as much beside it, or, where the
     # two never agreed, anywhere
     least, most = sorted(range(2), key=used.coverage.tolist().__getitem__)
@@ -187,10 +209,14 @@ def contradict(
         if not agreed:
             beside, needed = used.count[least] - used.met[least], used.met[most]
         if needed > 0 and beside >= rules.agreeing * needed:
-            return True
+            # of the body's, against detections anywhere near
+            v = min(variance, model.usual**2) + used.extra[least]
+            odds = np.log(model.errors.met**2 / (2 * v)) - used.squared[least] / (2 * v)
+            return bool(used.shares[least] @ odds < rules.sure)
     # offsets far beyond the noise so far, which a pose of its own takes away in each sensor
     if not is_far_off(used, before, rules, model):
         return False
+    used = _by_noise(used, variance, model)
     rows, offsets = used.rows()
     J = block_diag(*rows)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-12)
@@ -202,18 +228,33 @@ def contradict(
     return bool(own >= 1 and gained > fdtri(more, own, model.by_chance) * alone / own)
 
 
+def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
+    """Of the noise so far (2,), squares and degrees of freedom, or what is typical before that."""
+    is_known = before[1] >= model.known
+    return max(float(before[0] / before[1]), LEAST_VARIANCE) if is_known else typical**2
+
+
+def _by_noise(used: Matches, variance: float, model: NoiseModel) -> Matches:
+    """Matches of which what errs by more than noise counts less, and a few far off not at all."""
+    wide, met = variance + used.extra, used.shares > 0
+    far = met & (used.squared > model.errors.outlying**2 * wide)
+    # where most of a sensor are far off it is out of step, or turned
+    far &= (
+        np.count_nonzero(far, axis=1, keepdims=True) <= np.count_nonzero(met, axis=1)[:, None] / 2
+    )
+    return replace(used, shares=np.where(far, 0.0, used.shares * variance / wide))
+
+
 def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Whether features are met far beyond the noise so far (2,), squares and degrees of freedom.
 
     Where that is not known, half as far beyond what is typical: half of σ_ε; right geometry has
     0.2.
     """
-    degrees = sum(used.measurements.tolist()) - 6
-    if degrees < 1:
-        return False
-    is_told, typical = before[1] >= model.known, model.errors.typical**2 / 4
-    variance = max(before[0] / before[1], LEAST_VARIANCE) if is_told else typical
-    return bool(sum(used.squares.tolist()) / degrees >= rules.disagreeing * variance)
+    variance = _variance(before, model, model.errors.typical / 2)
+    used = _by_noise(used, variance, model)
+    degrees, squares = sum(used.measurements.tolist()) - 6, sum(used.squares.tolist())
+    return bool(degrees >= 1 and squares >= degrees * rules.disagreeing * variance)
 
 
 def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None) -> Floats:

@@ -78,6 +78,9 @@ class ScoredPose:
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
     # (6, 6) of the covariance, what lasts from frame to frame
     persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
+    variances: Floats = field(
+        default_factory=lambda: np.ones(1)
+    )  # (L,) of the noise, of those used
     residual_ratio: float = 0.0  # of its residuals to the largest that chance makes
     # (6, 6) where features are off by all that the spreads of a body that gives way allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
@@ -160,9 +163,11 @@ def judge_together(
     """Judge K poses that the same sensors see and take part in; those left out meet nothing."""
     left_out, whole, noises = left_out or {}, [], []
     association = rules.association, rules.noise.errors.narrowest
-    for objective, T, before, _, matches, noise in cases:
+    for objective, T, before, prior, matches, noise in cases:
         whole.append(matches or associate(objective, T, *association))
-        noises.append(noise_of(taken_part(whole[-1], left_out), free, before, rules.noise, noise))
+        known = (prior or flat_prior(objective.projection.body, free, rules.detection))[1]
+        part = taken_part(whole[-1], left_out)
+        noises.append(noise_of(part, free, before, rules.noise, noise, known))
     # one pose needs no axis of poses
     variances, seen = noises[0][0], whole[0]
     if len(cases) > 1:
@@ -183,9 +188,10 @@ def judge_together(
             left_out=left_out,
             persistent=persistent,
             residual_ratio=ratio,
+            variances=own,
             bent=bent[k],
         )
-        for k, (_, covariance, persistent, remembered, ratio) in enumerate(noises)
+        for k, (own, covariance, persistent, remembered, ratio) in enumerate(noises)
     ]
 
 
@@ -267,10 +273,10 @@ def odds_of(
 
     Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
     """
-    roots, m = np.sqrt(variances), found.dimensions
-    crowd = found.crowd * roots**m
+    roots, m = np.sqrt(variances[..., None] + found.extra), found.dimensions[:, None]
+    crowd = found.crowd[..., None] * roots**m
     rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
-    gained = found.shares * np.maximum(rarity[..., None] - _costs(found, roots, spreads), 0.0)
+    gained = found.shares * np.maximum(rarity - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
     is_blind = (gained + missed).sum(axis=-1) < detection.log_blind
@@ -280,8 +286,8 @@ def odds_of(
         missed = np.where(is_blind[..., None], even * detection.log_blind, missed)
         gained, shares = (one * ~is_blind[..., None] for one in (gained, shares))
     # a detection that chance puts as near is not the feature's
-    near = (gained > 0) & (m == 2)[:, None]
-    (gained, missed), coordinates = np.array([gained, missed]).sum(axis=-2), m @ shares
+    near = (gained > 0) & (m == 2)
+    (gained, missed), coordinates = np.array([gained, missed]).sum(axis=-2), m[:, 0] @ shares
     # a feature that no sensor sees is covered, as if two had missed it: not one by one
     most = 2 * detection.log_missed * found.weights.max(axis=-2)
     missed = np.where(shares.any(axis=-2), missed, np.maximum(missed, most))
@@ -299,9 +305,9 @@ def odds_of(
 def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:
     """What offsets (K, L, N) cost: − ln N(offset; 0, s² + J Σ Jᵀ), beside 2 π s²."""
     if spreads is None:
-        return np.asarray(found.squared / (2 * roots**2)[..., None])
-    r = (found.offsets / roots[..., None, None])[..., None]
-    by_world = found.J[..., :3] / roots[..., None, None, None]
+        return np.asarray(found.squared / (2 * roots**2))
+    r = (found.offsets / roots[..., None])[..., None]
+    by_world = found.J[..., :3] / roots[..., None, None]
     S = np.eye(2) + by_world @ spreads[..., None, :, :, :] @ by_world.swapaxes(-2, -1)
     away = (r * np.linalg.solve(S, r)).sum(axis=(-2, -1))
     return np.asarray(0.5 * (away + np.linalg.slogdet(S)[1]))
@@ -315,7 +321,7 @@ def _in_space(
     A clutter point lies where the cameras see it; only that it lies at the feature tells.
     """
     *K, L, N = near.shape
-    J, r = found.J[..., :3] / roots[..., None, None, None], found.offsets / roots[..., None, None]
+    J, r = found.J[..., :3] / roots[..., None, None], found.offsets / roots[..., None]
     rows = (J * near[..., None, None]).swapaxes(-4, -3).reshape(*K, N, 2 * L, 3).swapaxes(-2, -1)
     A = rows @ rows.swapaxes(-2, -1)
     A.reshape(*K, N, 9)[..., ::4] += 1 / sizes[..., None, None] ** 2
@@ -324,7 +330,7 @@ def _in_space(
     # detections per area, of which each has a depth
     a, b = J[..., 0, :], J[..., 1, :]
     areas = np.vecdot(a, a) * np.vecdot(b, b) - np.vecdot(a, b) ** 2
-    squared = (crowd[..., None] ** 2 * areas).min(axis=-2, initial=1e300, where=near)
+    squared = (crowd**2 * areas).min(axis=-2, initial=1e300, where=near)
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
         place = np.linalg.solve(A, pull)
         A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads, A))

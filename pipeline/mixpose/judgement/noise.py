@@ -20,19 +20,24 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.linalg.lapack import dposv
 from scipy.optimize import nnls
 from scipy.special import chdtri, fdtri
 
-from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.matching import ErrorRules, Matches, NoiseEstimate, errors_seen, pooled
-from mixpose.objective import project_body
+from mixpose.judgement.cut import with_cut_spots
+from mixpose.matching import (
+    ErrorRules,
+    Matches,
+    NoiseEstimate,
+    errors_seen,
+    pooled,
+    residual_ratio,
+)
 from mixpose.records import Floats, Mask
-from mixpose.sensors import Sensor
 
 Biases: TypeAlias = Mapping[tuple[str, ...], Floats]
 
@@ -44,6 +49,11 @@ class NoiseModel:
     errors: ErrorRules = ErrorRules()
     by_chance: float = constant(0.999, "frames of residuals rarer than this stand on their own")
     known: float = constant(20.0, "degrees of freedom that tell the noise to 16 %, √(1/2ν)")
+    usual: float = constant(0.1, "σ_ε: spots and corners err by 0.01 to 0.3 of it")
+    usual_degrees: float = constant(10.0, "of freedom that this counts as: by a factor of 1.25")
+    fewest: float = constant(
+        10.0, "detections that tell a change of noise from something that cuts every second spot"
+    )
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
     confidence: float = constant(0.95, "of the F distribution's ellipsoid; 0 enlarges nothing")
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
@@ -79,6 +89,12 @@ class RememberedNoise:
         """Squares and degrees of freedom (2,) of all sensors together."""
         return np.asarray(self.sums.sum(axis=1))
 
+    def followed(self, names: Sequence[str], sums: Floats, *rest: Any) -> RememberedNoise:
+        """With sums (2, L) of some sensors and those of others as they were, and all else anew."""
+        others = [k for k, name in enumerate(self.names) if name not in names]
+        sums = np.concatenate([sums, self.sums[:, others]], axis=1) if others else sums
+        return RememberedNoise((*names, *[self.names[k] for k in others]), sums, *rest)
+
     def of(self, names: Sequence[str]) -> Floats:
         """Squares and degrees of freedom (2, L) of some sensors."""
         if tuple(names) == self.names:
@@ -93,6 +109,7 @@ def noise_of(
     before: RememberedNoise,
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
+    known: Floats = np.full(6, np.inf),  # how uncertain the pose was before
 ) -> tuple[Floats, Floats, Floats, RememberedNoise, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
@@ -103,8 +120,10 @@ def noise_of(
     (chosen,) = free.nonzero()
     count, inner = len(chosen), (chosen[:, None], chosen)
     variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
-    is_noise = found.squared <= model.errors.outlying**2 * scale[:, None]
-    shares, noise = np.where(is_noise, found.shares, 0.0), np.sqrt(scale)
+    wide = scale[:, None] + found.extra
+    is_noise = found.squared <= model.errors.outlying**2 * wide
+    # what errs by more than noise counts less
+    shares, noise = np.where(is_noise, found.shares * scale[:, None] / wide, 0.0), np.sqrt(scale)
     met = shares.sum(axis=1)
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
@@ -129,13 +148,13 @@ def noise_of(
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    given = found, J, r, inverse, known[chosen], wide, model.errors, 1 - model.by_chance
+    spread, larger = with_cut_spots(*given)
+    covariance[inner] = larger * (covariance[inner] + spread)
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
-    others = [k for k, name in enumerate(before.names) if name not in found.names]
-    names = (*found.names, *[before.names[k] for k in others])
-    sums = np.concatenate([sums, before.sums[:, others]], axis=1) if others else sums
-    after = RememberedNoise(names, sums, moments, biases, share)
+    after = before.followed(found.names, sums, moments, biases, share)
     return variances, covariance + steady, steady, after, ratio
 
 
@@ -149,22 +168,28 @@ def _level(
     """Variances (L,) as offsets show them, and those that residuals are measured in.
 
     As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Then the
-    degrees of freedom of all that was seen, and the ratio.
+    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Where it is
+    more likely that something in front cuts spots, it goes by the noise so far, beyond which spots
+    say nothing.  Then the degrees of freedom of all that was seen, and the ratio.
     """
     rules, past = model.errors, before.of(matches.names)
-    sums, ratio = model.memory * past, 0.0
+    sums, share = model.memory * past, model.usual_degrees / len(matches.names)
     own, variances, *_ = estimate or errors_seen(matches, count, sums, rules)
-    known, degrees = sum(past[1].tolist()), sum(own[1].tolist())
-    if known >= model.known and degrees >= 1:
-        ratio = sum((own[0] / pooled(past, rules, 0.0)).tolist()) / degrees
-        ratio /= float(fdtri(degrees, known, model.by_chance))
+    # of cameras; what is usual for ranges nobody knows
+    believed = past + share * (matches.dimensions == 2) * [[model.usual**2], [1.0]]
+    known = [believed, past] if sum(past[1].tolist()) >= model.known else [believed]
+    ratio = residual_ratio(own, known, model.by_chance, rules)
     told = sums + own
     if ratio > 1:
         told[0] = sums[0] + own[0] / ratio
-        sums = np.zeros_like(past)
-        own, variances, *_ = errors_seen(matches, count, sums, rules)
+        if sum(matches.met.tolist()) < model.fewest:
+            variances, told = pooled(believed, rules, 0.0), sums
+        else:
+            sums = np.zeros_like(past)
+            own, variances, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
+    if ratio <= 1:
+        variances = pooled(sums, rules, 1.0)
     degrees = sum(sums[1].tolist())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
     return variances, scale, told, degrees, ratio
@@ -294,7 +319,10 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
     What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
     """
     *poses, sensors, n, m, _ = found.J.shape
-    by_feature, weights = (*poses, n, sensors * m, 6), found.shares / variances[..., None]
+    by_feature, weights = (
+        (*poses, n, sensors * m, 6),
+        found.shares / (variances[..., None] + found.extra),
+    )
     rows = found.J, weights[..., None, None] * found.J
     J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]
     information = scaled.swapaxes(-2, -1) @ J
@@ -302,34 +330,3 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
         taken = spreads @ np.linalg.inv(np.eye(3) + information[..., :3, :3] @ spreads)
         information = information - information[..., :3] @ taken @ information[..., :3, :]
     return np.asarray(information.sum(axis=-3))
-
-
-def invert_information(information: Floats, free: Mask) -> Floats:
-    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
-    inner, covariance = np.ix_(free, free), np.zeros((6, 6))
-    covariance[inner] = inverted(information[inner])
-    # so much larger than if all other directions were known
-    inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
-    unknown = inflation > 1e9
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
-
-
-def expected_covariance(
-    sensors: Sequence[Sensor],
-    sigmas: Sequence[float],  # σ_ε, sensor units
-    body: Body,
-    T_world_object: Floats,
-    free: Mask,
-) -> tuple[Floats, list[int]]:
-    """Covariance that one frame gives when every feature in view is found with error σ_ε.
-
-    As `invert_information` has it, in the axes of `mixpose.rigid`; and the number of features
-    that each sensor sees.
-    """
-    at = project_body(tuple(sensors), body).project(T_world_object[None])
-    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
-    information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
-    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
-    return invert_information(information, free), counts

@@ -13,5 +13,6 @@ from mixpose.matching.matches import (
     errors_seen as errors_seen,
     log_likelihood as log_likelihood,
     pooled as pooled,
+    residual_ratio as residual_ratio,
     welsch as welsch,
 )

@@ -31,6 +31,7 @@ class AssociationRules:
     min_region: float = constant(20.0, "σ_ε over which features crowd at least, be they two")
     crowded: bool = constant(True, "whether clutter is as dense as detections around the body")
     merged: bool = constant(True, "whether two features may share a detection: blobs that touch")
+    middle: float = constant(0.2, "σ_ε: of two that share one, which one of them may outshine")
     slip: float = constant(0.25, "of the body's size: there a slipped grid (1/8) has detections")
 
     @property
@@ -72,6 +73,7 @@ def associate(
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     return Matches(
+        extra=_extra(views, by, partner, rules.middle),
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,
@@ -99,6 +101,18 @@ def _detections(views: Sequence[View]) -> Floats:
         side[: len(own)] = 0.0
         side[: len(own), : own.shape[1]] = own
     return detections
+
+
+def _extra(views: Sequence[View], by: Indices, partner: Indices, middle: float) -> Floats:
+    """Variances (L, n) of the detections by which features are met beyond noise, σ_ε²."""
+    extra = np.where(partner >= 0, middle**2, 0.0)
+    for k, pattern in enumerate([view.observation.pattern for view in views]):
+        if isinstance(pattern, PointPattern) and not pattern.is_even:
+            # what two features share is long for that
+            single = np.flatnonzero((by[k] >= 0) & (partner[k] < 0))
+            deviations = pattern.deviations[by[k, single]] / views[k].observation.sigma
+            extra[k, single] = deviations * deviations
+    return extra
 
 
 def _to_nearest(

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.special import fdtri
 
 from mixpose.constants import constant
 from mixpose.density import DRAWING
@@ -47,6 +48,7 @@ class Matches:
     unmatched_nearby: Floats  # (..., L) of no feature, about the body, where some feature is missed
     beside: Floats  # (..., L, N) how far the nearest detection but its own is, σ_ε; NaN for none
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
+    extra: Floats  # (..., L, N) variances of what meets them beyond the noise, σ_ε²: of what is cut
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
 
     def at(self, index: int | list[int] | None) -> Matches:
@@ -159,6 +161,7 @@ class ErrorRules:
         "of the noise is that of all sensors, at least: half of it costs 10 % beside ranges, and "
         "none of it 20 % where a body is off",
     )
+    cut: float = constant(0.01, "chance that a detection is off by more than it shows: 18 of 2500")
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 
     @property
@@ -215,8 +218,12 @@ def _seen_at(
     blurs: Floats, before: Floats, matches: Matches, free: int, known: Floats, rules: ErrorRules
 ) -> NoiseEstimate:
     """The same, as seen at one blur (L,) for each sensor."""
-    weights = matches.shares * welsch(matches.squared, blurs)
-    sums = map(sum, weights.tolist()), np.vecdot(weights, matches.squared).tolist()
+    # what errs by more counts less
+    expected = ((before / rules.blur) ** 2)[:, None]
+    alike = expected / (expected + matches.extra)
+    squared = matches.squared * alike
+    weights = matches.shares * alike * welsch(squared, blurs)
+    sums = map(sum, weights.tolist()), np.vecdot(weights, squared).tolist()
     coordinates, squares, degrees = [], [], []
     for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):
         coordinates.append(m * weight + 1e-12)
@@ -247,7 +254,7 @@ def log_likelihood(
 
     What a pose is free to fit is paid for.  Blurs (L,) go by the noise.
     """
-    m, variances = matches.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2
+    m, variances = matches.dimensions[:, None], (blurs[:, None] / rules.blur) ** 2 + matches.extra
     peaks = (2 * np.pi * variances) ** (-0.5 * m)
     anywhere = np.where(m == 1, 2 * rules.met, np.pi * rules.met**2)
     odds = (1 / rules.astray - 1) * anywhere * peaks * np.exp(-0.5 * matches.squared / variances)
@@ -268,3 +275,16 @@ def pooled(sums: Floats, rules: ErrorRules, typical: float) -> Floats:
     pull = min(rules.typical_degrees, most)
     drawn = [(s + pull * common) / max(d + pull, 1e-12) for s, d in zip(squares, degrees)]
     return np.array([max(variance, LEAST_VARIANCE) for variance in drawn])
+
+
+def residual_ratio(
+    own: Floats, known: Sequence[Floats], by_chance: float, rules: ErrorRules
+) -> float:
+    """Residuals of a frame (2, L) by the largest that chance makes of any that are known (2, L)."""
+    ratio, degrees = 0.0, sum(own[1].tolist())
+    for sums in known:
+        before = sum(sums[1].tolist())
+        if min(degrees, before) >= 1:
+            largest = degrees * float(fdtri(degrees, before, by_chance))
+            ratio = max(ratio, sum((own[0] / pooled(sums, rules, 0.0)).tolist()) / largest)
+    return ratio

@@ -156,6 +156,7 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         crowd=crowd,
         unmatched_nearby=nothing,
         beside=np.full(seen.shape, np.nan),
+        extra=np.zeros(seen.shape),
         finest=nothing + 1.0,
     )
 

@@ -8,13 +8,22 @@ none, reflected in the plane nearest to those met; of few in the first frames, w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mixpose.body import like_features, mirror_image, thickness, tolerance_of
-from mixpose.judgement import APART, ScoredPose, Verdict, contradict, decide, is_far_off, is_sure
+from mixpose.judgement import (
+    APART,
+    ScoredPose,
+    Verdict,
+    contradict,
+    decide,
+    is_far_off,
+    is_open,
+    is_sure,
+)
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
 from mixpose.tracking.likelihood import Start, likelihood_of
@@ -23,6 +32,8 @@ from mixpose.tracking.track import Track
 
 TRIANGLE = "three markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
+CHANGED = "features are met much farther off than in the frames before"
+OPEN = "features that would fix it are hidden or cut"
 MIRRORED = "it shows the body's mirror image"
 
 
@@ -42,20 +53,26 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
 
 def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
     """Why a sure pose is in doubt; empty if it is not."""
-    rules, track, noise = data.rules, data.track, data.rules.judgement.noise
-    if is_reflection(data, best):
-        return MIRRORED
-    if contradict(best, track.residuals.total, track.agreed, rules.acceptance, noise):
-        return APART
-    if has_rivals:
-        return ""
-    if not is_known(data, best):
-        return TRIANGLE
-    if track.believed or len(data.sensors) < 2 or np.count_nonzero(best.matches.met) != 1:
-        return ""
+    rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
+    reasons: dict[str, Callable[[], bool]] = {
+        MIRRORED: lambda: is_reflection(data, best),
+        APART: lambda: contradict(best, track.residuals.total, track.agreed, rules, noise),
+        CHANGED: lambda: best.residual_ratio > rules.changed,
+        OPEN: lambda: is_open(best, data.free, rules, noise),
+        TRIANGLE: lambda: not has_rivals and not is_known(data, best),
+        ALONE: lambda: not has_rivals and _is_alone(data, best),
+    }
+    return next((why for why, applies in reasons.items() if applies()), "")
+
+
+def _is_alone(data: Frame, best: ScoredPose) -> bool:
+    """Whether one sensor of several meets the body, and is not sure of it by its own frame."""
+    met = np.count_nonzero(best.matches.met)
+    if data.track.believed or len(data.sensors) < 2 or met != 1:
+        return False
     # a pose that is sure for doubtful ones before it alone errs as they do
     gained = max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
-    return "" if best.log_evidence - gained > rules.acceptance.sure else ALONE
+    return best.log_evidence - gained <= data.rules.acceptance.sure
 
 
 def is_known(data: Frame, judged: ScoredPose) -> bool:

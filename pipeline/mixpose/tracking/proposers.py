@@ -22,7 +22,7 @@ from mixpose.fit import blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats
+from mixpose.records import Floats, Mask
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
 from mixpose.tracking.frame import Frame
@@ -236,7 +236,8 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
 
 def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
     """Least squares with the middle of two features that run into each other in one detection."""
-    at, seen = judged, _paired(judged.matches, frame.rules.judgement.association.reach_squared)
+    rules = frame.rules.judgement.association
+    at, seen = judged, _paired(judged.matches, rules.reach_squared, rules.middle)
     for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
         if not np.count_nonzero(seen.merged):
             break
@@ -249,7 +250,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
     return [] if at is judged else [Start(at.T_world_object)]
 
 
-def _paired(seen: Matches, reach: float) -> Matches:
+def _paired(seen: Matches, reach: float, middle: float) -> Matches:
     """In each sensor the feature missed nearest to the detection of another, as one with that.
 
     `reach` is how far that may be, squared, in variances of C.
@@ -257,7 +258,7 @@ def _paired(seen: Matches, reach: float) -> Matches:
     if not np.count_nonzero(seen.missed):
         return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
-    merged = seen.merged.copy()
+    merged, extra = seen.merged.copy(), seen.extra.copy()
     for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
         met = np.flatnonzero(seen.detections[k] >= 0)
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
@@ -269,29 +270,33 @@ def _paired(seen: Matches, reach: float) -> Matches:
             shares[k, pair] = shares[k, met[j]] / 2
             offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
             J[k, pair] = J[k, pair].mean(axis=0)
-            merged[k] = 1
-    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged)
+            merged[k], extra[k, pair] = 1, middle**2
+    return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra)
 
 
 def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """The predictions at narrow blurs, where residuals are larger than chance makes them.
+    """The predictions at narrow blurs, where some detection is farther off than noise is.
 
     Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
     has_cells = any(view.observation.cell is not None for view in frame.views)
-    if not judged.is_unlike or has_cells:
-        return
     errors = frame.rules.judgement.noise.errors
-    largest = errors.outlying**2 * frame.variances[:, None]
+
+    def off(seen: Matches, noise: Floats) -> Mask:
+        least = errors.outlying**2 * (noise[:, None] + seen.extra)
+        return (seen.shares > 0) & (seen.squared > least)
+
+    is_off = judged.is_unlike or np.count_nonzero(off(judged.used, judged.variances))
+    if has_cells or not is_off:
+        return
     narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
     for one, blur in product(frame.predictions, blurs):
         start = Start(one.T_world_object, one.uncertainty, blur=blur)
         found = likelihood.judge(likelihood.fit(start), start)
-        met = found.matches.shares > 0
-        off = np.count_nonzero(met & (found.matches.squared > largest), axis=1)
         # where all of a sensor are off it is out of step, and the others no better for it
-        if not (off > np.count_nonzero(met, axis=1) / 2).any():
+        met = np.count_nonzero(found.matches.shares, axis=1)
+        if (off(found.matches, frame.variances).sum(axis=1) <= met / 2).all():
             yield Start(found.T_world_object)
 
 

@@ -1,0 +1,44 @@
+"""The covariance that a frame is expected to give, of sensors and a body alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.judgement.noise import inverted
+from mixpose.objective import project_body
+from mixpose.records import Floats, Mask
+from mixpose.sensors import Sensor
+
+
+def invert_information(information: Floats, free: Mask) -> Floats:
+    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
+    inner, covariance = np.ix_(free, free), np.zeros((6, 6))
+    covariance[inner] = inverted(information[inner])
+    # so much larger than if all other directions were known
+    inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
+    unknown = inflation > 1e9
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
+
+
+def expected_covariance(
+    sensors: Sequence[Sensor],
+    sigmas: Sequence[float],  # σ_ε, sensor units
+    body: Body,
+    T_world_object: Floats,
+    free: Mask,
+) -> tuple[Floats, list[int]]:
+    """Covariance that one frame gives when every feature in view is found with error σ_ε.
+
+    As `invert_information` has it, in the axes of `mixpose.rigid`; and the number of features
+    that each sensor sees.
+    """
+    at = project_body(tuple(sensors), body).project(T_world_object[None])
+    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
+    information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
+    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
+    return invert_information(information, free), counts
