@@ -63,6 +63,14 @@ def test_a_disk_that_is_cut_may_err_by_about_as_much_as_it_does(radius: float, c
     assert 0.3 < errors[0] / deviations[0] < 4.0 or errors[0] < 0.3 < deviations[0]
 
 
+@pytest.mark.parametrize("cut", [0.5, 0.7])
+def test_a_disk_whose_rim_is_not_seen_all_around_may_err(cut: float) -> None:
+    # an ellipse goes through what is seen of the rim of a large one, and through its chord
+    _, deviations = found(drawn((7.0, 7.0), cut=cut))
+    assert deviations[0] > 0
+    assert not deviations[1:].any()
+
+
 def test_what_errs_by_more_weighs_less_by_its_variance() -> None:
     pattern = PointPattern(CENTRES, np.ones(5), np.array([0.0, 0.0, 1.0, 2.0, 0.0]))
     np.testing.assert_allclose(pattern.weighed(0.5).weights, [1.0, 1.0, 0.2, 1 / 17, 1.0])
