@@ -65,6 +65,7 @@ class BlobRules:
     core_ratio: float = constant(
         3.0, "peak by median from which a core may be the feature, the rest what it lights"
     )
+    large: float = constant(20.0, "px: the radius from which what is seen of a rim locates a disk")
     whole: float = constant(0.97, "of the rim that is seen of whole disks")
     exact: float = constant(2.0, "of the usual residual of rims, up to which disks are whole")
     rough: float = constant(0.9, "by radius^1.5 in px: what pixels change the length by, in 1 %")
@@ -118,8 +119,10 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
         radius, rim = math.sqrt(blob.area / math.pi), blob.rim
         if rim is None:
             longer = blob.length / typical[0] - 1 - rules.rough / radius**1.5
-        elif rim.coverage < rules.whole or rim.residual > rules.exact * residual:
-            longer = blob.length - 1
+        elif radius < rules.large and (
+            rim.coverage < rules.whole or rim.residual > rules.exact * residual
+        ):
+            longer = blob.length / typical[0] - 1
         else:
             continue
         deviations[k] = rules.off_centre * radius * max(longer, 0.0)
