@@ -123,8 +123,8 @@ _CUT = (
     Mutant(
         "judgement-a-few-cut-spots-are-a-change-of-noise",
         "judgement/noise.py",
-        "if sum(matches.met.tolist()) < model.fewest:",
-        "if sum(matches.met.tolist()) < 0:",
+        "if sum(matches.met.tolist()) < model.fewest and",
+        "if sum(matches.met.tolist()) < 0 and",
         "a pose that cut spots pull is as likely as its own residuals make it",
         ("test_judgement_noise.py",),
     ),

@@ -182,7 +182,7 @@ def _level(
     told = sums + own
     if ratio > 1:
         told[0] = sums[0] + own[0] / ratio
-        if sum(matches.met.tolist()) < model.fewest:
+        if sum(matches.met.tolist()) < model.fewest and past[1].any():
             variances, told = pooled(believed, rules, 0.0), sums
         else:
             sums = np.zeros_like(past)
