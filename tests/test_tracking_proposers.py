@@ -166,8 +166,10 @@ def test_a_flat_body_followed_at_the_wrong_tilt_is_turned_over(seed: int) -> Non
     views = detect([camera], PLATE, T, noise=0.1, seed=seed)
     tracker = Tracker.create(PLATE, EstimatorOptions(), T_wrong)
     assert is_right(first_frame(tracker, views), T)
-    # the wrong tilt meets all features, a pixel off: farther than it is usual
-    assert first_frame(only(tracker, "predicted"), views).status != "ok"
+    # the wrong tilt meets all features, within a pixel or two: nothing else is asked
+    estimate = first_frame(without(tracker, "look_alikes"), views)
+    assert estimate.T_world_object is not None
+    assert rotation_angle_deg(estimate.T_world_object, T) > 40
 
 
 def test_of_several_cameras_the_tilt_is_that_of_the_one_that_meets_a_flat_body() -> None:
