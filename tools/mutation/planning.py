@@ -107,7 +107,7 @@ _DESIGN = (
     Mutant(
         "design-weighed-by-sigma-alone",
         "design/prediction.py",
-        "shown + common * (shown.mean() - shown)",
+        "NoiseModel().errors.counted(shown)",
         "1 + 0 * shown",
         "the prediction is worse than a run that has seen the noise of its sensors",
     ),

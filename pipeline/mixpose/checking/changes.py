@@ -69,7 +69,7 @@ def changes(session: Session) -> Iterator[Change]:
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
     for names in _all_or_one(list(sized)):
         yield Change(
-            f"images of {_called(names)} {{are}} mirrored",
+            f"images of {called(names)} {{are}} mirrored",
             "with left and right of them exchanged",
             lambda views, names=names: [  # type: ignore[misc]
                 _flipped(view, sized[view.name]) if view.name in names else view for view in views
@@ -78,7 +78,7 @@ def changes(session: Session) -> Iterator[Change]:
     for names in _all_or_one([setup.name for setup in cameras]):
         for factor, images, done in ((2.0, "half", "doubled"), (0.5, "twice", "halved")):
             yield Change(
-                f"camera_matrix of {_called(names)} {{is}} that of images {images} as large",
+                f"camera_matrix of {called(names)} {{is}} that of images {images} as large",
                 f"with fx, fy, cx and cy {done}",
                 lambda views, names=names, factor=factor: [  # type: ignore[misc]
                     with_sensor(view, scaled(view.sensor, factor)) if view.name in names else view
@@ -131,7 +131,14 @@ def _all_or_one(names: Sequence[str]) -> list[list[str]]:
     return ([list(names)] if names else []) + ([[n] for n in names] if len(names) > 1 else [])
 
 
-def _called(names: Sequence[str]) -> str:
+OTHER_SIZE = (
+    "the body of [object] {is} not of the size that was seen, or translations are in another unit "
+    "than points"
+)
+
+
+def called(names: Sequence[str]) -> str:
+    """Sensors in words."""
     return " and ".join(repr(name) for name in names)
 
 
@@ -145,7 +152,7 @@ def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
     ]
     for names in _all_or_one(far):
         yield Change(
-            f"T_sensor_world of {_called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
+            f"T_sensor_world of {called(names)} {'{is}' if len(names) == 1 else '{are}'} inverted "
             "(it maps world to sensor coordinates)",
             "with the inverse",
             lambda views, names=names: [  # type: ignore[misc]

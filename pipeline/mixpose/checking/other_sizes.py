@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from mixpose.body import PointFeature
-from mixpose.checking.changes import Change, of_points
+from mixpose.checking.changes import OTHER_SIZE, Change, of_points
 from mixpose.checking.evidence import Frames, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats
@@ -42,8 +42,7 @@ def other_sizes(session: Session, frames: Frames) -> Iterator[Change]:
     size, (least, most) = float(np.median(found or [1.0])), _OTHER_SIZE
     if abs(size - 1) > least and 1 / most < size < most:
         yield Change(
-            "the body of [object] {is} not of the size that was seen, or translations are in "
-            "another unit than points",
+            OTHER_SIZE,
             f"with points {size:.3g} times as large",
             body=lambda body: of_points(body, size * body.means, body.normals),
             values=1,

@@ -10,6 +10,7 @@ import numpy as np
 
 from mixpose.body import PointFeature
 from mixpose.checking.adjusted import Unknown
+from mixpose.checking.changes import OTHER_SIZE, called
 from mixpose.records import Floats
 from mixpose.rigid import perturb
 from mixpose.sensors import PinholeCamera
@@ -31,8 +32,7 @@ def unknowns(session: Session) -> Iterator[Unknown]:
     are_points = all(isinstance(feature, PointFeature) for feature in body.features)
     if are_points and len(cameras) > 1:
         yield Unknown(
-            "the body of [object] {is} not of the size that was seen, or translations are in "
-            "another unit than points",
+            OTHER_SIZE,
             lambda v: f"with points {1 + v[0]:.3g} times as large",
             np.array([_SIZE]),
             points=lambda points, v: points + v[0] * (points - points.mean(axis=0)),
@@ -90,7 +90,7 @@ def _distortion(names: Sequence[str]) -> Unknown:
         return sensor if k is None else _bent(sensor, v[2 * k : 2 * k + 2])
 
     return Unknown(
-        f"distortion of {' and '.join(map(repr, names))} {{is}} left out",
+        f"distortion of {called(names)} {{is}} left out",
         lambda v: "with two coefficients k1 and k2 for each lens",
         np.full(2 * len(names), _BENT),
         sensor=bent,

@@ -62,10 +62,10 @@ class Plan:
         Single ranges alone are weighed by `sigma`.
         """
         stated = np.square(self.sigmas)
-        shown, common = np.square(self.noises) / stated, NoiseModel().errors.common
+        shown = np.square(self.noises) / stated
         if not shown.all() or all(sensor.dimension == 1 for sensor in self.sensors):
             return stated
-        own = shown + common * (shown.mean() - shown)
+        own = NoiseModel().errors.counted(shown)
         return np.asarray(stated * own * (1 / own).mean())
 
 

@@ -57,6 +57,7 @@ class EstimatorOptions:
     fuse: bool = True  # whether frames of single ranges take the pose before them as a prior
     # how long a frame is searched where no prediction convinces; None: live for cameras and streams
     search: SearchName | None = None
+    confidence: float | None = None  # from which a pose is ok; None: as the rules have it
 
 
 def free_mask(options: EstimatorOptions) -> Mask:
@@ -237,7 +238,7 @@ def _to_the_noise(
         fit = Fit.of(ascent, finest.views, levels, matches=matches, noise=noise, first=first)
         # offsets of a bent pose hide how small noise is
         variances = np.minimum(variances, (before / errors.blur) ** 2)
-        weighed = variances + max(fields, errors.common) * (variances.mean() - variances)
+        weighed = errors.counted(variances, fields)
         end = np.minimum(np.minimum(narrow, before), blurs)
         narrower = np.maximum(end, blurs / rules.ratio)
         is_noise = _are_noise(matches, variances, blurs, errors)

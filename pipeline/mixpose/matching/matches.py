@@ -164,6 +164,15 @@ class ErrorRules:
     cut: float = constant(0.01, "chance that a detection is off by more than it shows: 18 of 2500")
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 
+    def counted(self, variances: Floats, fields: float = 0.0) -> Floats:
+        """Variances (L,) that sensors count by: `common` of their noise, or `fields`, is alike."""
+        return np.asarray(variances + max(fields, self.common) * (variances.mean() - variances))
+
+    def are_off(self, matches: Matches, variances: Floats) -> Mask:
+        """Which features (L, N) are met farther off than errors of variances (L, N) put them."""
+        far = matches.squared > self.outlying**2 * variances
+        return np.asarray((matches.shares > 0) & far)
+
     @property
     def reach(self) -> float:
         """σ_ε around features within which detections count: as far as C is drawn, and `met`."""
