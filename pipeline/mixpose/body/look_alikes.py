@@ -33,6 +33,9 @@ Pairs: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
 FEWEST = 3
 """Features that fix a motion."""
 
+LOST = 0.15
+"""Share of features that may be without a partner: a step of a grid of 7 by 7 takes 1/7 away."""
+
 _TOGETHER = 8  # features that motions are tried with at a time
 
 
@@ -99,8 +102,8 @@ def like_features(
 ) -> tuple[LookAlike, ...]:
     """All motions under which features of a body lie like features of another, or of itself.
 
-    All but one of the features need a partner, where these are more than fix a motion.  The body's
-    own symmetries are left out, and what turns a face away that was seen.
+    All but one or a seventh of the features need a partner, where these are more than fix a motion.
+    The body's own symmetries are left out, and what turns a face away that was seen.
 
     Parameters
     ----------
@@ -114,7 +117,7 @@ def like_features(
     chosen = np.array(sorted(features), dtype=np.intp)
     points, targets = body.means[chosen], other.means
     found: dict[Pairs, LookAlike] = {}
-    least = min(len(points), max(len(points) - 1, FEWEST + 1))
+    least = min(len(points), max(len(points) - max(1, int(LOST * len(points))), FEWEST + 1))
     for base in _bases(points, tolerance):
         triples = congruent_triples(points[base], targets, 2 * tolerance)
         T = motions(points[base], targets[triples])
@@ -217,6 +220,13 @@ def _bases(points: Floats, tolerance: float) -> list[list[int]]:
             base = rest[list(widest_triple(points[rest]))].tolist()
             if not _is_narrow(points[base], tolerance):
                 bases.append(base)
+    # where a step of a grid takes those at an edge away, those in the middle have partners
+    away = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    middle = away.argsort(kind="stable")[: len(points) // 2]
+    if len(middle) > FEWEST:
+        base = middle[list(widest_triple(points[middle]))].tolist()
+        if not _is_narrow(points[base], tolerance):
+            bases.append(base)
     return bases
 
 
@@ -237,6 +247,8 @@ def _kept(
     """Of motions (K, 4, 4), those that bring enough of the chosen features to partners."""
     alive, lacking = np.arange(len(T_other_body)), np.zeros(len(T_other_body), dtype=np.intp)
     partners, near = np.zeros((2, len(T_other_body), len(chosen)), dtype=np.intp)
+    # some from everywhere at a time: few motions leave so many of them without
+    chosen = np.random.default_rng(0).permutation(chosen)
     for first in range(0, len(chosen), _TOGETHER):
         some = slice(first, first + _TOGETHER)
         partners[alive, some], fits = _partners(
@@ -244,7 +256,12 @@ def _kept(
         )
         near[alive, some] = fits
         lacking[alive] += (~fits).sum(axis=1)
-        alive = alive[lacking[alive] <= len(chosen) - least]
+        tried, most = first + _TOGETHER, len(chosen) - least
+        alive = alive[
+            lacking[alive] <= (min(most, 2 * LOST * tried) if tried < len(chosen) else most)
+        ]
+    order = chosen.argsort()
+    chosen, partners, near = chosen[order], partners[:, order], near[:, order]
     for k in alive:
         keep = near[k] > 0
         # once more after a fit to all of them, which errs less than that to three
