@@ -80,8 +80,7 @@ SHOWN_BY = {
     "blurs always": "two_cameras",
     "blurs never": "fast",
     "not looked elsewhere": "fast board",
-    "rivals not counted": "flat and small",
-    "nothing doubtful told": "1 pinhole 8/3/5",
+    "nothing doubted": "flat and small",
 }
 SHOWN_BY_REAL = {"no fusion of ranges": "uwb_trolley", "any turn sure": "uwb_trolley"}
 FRAMES, TRIALS = 12, 2

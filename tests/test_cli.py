@@ -86,7 +86,7 @@ def test_lines_have_the_keys_of_the_contract_in_their_order(recording: Path) -> 
     assert [pose["frame"] for pose in poses] == [0, 1]
     assert list(poses[0]) == [
         "type", "frame", "time_s", "object", "status", "T_world_object", "quaternion_xyzw",
-        "covariance", "score", "sensors", "hypotheses", "latency_ms",
+        "covariance", "confidence", "score", "sensors", "hypotheses", "latency_ms",
     ]  # fmt: skip
     assert set(poses[0]["sensors"]) == {"left", "right"}
     assert np.shape(poses[0]["covariance"]) == (6, 6)

@@ -29,7 +29,7 @@ def judged(
     model: NoiseModel = MODEL,
 ) -> tuple[Floats, RememberedNoise]:
     """The covariance of one frame, and what is remembered."""
-    _, covariance, _, remembered, _ = noise_of(matches_of(*sensors), FREE, before, model)
+    _, covariance, _, remembered, *_ = noise_of(matches_of(*sensors), FREE, before, model)
     return covariance, remembered
 
 
@@ -110,7 +110,7 @@ def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
 def test_a_few_detections_farther_off_than_those_before_are_cut_and_change_no_noise() -> None:
     rng = np.random.default_rng(1)
     one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))
-    variances, _, _, found, ratio = noise_of(
+    variances, _, _, found, ratio, _ = noise_of(
         matches_of(one), FREE, known(40 * 0.02**2, 40.0), ALONE
     )
     assert ratio > 1

@@ -70,7 +70,7 @@ def test_json_lines_have_the_keys_of_the_contract_in_its_order() -> None:
     assert header["covariance"] == "x y z rx ry rz, world axes, unit^2 and rad^2"
     assert list(pose) == [
         *("type", "frame", "time_s", "object", "status", "T_world_object", "quaternion_xyzw"),
-        *("covariance", "score", "sensors", "hypotheses", "latency_ms"),
+        *("covariance", "confidence", "score", "sensors", "hypotheses", "latency_ms"),
     ]
     assert pose["sensors"]["left"] == {"used": True, "explained": 0.83, "rms": 0.21}
     assert pose["sensors"]["right"] == {"used": False, "explained": None, "rms": None}

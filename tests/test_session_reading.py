@@ -85,6 +85,7 @@ def test_every_table_and_key_is_read(tmp_path: Path) -> None:
         free = ["rz", "x"]
         samples = 50
         seed = 9
+        confidence = 0.99
         [extract]
         method = "mine.tools:find"
         polarity = "dark"
@@ -126,7 +127,7 @@ def test_every_table_and_key_is_read(tmp_path: Path) -> None:
         """,
     )
     assert session.metres_per_unit == 1e-6
-    assert session.estimator == EstimatorOptions("paper", ("x", "rz"), 50, 9)
+    assert session.estimator == EstimatorOptions("paper", ("x", "rz"), 50, 9, confidence=0.99)
     assert session.start is not None
     assert (session.start.rotation_deg, session.start.distance) == (5.0, 7.5)
     fish, beam, sonar = session.sensors

@@ -258,6 +258,9 @@ class Estimate:
         None when the status is "lost".
     covariance : (6, 6) float64 or None
         In the order and axes of `mixpose.rigid`, squared lengths and radians.
+    confidence : float or None
+        Probability that the truth is within the pose's own 99.9 % ellipsoid; 0 where the frame is
+        lost, None where a file does not say.
     score : float
         0 to 1: how well the predicted densities meet the observed ones, over all sensors.
     instance : int or None
@@ -290,6 +293,7 @@ class Estimate:
     hypotheses: tuple[Hypothesis, ...] = ()
     latency_ms: float = field(default=0.0, compare=False)
     instance: int | None = None
+    confidence: float | None = None
     proposer: str = field(default="", compare=False)
     blurs: tuple[Mapping[str, float], ...] = field(default=(), compare=False, repr=False)
     guesses: tuple[int, int, int] | None = field(default=None, compare=False)

@@ -135,7 +135,6 @@ SWITCHES = (
     Switch("blurs always", ruled("fit", near=NEVER)),
     Switch("blurs never", ruled("fit", near=0.0)),
     Switch("not looked elsewhere", ruled("acceptance", convincing=0.0)),
-    Switch("rivals not counted", ruled("acceptance", rival=2.0)),
+    Switch("nothing doubted", ruled("acceptance", confidence=1e-9)),
     Switch("any turn sure", ruled("acceptance", widest_turn_deg=NEVER)),
-    Switch("nothing doubtful told", ruled("acceptance", doubtful_coverage=2.0)),
 )

@@ -3,6 +3,7 @@
 from mixpose.judgement.acceptance import (
     APART as APART,
     AcceptanceRules as AcceptanceRules,
+    Alternative as Alternative,
     Verdict as Verdict,
     beliefs as beliefs,
     contradict as contradict,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import fdtri
+from scipy.special import chdtri, expit, fdtri, logit, logsumexp
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -17,7 +18,7 @@ from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel, information_of, inverted
 from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
-from mixpose.rigid import rotation_angle_deg, twist_between
+from mixpose.rigid import twist_between
 
 APART = "two sensors contradict each other"
 
@@ -26,40 +27,70 @@ APART = "two sensors contradict each other"
 class AcceptanceRules:
     """When a pose is believed."""
 
-    sure: float = constant(7.0, "log odds against clutter from which a pose is ok: 1 in 1000 errs")
-    possible: float = constant(0.5, "log odds to tell a pose: a little over even, as best of many")
-    doubtful: float = constant(-4.5, "log odds to tell one that stands out: sure less two misses")
-    doubtful_coverage: float = constant(0.6, "share of the body that a pose must meet to stand out")
-    # of frames of one camera with five features and five false detections
-    spare: float = constant(
-        4.0, "coordinates beyond six that it must meet: of two fewer chance makes enough, in 9 %"
+    confidence: float = constant(0.999, "that a pose is right, to be ok: one of 1000 may err")
+    told: float = constant(0.2, "that it is no clutter, to tell it: one feature more makes it even")
+    displaced: float = constant(0.01, "of recordings, a sensor of which does not stand as told")
+    mirrored: float = constant(2e-4, "of bodies, measured as their mirror image")
+    widest_turn_deg: float = constant(
+        15.0, "95 % bound on a turn that is known; of one pose's peak"
     )
-    standing_out: float = constant(1.5, "log odds against all others: told without the body in 4 %")
-    enough: float = constant(8.0, "features met that are enough however many are missed: a shape")
-    rival: float = constant(0.01, "belief from which a pose is a rival; from a tenth, a hypothesis")
-    widest_turn_deg: float = constant(15.0, "95 % bound on a turn that ranges may leave open")
     convincing: float = constant(0.75, "share of the body to look nowhere else: a slip meets less")
-    agreeing: float = constant(0.5, "share that a sensor that agrees, and a sure pose, must meet")
+    agreeing: float = constant(0.5, "share of the body that a sensor that agrees must meet")
     disagreeing: float = constant(25.0, "variance of a sensor over the others' to leave it out")
-    open: float = constant(300.0, "sum of variances by those if all in view were met, and whole")
     changed: float = constant(10.0, "times the residuals that chance makes: frames have up to 7")
-    same: float = constant(0.02, "of the body's radius, and rad: nearer poses are one")
-    same_peak: float = constant(3.0, "deviations of their distance within which poses are one")
-    same_peak_deg: float = constant(5.0, "turn of two poses all the same: tilts of a flat body")
+    open: float = constant(300.0, "sum of variances by those if all in view were met, and whole")
+
+    @property
+    def log_doubt(self) -> float:
+        """Log odds against a pose that is just ok."""
+        return -float(logit(self.confidence))
+
+
+class Alternative(NamedTuple):
+    """Something else that a frame may show."""
+
+    what: str  # in words; empty for mere clutter, and for other poses of the body
+    log_odds: float = 0.0  # against the pose in question; even where nobody knows
+
+
+_NOTHING = Alternative("", -math.inf)
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The decision about a frame."""
+    """The decision about a frame: ok where nothing else is likely."""
 
-    status: Status
     best: ScoredPose | None  # None where the frame is lost
     kept: list[tuple[ScoredPose, float]]  # poses worth telling with their beliefs, best first
-    doubt: str = ""  # why a frame is ambiguous, other than for its rivals
+    against: tuple[Alternative, ...] = ()  # the best of them
+    most: float = -math.inf  # log odds against it up to which it is ok
 
-    def doubted(self, doubt: str) -> Verdict:
-        """The same, ambiguous for a reason; no reason leaves it as it is."""
-        return replace(self, status="ambiguous", doubt=doubt) if doubt else self
+    @cached_property
+    def confidence(self) -> float:
+        """Probability that the best pose is right, by all alternatives."""
+        return 0.0 if self.best is None else float(expit(-self._log_odds))
+
+    @cached_property
+    def _log_odds(self) -> float:
+        return float(logsumexp([one.log_odds for one in self.against]))
+
+    @property
+    def status(self) -> Status:
+        """What is told of the frame."""
+        if self.best is None:
+            return "lost"
+        return "ok" if self._log_odds <= self.most else "ambiguous"
+
+    @property
+    def doubt(self) -> str:
+        """Why the frame is ambiguous, other than for its rivals: the likeliest in words."""
+        named = [one for one in self.against if one.what and one.log_odds > self.most]
+        told = named if self.status == "ambiguous" else []
+        return max(told, key=lambda one: one.log_odds, default=_NOTHING).what
+
+    def doubted(self, more: Iterable[Alternative]) -> Verdict:
+        """The same, with more alternatives."""
+        return replace(self, against=(*self.against, *more))
 
 
 def is_fixed(pose: ScoredPose, free: Mask) -> bool:
@@ -69,23 +100,12 @@ def is_fixed(pose: ScoredPose, free: Mask) -> bool:
 
 def is_possible(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
     """Whether a pose is worth telling."""
-    return is_fixed(pose, free) and pose.log_evidence > rules.possible
+    return is_fixed(pose, free) and pose.log_evidence > logit(rules.told)
 
 
 def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether a pose is believed, if no rival casts doubt on it.
-
-    So much of the body is met that another one cannot pass for it, as three markers of it may; and
-    no wide sector of turns is left open, as by ranges.
-    """
-    turn = 0.0 if pose.spread is None else 1.96 * float(pose.spread[3:].max())
-    met, in_view = pose.features
-    return bool(
-        is_fixed(pose, free)
-        and pose.log_evidence > rules.sure
-        and turn < math.radians(rules.widest_turn_deg)
-        and met >= min(rules.agreeing * in_view, rules.enough)
-    )
+    """Whether a pose is believed, if no rival casts doubt on it."""
+    return is_fixed(pose, free) and pose.log_evidence > -rules.log_doubt
 
 
 def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
@@ -99,25 +119,33 @@ def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 
 
 def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> Verdict:
-    """Decide about a frame from all its poses, the most evident first."""
+    """Decide about a frame from all its poses, the most evident first.
+
+    Against the best there is clutter, then the others: what is not possible by itself still casts
+    doubt.
+    """
     told = [one for one in ranked if is_possible(one, free, rules)]
-    if ranked and _stands_out(ranked, free, rules):
-        told.insert(0, ranked[0])
     if not told:
-        return Verdict("lost", None, [])
+        return Verdict(None, [])
     best, weights = told[0], beliefs(ranked)
-    # what is not possible by itself still casts doubt on the others
-    rivals = [weight for one, weight in zip(ranked, weights, strict=True) if one is not best]
-    clear = max(rivals, default=0.0) < rules.rival
-    if clear := clear and is_sure(best, free, rules):
-        # nor is a turn unknown (π²/3 rad²), as about the line that all features met lie on
-        clear = bool(best.covariance[3:, 3:].trace() < math.pi**2 / 3)
+    rivals = [one.log_evidence for one in ranked if one is not best]
+    against = [Alternative("", odds - best.log_evidence) for odds in (0.0, *rivals)]
+    if not is_turn_known(best, rules):
+        against.append(Alternative(""))
     kept = [
         (one, weight)
         for one, weight in zip(ranked, weights, strict=True)
-        if one is best or (weight >= rules.rival / 10 and is_fixed(one, free))
+        if one is best or (weight >= 1 - rules.confidence and is_fixed(one, free))
     ]
-    return Verdict("ok" if clear else "ambiguous", best, kept)
+    return Verdict(best, kept, tuple(against), rules.log_doubt)
+
+
+def is_turn_known(pose: ScoredPose, rules: AcceptanceRules) -> bool:
+    """Whether no wide sector of turns is left open, as by ranges, or about a line of features."""
+    variances = pose.covariance.diagonal()[3:]
+    if pose.spread is not None:
+        variances = pose.spread[3:] ** 2
+    return bool(1.96 * math.sqrt(variances.max()) < math.radians(rules.widest_turn_deg))
 
 
 def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseModel) -> bool:
@@ -139,54 +167,40 @@ def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseMo
     return ratio > rules.open and by_usual > 2 * len(C)
 
 
-def _stands_out(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether the first pose meets most of the body and is far likelier than all others.
-
-    Poses that meet detections by chance come in numbers, and about equally good.
-    """
-    first, *others = ranked
-    rest = float(reduce(np.logaddexp, [one.log_evidence for one in others], -math.inf))
-    return bool(
-        first.coverage >= rules.doubtful_coverage
-        and first.measurements >= np.count_nonzero(free) + rules.spare
-        and first.log_evidence > max(rules.doubtful, rest + rules.standing_out)
-    )
-
-
 def insert(
     ranked: list[ScoredPose], new: ScoredPose, body: Body, free: Mask, rules: AcceptanceRules
 ) -> None:
-    """Keep a list of distinct poses, the most evident first."""
+    """Keep a list of distinct poses, the most evident first; each covers those it stands for."""
+    limit = float(chdtri(np.count_nonzero(free), 1 - rules.confidence))
     for k, old in enumerate(ranked):
-        if _alike(old, new, body, free, rules):
+        T_new = nearest_alike(new.T_world_object, body, old.T_world_object)
+        away = np.where(free, twist_between(old.T_world_object, T_new), 0.0)
+        if _are_one(old, new, away, free, limit, rules):
             # that residuals are larger than those before them is as rare as that a sure pose is
             # wrong, though more spots are off for smaller ones; of two as good the later says more
-            more = rules.sure * (int(new.is_unlike) - int(old.is_unlike))
-            if new.log_evidence > old.log_evidence + more - 0.01:
-                ranked[k] = new
+            more = rules.log_doubt * (int(old.residual_ratio > 1) - int(new.residual_ratio > 1))
+            is_better = new.log_evidence > old.log_evidence + more - 0.01
+            told, other = (new, old) if is_better else (old, new)
+            belief = beliefs([told, other])[1]
+            if told.spread is None and belief > 1 - rules.confidence:
+                wider = max(belief, 1 / limit) * np.outer(away, away)
+                told = replace(told, covariance=told.covariance + wider)
+            ranked[k] = told
             break
     else:
         ranked.append(new)
     ranked.sort(key=lambda one: -one.log_evidence)
 
 
-def _alike(a: ScoredPose, b: ScoredPose, body: Body, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether two poses are one: at the same place, or on one peak of which one is not the top."""
-    T_a = a.T_world_object
-    T_b = nearest_alike(b.T_world_object, body, T_a)
-    away = twist_between(T_a, T_b)[free]
+def _are_one(
+    a: ScoredPose, b: ScoredPose, away: Floats, free: Mask, limit: float, rules: AcceptanceRules
+) -> bool:
+    """Whether two poses, a twist (6,) apart, are on one peak of which one is not the top."""
     both = (a.covariance + b.covariance + a.bent)[np.ix_(free, free)]
-    inside = bool(away @ inverted(both) @ away < rules.same_peak**2)
-    if a.spread is not None:
-        return inside  # of the likelihood, drawn to different priors
-    turned = float(rotation_angle_deg(T_a, T_b))
-    centre = np.append(body.means.mean(axis=0), 1.0)
-    apart = float(np.linalg.norm((T_a - T_b) @ centre)) / body.radius
-    if max(apart, math.radians(turned)) < rules.same:
-        return True
-    # features that may be off leave a turn as open as that
-    open_turn = rules.same_peak * np.degrees(np.sqrt(np.linalg.eigvalsh(a.bent[3:, 3:]).max()))
-    return inside and turned < max(rules.same_peak_deg, min(open_turn, rules.widest_turn_deg))
+    inside = bool(away[free] @ inverted(both) @ away[free] < limit)
+    # those of a likelihood may be drawn to different priors; tilts of a flat body are two
+    turned = float(np.linalg.norm(away[3:]))
+    return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 
 def contradict(
@@ -212,7 +226,7 @@ def contradict(
             # of the body's, against detections anywhere near
             v = min(variance, model.usual**2) + used.extra[least]
             odds = np.log(model.errors.met**2 / (2 * v)) - used.squared[least] / (2 * v)
-            return bool(used.shares[least] @ odds < rules.sure)
+            return bool(used.shares[least] @ odds < -rules.log_doubt)
     # offsets far beyond the noise so far, which a pose of its own takes away in each sensor
     if not is_far_off(used, before, rules, model):
         return False
@@ -237,7 +251,7 @@ def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
 def _by_noise(used: Matches, variance: float, model: NoiseModel) -> Matches:
     """Matches of which what errs by more than noise counts less, and a few far off not at all."""
     wide, met = variance + used.extra, used.shares > 0
-    far = met & (used.squared > model.errors.outlying**2 * wide)
+    far = model.errors.are_off(used, wide)
     # where most of a sensor are far off it is out of step, or turned
     far &= (
         np.count_nonzero(far, axis=1, keepdims=True) <= np.count_nonzero(met, axis=1)[:, None] / 2

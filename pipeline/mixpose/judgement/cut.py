@@ -36,10 +36,8 @@ def with_cut_spots(
     met, chance = (is_spot & (found.shares > 0)).nonzero(), errors.cut
     J, r = J.reshape(*found.shares.shape, 2, len(C))[met], r.reshape(*found.shares.shape, 2)[met]
     # a cut that moves the pose out of its ellipsoid shows in what others tell as well
-    told = J @ C @ J.swapaxes(1, 2)
-    half, apart = (told[:, 0, 0] + told[:, 1, 1]) / 2, (told[:, 0, 0] - told[:, 1, 1]) / 2
-    leverage = max(float((half + np.hypot(apart, told[:, 0, 1])).max(initial=0.0)), 1e-9)
-    limit = float(chdtri(len(C), outside))
+    shares = np.linalg.eigvalsh(J @ C @ J.swapaxes(1, 2))
+    leverage, limit = max(float(shares.max(initial=0.0)), 1e-9), float(chdtri(len(C), outside))
     if chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < outside:
         return np.zeros(C.shape), 1.0
     C = np.linalg.pinv(np.linalg.pinv(C, hermitian=True) + np.diag(1 / known**2), hermitian=True)

@@ -76,13 +76,12 @@ class ScoredPose:
     log_evidence: float  # logarithm of the odds for this pose against mere clutter
     noise: RememberedNoise = RememberedNoise()  # of this frame and those before it, for the next
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
-    # (6, 6) of the covariance, what lasts from frame to frame
-    persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
-    variances: Floats = field(
-        default_factory=lambda: np.ones(1)
-    )  # (L,) of the noise, of those used
+    persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of it, what lasts
+    # (L,) of the noise, of those used
+    variances: Floats = field(default_factory=lambda: np.ones(1))
     residual_ratio: float = 0.0  # of its residuals to the largest that chance makes
-    # (6, 6) where features are off by all that the spreads of a body that gives way allow
+    displaced: float = -math.inf  # log of how much likelier sensors do not stand as told
+    # (6, 6) where features are off by all that the body's spreads allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
     proposer: str = ""  # where the pose came from
@@ -113,11 +112,6 @@ class ScoredPose:
     def score(self) -> float:
         """Mean cosine between predicted and observed densities, 0 to 1."""
         return float(sum(np.sqrt(self.used.explained).tolist())) / len(self.used.names)
-
-    @property
-    def is_unlike(self) -> bool:
-        """Whether its residuals are larger than chance makes them."""
-        return self.residual_ratio > 1
 
     def reports(
         self, residuals: Mapping[str, Mapping[str, float | None]]
@@ -180,18 +174,19 @@ def judge_together(
     evidence, bent = _evidence(cases, seen, variances, free, rules.detection)
     return [
         ScoredPose(
-            T_world_object=cases[k][1],
-            matches=whole[k],
-            covariance=covariance,
-            log_evidence=float(evidence[k]),
+            cases[k][1],
+            whole[k],
+            covariance,
+            float(evidence[k]),
             noise=remembered,
             left_out=left_out,
             persistent=persistent,
             residual_ratio=ratio,
+            displaced=displaced,
             variances=own,
             bent=bent[k],
         )
-        for k, (own, covariance, persistent, remembered, ratio) in enumerate(noises)
+        for k, (own, covariance, persistent, remembered, ratio, displaced) in enumerate(noises)
     ]
 
 
@@ -252,9 +247,8 @@ def log_evidence(
     # a direction that the data leave open is as uncertain as before
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
     (chosen,) = free.nonzero()
-    inner = (
-        information[..., chosen[:, None], chosen] + np.eye(len(chosen)) / wide[:, chosen, None] ** 2
-    )
+    inner = information[..., chosen[:, None], chosen]
+    inner = inner + np.eye(len(chosen)) / wide[:, chosen, None] ** 2
     laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
     evidence = odds[0] + odds[1] + laplace + log_densities
     if detection.by_count:

@@ -31,7 +31,7 @@ class CsvWriter:
 
     Columns: frame, time_s, object, status, unit (where there are identical bodies also instance,
     behind object); the pose as position, quaternion and rotation vector; the upper triangle of its
-    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; score;
+    covariance, row by row, ``cov_<a>_<b>`` in the axes of `mixpose.rigid`; confidence; score;
     ``<sensor>_used``, ``<sensor>_explained`` and ``<sensor>_rms`` of each sensor; latency_ms.
 
     Parameters
@@ -73,6 +73,7 @@ class CsvWriter:
             estimate.status,
             self._unit,
             *_pose_cells(estimate),
+            plain_or_none(estimate.confidence),
             plain(estimate.score),
             *self._sensor_cells(estimate),
             plain(estimate.latency_ms),
@@ -96,6 +97,7 @@ class CsvWriter:
                 *FRAME_COLUMNS[3:],
                 *POSE_COLUMNS,
                 *COVARIANCE_COLUMNS,
+                "confidence",
                 "score",
                 *of_sensors,
                 "latency_ms",

@@ -96,6 +96,7 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
         "T_world_object": plain_or_none(T),
         "quaternion_xyzw": plain_or_none(turn),
         "covariance": plain_or_none(covariance),
+        "confidence": plain_or_none(estimate.confidence),
         "score": plain(estimate.score),
         "sensors": {
             name: {

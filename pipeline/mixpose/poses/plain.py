@@ -41,6 +41,7 @@ def require_finite(estimate: Estimate) -> None:
         "T_world_object": estimate.T_world_object,
         "covariance": estimate.covariance,
         "score": estimate.score,
+        "confidence": estimate.confidence,
         "latency_ms": estimate.latency_ms,
     }
     for name, report in estimate.sensors.items():

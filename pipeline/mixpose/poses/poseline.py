@@ -43,6 +43,7 @@ class PoseLine:
     hypotheses: tuple[Hypothesis, ...]
     latency_ms: float | None
     instance: int | None = None
+    confidence: float | None = None
 
     @property
     def label(self) -> str:
@@ -85,6 +86,7 @@ class _Pose(_Line):
     sensors: dict[str, _Sensor] = {}
     hypotheses: list[_Hypothesis] = []
     latency_ms: float | None = None
+    confidence: Annotated[float, Field(ge=0, le=1)] | None = None
 
 
 class _Header(_Line):
@@ -143,6 +145,7 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         ),
         latency_ms=pose.latency_ms,
         instance=pose.instance,
+        confidence=pose.confidence,
     )
 
 

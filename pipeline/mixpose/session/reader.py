@@ -146,5 +146,11 @@ def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> Estimat
             "free",
         )
     return EstimatorOptions(
-        table.objective, table.free, table.samples, table.seed, table.fuse, table.search
+        table.objective,
+        table.free,
+        table.samples,
+        table.seed,
+        table.fuse,
+        table.search,
+        table.confidence,
     )

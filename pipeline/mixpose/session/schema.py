@@ -214,6 +214,14 @@ class EstimatorTable(Table):
 
     Example: `search = "live"`
     """
+    confidence: Annotated[
+        float | None, Field(ge=0.5, lt=1, description="a number of at least 0.5, below 1")
+    ] = None
+    """Probability of a pose, printed as `confidence`, from which its frame is `ok`.  Left out,
+    0.999: one of a thousand may be wrong.
+
+    Example: `confidence = 0.99`
+    """
 
 
 class SessionTable(Table):

@@ -8,7 +8,8 @@ none, reflected in the plane nearest to those met; of few in the first frames, w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from mixpose.body import like_features, mirror_image, thickness, tolerance_of
 from mixpose.judgement import (
     APART,
+    Alternative,
     ScoredPose,
     Verdict,
     contradict,
@@ -30,8 +32,9 @@ from mixpose.tracking.likelihood import Start, likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
 
-TRIANGLE = "three markers are met, which other things may have alike"
+FEW = "few markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
+DISPLACED = "features are met as if a sensor stood otherwise than the session says"
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
 MIRRORED = "it shows the body's mirror image"
@@ -40,100 +43,114 @@ MIRRORED = "it shows the body's mirror image"
 def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     """The decision about a frame by its poses, the most evident first, and why it is in doubt."""
     verdict = decide(ranked, data.free, data.rules.acceptance)
-    best, has_rivals = verdict.best, verdict.status != "ok"
+    best = verdict.best
     if best is None:
         return verdict
-    rivals = [one for one, _ in verdict.kept if one is not best]
-    why = reason(data, best, rivals) if has_rivals else ""
+    if verdict.status != "ok":
+        rivals = [one for one, _ in verdict.kept if one is not best]
+        if why := reason(data, best, rivals):
+            clutter, *others = verdict.against
+            named = [one._replace(what=why) for one in others]
+            return replace(verdict, against=(clutter, *named))
     # a sure pose that has rivals may have them for a reason that can be told
-    if not why and is_sure(best, data.free, data.rules.acceptance):
-        why = _doubt_about(data, best, has_rivals=has_rivals)
-    return verdict.doubted(why)
+    sure = is_sure(best, data.free, data.rules.acceptance)
+    return verdict.doubted(_alternatives(data, best)) if sure else verdict
 
 
-def _doubt_about(data: Frame, best: ScoredPose, *, has_rivals: bool) -> str:
-    """Why a sure pose is in doubt; empty if it is not."""
+def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
+    """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
-    reasons: dict[str, Callable[[], bool]] = {
-        MIRRORED: lambda: is_reflection(data, best),
-        APART: lambda: contradict(best, track.residuals.total, track.agreed, rules, noise),
-        CHANGED: lambda: best.residual_ratio > rules.changed,
-        OPEN: lambda: is_open(best, data.free, rules, noise),
-        TRIANGLE: lambda: not has_rivals and not is_known(data, best),
-        ALONE: lambda: not has_rivals and _is_alone(data, best),
-    }
-    return next((why for why, applies in reasons.items() if applies()), "")
+    yield Alternative(MIRRORED, math.log(rules.mirrored) + of_reflection(data, best))
+    yield Alternative(FEW, of_other_things(data, best))
+    yield Alternative(ALONE, _of_one_sensor(data, best))
+    yield Alternative(DISPLACED, math.log(rules.displaced) + best.displaced)
+    if contradict(best, track.residuals.total, track.agreed, rules, noise):
+        yield Alternative(APART)
+    if best.residual_ratio > rules.changed:
+        yield Alternative(CHANGED)
+    if is_open(best, data.free, rules, noise):
+        yield Alternative(OPEN)
 
 
-def _is_alone(data: Frame, best: ScoredPose) -> bool:
-    """Whether one sensor of several meets the body, and is not sure of it by its own frame."""
+def _of_one_sensor(data: Frame, best: ScoredPose) -> float:
+    """Log odds of clutter where one sensor of several meets the body, and no frame was ok before.
+
+    A pose that is sure for doubtful ones before it alone errs as they do.
+    """
     met = np.count_nonzero(best.matches.met)
     if data.track.believed or len(data.sensors) < 2 or met != 1:
-        return False
-    # a pose that is sure for doubtful ones before it alone errs as they do
-    gained = max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
-    return best.log_evidence - gained <= data.rules.acceptance.sure
+        return -math.inf
+    return _gained(data, best) - best.log_evidence
 
 
-def is_known(data: Frame, judged: ScoredPose) -> bool:
-    """Whether a pose is the body's, by what it meets or by where it was expected."""
-    are_ranges = 1 in judged.matches.dimensions.tolist()  # which are no markers in space
-    others = sorted(judged.matches.met_by.tolist())[:-3]
-    # one sensor of several may meet a marker by chance
-    if are_ranges or not others or sum(others) >= max(len(data.views) / 2, 1):
-        return True
-    return (
-        data.track.known
-        and not data.track.misses
-        and bool((data.prior(judged.T_world_object)[1] < data.anywhere[1]).all())
-    )
+def _gained(data: Frame, best: ScoredPose) -> float:
+    """How much likelier the frames before make a pose, in nats."""
+    return max(data.prior(best.T_world_object)[0] - data.anywhere[0], 0.0)
 
 
-def is_reflection(data: Frame, judged: ScoredPose) -> bool:
-    """Whether the frame shows the body's mirror image rather than the body."""
+def of_other_things(data: Frame, judged: ScoredPose) -> float:
+    """Log odds of another thing that has what is met of the body alike, and nothing else.
+
+    Three markers are alike where three lengths between them are, and each further one as well.  A
+    sensor of several may meet one by chance.  It is not where the body is expected.
+    """
+    seen, rules = judged.matches, data.rules
+    if 1 in seen.dimensions.tolist():  # which are no markers in space
+        return -math.inf
+    met = np.minimum(seen.met_by / max(len(data.views) / 2, 1), 1).sum()
+    in_view = np.count_nonzero(seen.weights, axis=0)
+    covered = np.minimum(in_view, 2)[seen.met_by == 0].sum()
+    odds = 3 * (met - 2) * math.log(rules.look_alikes.alike)
+    odds -= covered * rules.judgement.detection.log_missed
+    return float(odds - (_gained(data, judged) if data.track.known else 0.0))
+
+
+def of_reflection(data: Frame, judged: ScoredPose) -> float:
+    """Log odds of the body's mirror image; minus infinity where it is not looked for."""
     rules, seen, T = data.rules, judged.matches, judged.T_world_object
     # where a turn brings it onto its mirror image no camera tells one side's markers
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
-        return False
-    ahead, met = rules.acceptance.standing_out, seen.met_by
+        return -math.inf
+    accepted, met = rules.acceptance, seen.met_by
+    own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mirrored)
     # of these the mirror image may meet more than the body
     if sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
         # no rival meets less than a quarter of what the body meets; values grow as the square
-        value, own = (one.finest.value(T[None])[0] for one in (there, data))
-        start, least = Start(T, data.close), judged.log_evidence + ahead
-        if value > own / 16 and _evidence(there, start) > least:
-            return True
+        theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
+        if theirs > value / 16:
+            odds = _evidence(there, Start(T, data.close)) - own
+            if odds > likely:
+                return odds
     if not _is_by_chance(data, judged):
-        return False
+        return -math.inf
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
     live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
     alone = data.seen_otherwise(predictions=(), beside=None, searches=[], track=track, options=live)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
-    return any(_evidence(mirror, start) > own + ahead for start in starts_at(mirror, rivals))
+    found = (_evidence(mirror, start) - own for start in starts_at(mirror, rivals))
+    return next((odds for odds in found if odds > likely), -math.inf)
 
 
-def look_alike_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> str:
-    """Why all that a pose meets might as well be a part of other bodies, or another of its own.
+def look_alikes_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> Iterator[Alternative]:
+    """Parts of other bodies, or of its own, that all that a pose meets might be as well.
 
-    `others` are the frames of the bodies in question; empty if it is none of theirs.
+    `others` are the frames of the bodies in question.
     """
     met = met_features(best)
     for other in others:
         rules = other.rules
-        limit = best.log_evidence + float(np.log(rules.acceptance.rival))
         tolerance = tolerance_of(data.body, other.body, rules.look_alikes.alike)
         seen = other.seen_otherwise(views=data.views, still=data.still)
         for part in like_features(data.body, met, other.body, tolerance):
             if len(part.features) == len(met):
                 T = best.T_world_object @ part.T_body_other
-                if _evidence(seen, Start(T, other.close, left_out=best.left_out)) > limit:
-                    return part.reason
-    return ""
+                start = Start(T, other.close, left_out=best.left_out)
+                yield Alternative(part.reason, _evidence(seen, start) - best.log_evidence)
 
 
 def _is_by_chance(data: Frame, judged: ScoredPose) -> bool:

@@ -22,7 +22,7 @@ from mixpose.fit import blur_schedule
 from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
-from mixpose.records import Floats, Mask
+from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
 from mixpose.tracking.frame import Frame
@@ -134,10 +134,9 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     """
     kinds, best = frame.rules.look_alikes.kinds, None
     # once more, where what is moved is better and meets more
-    for _ in range(2 if "congruent" in kinds else 0):
-        if ranked and ranked[0] is not best:
-            best = ranked[0]
-            yield from _as_evident(frame, best)
+    while "congruent" in kinds and ranked and ranked[0] is not best:
+        best = ranked[0]
+        yield from _as_evident(frame, best)
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
@@ -186,7 +185,7 @@ def _as_evident(frame: Frame, best: ScoredPose) -> Iterable[Start]:
     for k in np.flatnonzero(fewer < rules.look_alikes.fewer).tolist():
         moved = _moves_alike(frame, T) if alike[k].is_step else None
         against = frame.prior(T)[0] - frame.prior(poses[1 + k] if moved is None else moved)[0]
-        least = 1 + max(against, 0.0) / np.log(rules.acceptance.rival)
+        least = 1 + max(against, 0.0) / rules.acceptance.log_doubt
         if fewer[k] < rules.look_alikes.fewer * least:
             yield Start(poses[1 + k], frame.close, T_moved=moved)
 
@@ -280,14 +279,10 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
     Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
     has_cells = any(view.observation.cell is not None for view in frame.views)
-    errors = frame.rules.judgement.noise.errors
-
-    def off(seen: Matches, noise: Floats) -> Mask:
-        least = errors.outlying**2 * (noise[:, None] + seen.extra)
-        return (seen.shares > 0) & (seen.squared > least)
-
-    is_off = judged.is_unlike or np.count_nonzero(off(judged.used, judged.variances))
-    if has_cells or not is_off:
+    errors, used = frame.rules.judgement.noise.errors, judged.used
+    # what is known to be cut pulls as well
+    are_noise = not errors.are_off(used, judged.variances[:, None]).any()
+    if has_cells or (judged.residual_ratio <= 1 and are_noise):
         return
     narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
@@ -295,8 +290,9 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
         start = Start(one.T_world_object, one.uncertainty, blur=blur)
         found = likelihood.judge(likelihood.fit(start), start)
         # where all of a sensor are off it is out of step, and the others no better for it
-        met = np.count_nonzero(found.matches.shares, axis=1)
-        if (off(found.matches, frame.variances).sum(axis=1) <= met / 2).all():
+        seen = found.matches
+        off = errors.are_off(seen, frame.variances[:, None] + seen.extra)
+        if (2 * off.sum(axis=1) <= np.count_nonzero(seen.shares, axis=1)).all():
             yield Start(found.T_world_object)
 
 

@@ -19,7 +19,7 @@ class ProposalRules:
     kept: int = constant(5, "of these, starts that descend")
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(3.0, "drawn poses are so much surer than starts; searched: squared")
-    blurs: tuple[float, ...] = constant((0.5, 0.25), "σ_ε, to go on from where cut spots pull")
+    blurs: tuple[float, ...] = constant((0.5, 0.25, 0.12), "σ_ε, to begin at where spots pull")
     static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
     believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")
 

@@ -25,11 +25,11 @@ from scipy.spatial import KDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import AcceptanceRules, ScoredPose, Verdict
+from mixpose.judgement import AcceptanceRules, Alternative, ScoredPose, Verdict
 from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Mask
 from mixpose.sensors import Sensor
-from mixpose.tracking.doubt import look_alike_of
+from mixpose.tracking.doubt import look_alikes_of
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track
@@ -79,7 +79,7 @@ class Scene:
                     j for j in found if j not in sure and self.bodies[j].body is not tracked.body
                 ]
                 others = [found[j].frame for j in (k, *away)]
-                verdict = told[k] = verdict.doubted(look_alike_of(data, verdict.best, others))
+                verdict = told[k] = verdict.doubted(look_alikes_of(data, verdict.best, others))
             after.append(followed(data, verdict))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, estimates), estimates
@@ -110,7 +110,9 @@ def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
     total = sum(weight for _, weight in [*verdict.kept, *rivals])
     told = [*verdict.kept, *(pair for pair in rivals if pair[0] is not best)]
     told.sort(key=lambda pair: (pair[0] is not best, -pair[1]))
-    return Verdict("ambiguous", best, [(pose, weight / total) for pose, weight in told])
+    kept = [(pose, weight / total) for pose, weight in told]
+    exchanged = [Alternative("", math.log(weight)) for _, weight in rivals]
+    return replace(verdict, kept=kept).doubted(exchanged)
 
 
 def identify(
@@ -136,7 +138,7 @@ def identify(
     # no velocity is believed any more: they may have changed places, wherever they were before
     lost = np.array([one.track.misses > one.rules.motion.coasting for one in data], np.bool_)
     odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
-    rivals, limit = dict[int, Rivals](), np.log(found[group[0]].frame.rules.acceptance.rival)
+    rivals, limit = dict[int, Rivals](), found[group[0]].frame.rules.acceptance.log_doubt
     for i, j in zip(*np.nonzero(odds > limit), strict=True):
         if i != j and known[i] in pose_of:
             other = pose_of.get(known[j], pose_of[known[i]])

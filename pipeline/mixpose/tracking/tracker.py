@@ -18,7 +18,7 @@ from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.doubt import decided, is_known
+from mixpose.tracking.doubt import decided, of_other_things
 from mixpose.tracking.frame import Frame, Setup, follow
 from mixpose.tracking.in_motion import delays_after
 from mixpose.tracking.likelihood import Start, likelihood_of
@@ -55,6 +55,9 @@ class Tracker(Setup):
             start[:3] = distance
         if rotation_deg is not None:
             start[3:] = np.radians(rotation_deg)
+        if options.confidence is not None:
+            accepted = replace(rules.acceptance, confidence=options.confidence)
+            rules = replace(rules, acceptance=accepted)
         return cls(
             body,
             options,
@@ -162,6 +165,7 @@ class Tracker(Setup):
             T_world_object=best.T_world_object if best else None,
             covariance=best.covariance if best else None,
             score=shown.score if shown else 0.0,
+            confidence=verdict.confidence,
             sensors=reports,
             hypotheses=tuple([Hypothesis(one.T_world_object, weight) for one, weight in rivals]),
             instance=self.instance,
@@ -218,7 +222,8 @@ def judged_again(
 def followed(data: Frame, verdict: Verdict) -> Track:
     """The track after a frame."""
     track, best, is_ok = data.track, verdict.best, verdict.status == "ok"
-    if best is None:
+    # what is likelier clutter is told, and not followed
+    if best is None or best.log_evidence < 0:
         clutter = track.clutter.learnt(data.views, data.rules.proposals.static)
         state = data.searches[-1][1] if data.searches else Track.search
         return replace(track.missed(state, clutter), doubted=True)
@@ -242,7 +247,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         tallies=dict(zip(used.names, tallies)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,
-        known=is_ok or is_known(data, best),
+        known=is_ok or of_other_things(data, best) < data.rules.acceptance.log_doubt,
         believed=track.believed + is_ok,
         doubted=not is_ok,
     )
