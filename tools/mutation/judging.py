@@ -274,7 +274,7 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-the-likeliest-alternative-alone",
         "judgement/acceptance.py",
-        "float(logsumexp([one.log_odds for one in self.against]))",
+        "float(np.logaddexp.reduce([one.log_odds for one in self.against]))",
         "float(max([one.log_odds for one in self.against]))",
         "many poses of which each is unlikely leave a frame ok",
     ),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import chdtri, expit, fdtri, logit, logsumexp
+from scipy.special import chdtri, expit, fdtri, logit
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -72,7 +72,7 @@ class Verdict:
 
     @cached_property
     def _log_odds(self) -> float:
-        return float(logsumexp([one.log_odds for one in self.against]))
+        return float(np.logaddexp.reduce([one.log_odds for one in self.against]))
 
     @property
     def status(self) -> Status:
