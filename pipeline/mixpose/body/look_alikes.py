@@ -256,10 +256,8 @@ def _kept(
         )
         near[alive, some] = fits
         lacking[alive] += (~fits).sum(axis=1)
-        tried, most = first + _TOGETHER, len(chosen) - least
-        alive = alive[
-            lacking[alive] <= (min(most, 2 * LOST * tried) if tried < len(chosen) else most)
-        ]
+        tried = first + _TOGETHER
+        alive = alive[lacking[alive] <= min(len(chosen) - least, 2 * LOST * tried)]
     order = chosen.argsort()
     chosen, partners, near = chosen[order], partners[:, order], near[:, order]
     for k in alive:

@@ -262,7 +262,7 @@ def _to_the_noise(
 
 def _are_noise(matches: Matches, variances: Floats, blurs: Floats, errors: ErrorRules) -> bool:
     """Whether no offset is too large for noise (L,), and no other detection pulls at blurs (L,)."""
-    far = matches.squared > errors.outlying**2 * (variances[:, None] + matches.extra)
+    far = errors.are_off(matches, variances[:, None] + matches.extra)
     return not np.count_nonzero(far | (matches.beside < errors.met * blurs[:, None]))
 
 
