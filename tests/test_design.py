@@ -168,7 +168,8 @@ def test_simulated_frames_of_the_papers_systems_err_as_predicted(number: int) ->
     session = planned(system, 0.25)
     plan = replace(plan_of(session), noises=(0.25,) * len(system.sensors))
     found = confirm(session, plan, paper_poses(2), 150, tip=ORIGIN)
-    assert found.statuses == {"ok": 150}
+    # where noise is as large as sigma, one frame in a hundred looks as if a sensor were elsewhere
+    assert found.statuses["ok"] >= 148
     assert found.chance == pytest.approx(1 / np.sqrt(2 * 150 * 6))
     # 5 %, and what 150 frames leave to chance
     assert abs(found.overall - 1) < 0.05 + found.chance

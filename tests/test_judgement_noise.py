@@ -110,9 +110,8 @@ def test_a_frame_of_much_larger_residuals_goes_by_its_own() -> None:
 def test_a_few_detections_farther_off_than_those_before_are_cut_and_change_no_noise() -> None:
     rng = np.random.default_rng(1)
     one = sensor("0", rng, rng.normal(0, 0.2, (8, 2)))
-    variances, _, _, found, ratio, _ = noise_of(
-        matches_of(one), FREE, known(40 * 0.02**2, 40.0), ALONE
-    )
+    before = known(40 * 0.02**2, 40.0)
+    variances, _, _, found, ratio = noise_of(matches_of(one), FREE, before, ALONE)
     assert ratio > 1
     # 40 degrees of freedom of 0.02 σ and ten of 0.1 σ, which is usual
     assert variances[0] == pytest.approx((40 * 0.02**2 + 10 * 0.1**2) / 50, rel=0.01)

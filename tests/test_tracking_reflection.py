@@ -31,7 +31,7 @@ def status(
     views = detect(cameras, shown, TRUTH, noise=0.2)
     tracker = Tracker.create(given, EstimatorOptions())
     if not mirrors:  # no body is measured mirrored
-        acceptance = replace(tracker.rules.acceptance, mirrored=1e-300)
+        acceptance = replace(tracker.rules.acceptance, mistaken=1e-300)
         tracker = replace(tracker, rules=replace(tracker.rules, acceptance=acceptance))
     return tracker.advance(tracker.begin(), 0, None, views)[1].status
 

@@ -105,14 +105,6 @@ _CUT = (
         ("test_judgement_cut.py",),
     ),
     Mutant(
-        "judgement-a-turned-camera-is-as-told",
-        "judgement/noise.py",
-        "displaced = 0.5 * float(v @ (np.linalg.solve(wide, v) - mean) - volumes)",
-        "displaced = -math.inf",
-        "two cameras of which one was turned agree about a wrong pose",
-        ("test_turned_camera.py",),
-    ),
-    Mutant(
         "judgement-cut-as-told-along-rows",
         "judgement/cut.py",
         "np.linalg.eigvalsh(J @ C @ J.swapaxes(1, 2))",

@@ -1,7 +1,6 @@
 """Judgement: which features a pose meets, what that is worth, and whether it is believed."""
 
 from mixpose.judgement.acceptance import (
-    APART as APART,
     AcceptanceRules as AcceptanceRules,
     Alternative as Alternative,
     Verdict as Verdict,
@@ -31,6 +30,10 @@ from mixpose.judgement.judge import (
 from mixpose.judgement.expected import (
     expected_covariance as expected_covariance,
     invert_information as invert_information,
+)
+from mixpose.judgement.mistakes import (
+    APART as APART,
+    mistakes as mistakes,
 )
 from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,

@@ -20,8 +20,6 @@ from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import twist_between
 
-APART = "two sensors contradict each other"
-
 
 @dataclass(frozen=True)
 class AcceptanceRules:
@@ -29,8 +27,9 @@ class AcceptanceRules:
 
     confidence: float = constant(0.999, "that a pose is right, to be ok: one of 1000 may err")
     told: float = constant(0.2, "that it is no clutter, to tell it: one feature more makes it even")
-    displaced: float = constant(0.01, "of recordings, a sensor of which does not stand as told")
-    mirrored: float = constant(2e-4, "of bodies, measured as their mirror image")
+    mistaken: float = constant(
+        2e-4, "of sessions, each: a body mirrored or of another size, a sensor elsewhere"
+    )
     widest_turn_deg: float = constant(
         15.0, "95 % bound on a turn that is known; of one pose's peak"
     )

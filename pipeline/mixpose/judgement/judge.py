@@ -80,7 +80,6 @@ class ScoredPose:
     # (L,) of the noise, of those used
     variances: Floats = field(default_factory=lambda: np.ones(1))
     residual_ratio: float = 0.0  # of its residuals to the largest that chance makes
-    displaced: float = -math.inf  # log of how much likelier sensors do not stand as told
     # (6, 6) where features are off by all that the body's spreads allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
@@ -182,11 +181,10 @@ def judge_together(
             left_out=left_out,
             persistent=persistent,
             residual_ratio=ratio,
-            displaced=displaced,
             variances=own,
             bent=bent[k],
         )
-        for k, (own, covariance, persistent, remembered, ratio, displaced) in enumerate(noises)
+        for k, (own, covariance, persistent, remembered, ratio) in enumerate(noises)
     ]
 
 

@@ -58,7 +58,8 @@ class NoiseModel:
     confidence: float = constant(0.95, "of the F distribution's ellipsoid; 0 enlarges nothing")
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
-    displaced: float = constant(1.0, "σ_ε: of those of a sensor that does not stand as told")
+    turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
+    shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
     bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
     def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
@@ -111,12 +112,12 @@ def noise_of(
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
     known: Floats = np.full(6, np.inf),  # how uncertain the pose was before
-) -> tuple[Floats, Floats, Floats, RememberedNoise, float, float]:
+) -> tuple[Floats, Floats, Floats, RememberedNoise, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
     Variances (L,) of each sensor, σ_ε²; the covariance (6, 6), zero where the pose is not free, and
-    what of it lasts and leaves velocities alone; what is remembered; the ratio of residuals to the
-    largest that chance makes; the log of how much likelier sensors do not stand as told.
+    what of it lasts and leaves velocities alone; what is remembered; and the ratio of residuals to
+    the largest that chance makes.
     """
     (chosen,) = free.nonzero()
     count, inner = len(chosen), (chosen[:, None], chosen)
@@ -128,13 +129,13 @@ def noise_of(
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    J, (fields, kinds) = rows[:, chosen], _fields_of(found, shares, met, rows)
+    J, (fields, kinds) = rows[:, chosen], fields_of(found, shares, met, rows)
     inverse = inverted(J.T @ J)
     # by how much fields move the pose, and what it leaves of them
     left = fields - J @ (drawn := inverse @ (J.T @ fields))
     q = fields.shape[1] - 3 * shares.shape[1]  # those of the sensors may last
     lasting = left[:, :q] / (sizes := noise.repeat(q // len(noise)))
-    biases, mean, second, displaced = _lasting(before.biases, found.names, lasting, r, model)
+    biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
     pulls, moved = np.append(rest @ fields[:, :q], r @ fields[:, q:]), drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
@@ -151,9 +152,8 @@ def noise_of(
     if found.by_calibration is not None:
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
-        displaced = -math.inf  # it is stated how far
     after = before.followed(found.names, sums, moments, biases, share)
-    return variances, covariance + steady, steady, after, ratio, displaced
+    return variances, covariance + steady, steady, after, ratio
 
 
 def _level(
@@ -193,7 +193,7 @@ def _level(
     return variances, scale, told, degrees, ratio
 
 
-def _fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[Floats, Floats]:
+def fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[Floats, Floats]:
     """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
 
     Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
@@ -229,11 +229,10 @@ def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats,
 
 def _lasting(
     before: Biases, names: tuple[str, ...], fields: Floats, r: Floats, model: NoiseModel
-) -> tuple[Biases, Floats, Floats, float]:
+) -> tuple[Biases, Floats, Floats]:
     """Sums [A | v] with those of a frame, of fields (R, q), and what they show of those that last.
 
-    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none; and the
-    logarithm of how much likelier they are with sizes of sensors that do not stand as told.
+    Sizes γ̂ (q,) in σ_ε and their second moments (q, q), zero where there may be none.
     """
     shown = np.concatenate([fields.T @ fields, (r @ fields)[:, None]], axis=1)
     if names in before and before[names].shape == shown.shape:
@@ -249,14 +248,8 @@ def _lasting(
         if v @ mean > chdtri(1.0, 1 - model.by_chance):
             S = inverted(known)
             if v @ mean > chdtri(max(float((S * A).sum()), 1.0), 1 - model.by_chance):
-                wide = A + np.eye(len(v)) / model.displaced**2
-                volumes = np.linalg.slogdet(np.array([wide, known]))[1] @ [1.0, -1.0]
-                volumes += 2 * len(v) * math.log(model.displaced / model.bias)
-                displaced = 0.5 * float(v @ (np.linalg.solve(wide, v) - mean) - volumes)
-                # one sensor alone has the world stand as it does
-                displaced = displaced if len(names) > 1 else -math.inf
-                return biases, mean, S + np.outer(mean, mean), displaced
-    return biases, np.zeros(len(v)), np.zeros(A.shape), -math.inf
+                return biases, mean, S + np.outer(mean, mean)
+    return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
 def _normal_equations(

@@ -25,6 +25,7 @@ from mixpose.judgement import (
     is_far_off,
     is_open,
     is_sure,
+    mistakes,
 )
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
@@ -34,7 +35,6 @@ from mixpose.tracking.track import Track
 
 FEW = "few markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
-DISPLACED = "features are met as if a sensor stood otherwise than the session says"
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
 MIRRORED = "it shows the body's mirror image"
@@ -60,10 +60,11 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
 def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
-    yield Alternative(MIRRORED, math.log(rules.mirrored) + of_reflection(data, best))
+    yield Alternative(MIRRORED, math.log(rules.mistaken) + of_reflection(data, best))
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(ALONE, _of_one_sensor(data, best))
-    yield Alternative(DISPLACED, math.log(rules.displaced) + best.displaced)
+    for what, odds in mistakes(best, data.body, data.free, noise):
+        yield Alternative(what, math.log(rules.mistaken) + odds)
     if contradict(best, track.residuals.total, track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
@@ -113,7 +114,7 @@ def of_reflection(data: Frame, judged: ScoredPose) -> float:
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return -math.inf
     accepted, met = rules.acceptance, seen.met_by
-    own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mirrored)
+    own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mistaken)
     # of these the mirror image may meet more than the body
     if sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance

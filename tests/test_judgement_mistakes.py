@@ -1,0 +1,92 @@
+"""A body of another size, or a sensor that stands otherwise than told, in a single frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detections import TRUTH, detect
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from mixpose.body import Body, PointFeature
+from mixpose.fit import EstimatorOptions
+from mixpose.judgement import APART
+from mixpose.judgement.mistakes import SIZE, evidence_of
+from mixpose.records import Estimate
+from mixpose.rigid import from_rotation_vector
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Tracker
+
+Floats = NDArray[np.float64]
+
+# of a tool whose origin is its tip
+POINTS = np.random.default_rng(5).uniform(-80.0, 80.0, (10, 3)) + [0.0, 0.0, 150.0]
+
+
+def body(size: float = 1.0, sigma: float = 0.0) -> Body:
+    return Body("body", tuple(PointFeature(size * one, sigma**2 * np.eye(3)) for one in POINTS))
+
+
+def estimate(
+    given: Body, seen_by: list[PinholeCamera], told: list[PinholeCamera], noise: float
+) -> Estimate:
+    views = detect(seen_by, body(), TRUTH, noise=noise)
+    views = [replace(view, sensor=camera) for view, camera in zip(views, told, strict=True)]
+    tracker = Tracker.create(given, EstimatorOptions())
+    return tracker.advance(tracker.begin(), 0, None, views)[1]
+
+
+def turned(camera: PinholeCamera, degrees: float) -> PinholeCamera:
+    turn = from_rotation_vector([0.0, 0.0, np.radians(degrees)], [0.0, 0.0, 0.0])
+    return replace(camera, T_sensor_world=turn @ camera.T_sensor_world)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.2, 0.5])
+def test_with_the_body_and_the_cameras_as_told_frames_are_ok(
+    pinhole_cameras: list[PinholeCamera], noise: float
+) -> None:
+    for cameras in (pinhole_cameras, pinhole_cameras[:2]):
+        assert estimate(body(), cameras, cameras, noise).status == "ok"
+
+
+@pytest.mark.parametrize("size", [0.98, 1.02])
+def test_a_body_of_another_size_is_not_ok_before_several_cameras_and_called_so(
+    pinhole_cameras: list[PinholeCamera], size: float
+) -> None:
+    found = estimate(body(size), pinhole_cameras, pinhole_cameras, 0.1)
+    assert (found.status, found.doubt) == ("ambiguous", SIZE)
+    # which one camera cannot tell from a distance
+    one = pinhole_cameras[:1]
+    assert estimate(body(size), one, one, 0.1).status == "ok"
+
+
+def test_a_size_that_the_spread_of_the_body_allows_is_not_another(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    found = estimate(body(1.01, sigma=1.0), pinhole_cameras, pinhole_cameras, 0.1)
+    assert found.status == "ok"
+
+
+def test_cameras_of_which_one_is_turned_contradict_each_other(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    told = [turned(pinhole_cameras[0], 2.0), *pinhole_cameras[1:]]
+    found = estimate(body(), pinhole_cameras, told, 0.1)
+    assert (found.status, found.doubt) == ("ambiguous", APART)
+
+
+def test_evidence_is_the_marginal_likelihood_over_sizes_and_noise() -> None:
+    rng = np.random.default_rng(2)
+    X, r = rng.normal(size=(2, 9, 3)), rng.normal(size=9)
+    s2 = np.array([0.1, 1.0])
+    found, second = evidence_of(X, r, 9.0, 0.0, s2)
+    for k in range(2):
+        each = [multivariate_normal(cov=X[k] @ X[k].T + one * np.eye(9)).logpdf(r) for one in s2]
+        assert found[k] == pytest.approx(logsumexp(each) + 4.5 * np.log(2 * np.pi))
+        best = s2[int(np.argmax(each))]
+        S = np.linalg.inv(X[k].T @ X[k] / best + np.eye(3))
+        mean = S @ X[k].T @ r / best
+        np.testing.assert_allclose(second[k], S + np.outer(mean, mean), rtol=1e-9)
