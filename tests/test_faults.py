@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from matches import Seen, scored
 
 from mixpose.cli.findings import Stretches
-from mixpose.judgement import AcceptanceRules, NoiseModel, contradict
+from mixpose.judgement import AcceptanceRules, NoiseModel, one_misses
 from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
@@ -126,13 +125,13 @@ def test_a_camera_that_is_a_frame_late_is_told_from_one_that_is_bumped(tmp_path:
     assert found.is_named, found.said
 
 
-def test_a_body_that_is_one_per_cent_too_small_is_named_by_what_it_is_met_off(
+def test_a_body_that_is_one_per_cent_too_small_is_named(
     tmp_path: Path,
 ) -> None:
     found = outcome(FAULTS["body 1 % too small"], tmp_path / "recording", stop=12)
     assert found.wrong == 0
     (said,) = found.said
-    assert "'tracker' are met as if it were 1.01 times as large" in said
+    assert "with points 1.01 times as large" in said
 
 
 def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> Seen:
@@ -140,8 +139,8 @@ def sensor(name: str, offsets: Floats, J: Floats, met: Floats, count: float) -> 
     return Seen(J, name, offsets, met, count=count, unmatched_nearby=unmatched)
 
 
-def is_contradiction(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
-    return contradict(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
+def is_missed(sensors: Sequence[Seen], before: Floats = QUIET, agreed: bool = True) -> bool:
+    return one_misses(scored(np.eye(4), *sensors), before, agreed, RULES, MODEL)
 
 
 @pytest.fixture
@@ -160,30 +159,16 @@ def seen(jacobians: Floats, shifts: list[float], noise: float = 0.01) -> list[Se
     return found
 
 
-def test_sensors_that_see_the_body_at_two_poses_contradict_each_other(jacobians: Floats) -> None:
-    assert is_contradiction(seen(jacobians, [0.2, -0.2]))
-    assert not is_contradiction(seen(jacobians, [0.0, 0.0]))
-
-
-def test_one_feature_that_is_far_off_makes_no_contradiction(jacobians: Floats) -> None:
-    one, other = seen(jacobians, [0.0, 0.0])
-    offsets = np.array(one.offsets)
-    offsets[2] = [1.0, -1.0]  # as where it runs into another one
-    assert not is_contradiction([replace(one, offsets=offsets), other])
-
-
-def test_of_three_sensors_the_majority_tells(jacobians: Floats) -> None:
-    assert not is_contradiction(seen(jacobians, [0.2, -0.2, 0.0]))
-
-
-def test_a_sensor_that_never_met_the_body_but_sees_as_much_contradicts(jacobians: Floats) -> None:
+def test_a_sensor_that_never_met_the_body_but_sees_as_much_is_not_believed(
+    jacobians: Floats,
+) -> None:
     one, _ = seen(jacobians, [0.0, 0.0])
     blind = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 5.0)
-    assert is_contradiction([one, blind], np.zeros(2), False)
+    assert is_missed([one, blind], np.zeros(2), False)
     empty = sensor("1", np.zeros((7, 2)), jacobians[1], np.zeros(7), 1.0)
-    assert not is_contradiction([one, empty], np.zeros(2), False)
+    assert not is_missed([one, empty], np.zeros(2), False)
     # once they agreed, what is seen elsewhere may be anything
-    assert not is_contradiction([one, empty])
+    assert not is_missed([one, empty])
 
 
 def test_stretches_are_told_with_the_longest_first_in_the_order_of_the_run() -> None:

@@ -23,7 +23,7 @@ from mixpose.tracking import Tracker
 Floats = NDArray[np.float64]
 
 # of a tool whose origin is its tip
-POINTS = np.random.default_rng(5).uniform(-80.0, 80.0, (10, 3)) + [0.0, 0.0, 150.0]
+POINTS = np.random.default_rng(5).uniform([-80.0, -80.0, 70.0], [80.0, 80.0, 230.0], (10, 3))
 
 
 def body(size: float = 1.0, sigma: float = 0.0) -> Body:
@@ -82,7 +82,7 @@ def test_evidence_is_the_marginal_likelihood_over_sizes_and_noise() -> None:
     rng = np.random.default_rng(2)
     X, r = rng.normal(size=(2, 9, 3)), rng.normal(size=9)
     s2 = np.array([0.1, 1.0])
-    found, second = evidence_of(X, r, 9.0, 0.0, s2)
+    found, second = evidence_of(X, r, 9.0, s2)
     for k in range(2):
         each = [multivariate_normal(cov=X[k] @ X[k].T + one * np.eye(9)).logpdf(r) for one in s2]
         assert found[k] == pytest.approx(logsumexp(each) + 4.5 * np.log(2 * np.pi))

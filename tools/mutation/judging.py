@@ -146,6 +146,33 @@ _CUT = (
     ),
 )
 
+_MISTAKES = (
+    Mutant(
+        "judgement-bodies-have-the-size-that-is-told",
+        "judgement/mistakes.py",
+        "columns[1, :, 0] = model.turned *",
+        "columns[1, :, 0] = 1e-9 *",
+        "the tip of a tool that is a fiftieth too large is ok millimetres off",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-bodies-that-give-way-are-of-another-size",
+        "judgement/mistakes.py",
+        "axes *= np.sqrt(np.maximum(values, 0.0))[:, None]",
+        "axes *= 0",
+        "a body whose spread is stated is said to be of another size",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-mistakes-cost-nothing",
+        "judgement/mistakes.py",
+        "np.log(wide / s2).sum(axis=1)",
+        "0 * np.log(wide / s2).sum(axis=1)",
+        "what may explain anything is likelier than what is told",
+        ("test_judgement_mistakes.py",),
+    ),
+)
+
 _EVIDENCE = (
     Mutant(
         "judgement-covered-features-missed-one-by-one",
@@ -368,4 +395,4 @@ _JUDGE = (
     ),
 )
 
-MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)
+MUTANTS = (*_NOISE, *_FIELDS, *_CUT, *_MISTAKES, *_EVIDENCE, *_ACCEPTANCE, *_JUDGE)

@@ -66,6 +66,14 @@ _PROPOSALS = (
         (_STARTS,),
     ),
     Mutant(
+        "tracking-a-turned-camera-is-as-told",
+        "tracking/doubt.py",
+        "math.log(rules.mistaken) + odds)",
+        "math.log(rules.mistaken) - abs(odds))",
+        "two cameras of which one was turned agree about a wrong pose",
+        ("test_turned_camera.py",),
+    ),
+    Mutant(
         "tracking-three-markers-of-eight-are-the-body",
         "tracking/doubt.py",
         "    yield Alternative(FEW, of_other_things(data, best))",

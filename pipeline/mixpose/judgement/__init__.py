@@ -5,7 +5,7 @@ from mixpose.judgement.acceptance import (
     Alternative as Alternative,
     Verdict as Verdict,
     beliefs as beliefs,
-    contradict as contradict,
+    one_misses as one_misses,
     convinces as convinces,
     decide as decide,
     insert as insert,
@@ -33,7 +33,7 @@ from mixpose.judgement.expected import (
 )
 from mixpose.judgement.mistakes import (
     APART as APART,
-    mistakes as mistakes,
+    possible_mistakes as possible_mistakes,
 )
 from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,

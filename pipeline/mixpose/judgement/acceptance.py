@@ -9,8 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.special import chdtri, expit, fdtri, logit
+from scipy.special import chdtri, expit, logit
 
 from mixpose.body import Body
 from mixpose.constants import constant
@@ -202,10 +201,10 @@ def _are_one(
     return inside and (a.spread is not None or turned < math.radians(rules.widest_turn_deg))
 
 
-def contradict(
+def one_misses(
     judged: ScoredPose, before: Floats, agreed: bool, rules: AcceptanceRules, model: NoiseModel
 ) -> bool:
-    """Whether the two sensors of a frame contradict each other: no pose is right for both.
+    """Whether one of two sensors meets most of the body, and the other sees as much elsewhere.
 
     `before` are squares and degrees of freedom (2,) of residuals of the frames before; where two
     sensors `agreed` in one of them, one may miss the body now.
@@ -213,32 +212,20 @@ def contradict(
     used = judged.used
     if used.dimensions.tolist() != [2, 2]:
         return False
-    variance = _variance(before, model, model.errors.typical)
-    # one meets most of the body; the other misses it, and sees as much beside it, or, where the
-    # two never agreed, anywhere
     least, most = sorted(range(2), key=used.coverage.tolist().__getitem__)
-    if used.coverage[least] < rules.agreeing <= used.coverage[most]:
-        beside, needed = used.unmatched_nearby[least], used.missed[least]
-        if not agreed:
-            beside, needed = used.count[least] - used.met[least], used.met[most]
-        if needed > 0 and beside >= rules.agreeing * needed:
-            # of the body's, against detections anywhere near
-            v = min(variance, model.usual**2) + used.extra[least]
-            odds = np.log(model.errors.met**2 / (2 * v)) - used.squared[least] / (2 * v)
-            return bool(used.shares[least] @ odds < -rules.log_doubt)
-    # offsets far beyond the noise so far, which a pose of its own takes away in each sensor
-    if not is_far_off(used, before, rules, model):
+    if not used.coverage[least] < rules.agreeing <= used.coverage[most]:
         return False
-    used = _by_noise(used, variance, model)
-    rows, offsets = used.rows()
-    J = block_diag(*rows)
-    J /= np.maximum(np.linalg.norm(J, axis=0), 1e-12)
-    taken, _, rank, _ = np.linalg.lstsq(J, offsets.ravel(), rcond=1e-6)
-    alone = float(((offsets.ravel() - J @ taken) ** 2).sum())
-    # two poses take up more than the one that both have in common
-    own, more = float(used.measurements.sum()) - rank, max(rank - 6, 1.0)
-    gained = (float(used.squares.sum()) - alone) / more
-    return bool(own >= 1 and gained > fdtri(more, own, model.by_chance) * alone / own)
+    # beside the body, or, where the two never agreed, anywhere
+    beside, needed = used.unmatched_nearby[least], used.missed[least]
+    if not agreed:
+        beside, needed = used.count[least] - used.met[least], used.met[most]
+    if needed <= 0 or beside < rules.agreeing * needed:
+        return False
+    # what it meets is of the body, against detections anywhere near
+    variance = _variance(before, model, model.errors.typical)
+    v = min(variance, model.usual**2) + used.extra[least]
+    odds = np.log(model.errors.met**2 / (2 * v)) - used.squared[least] / (2 * v)
+    return bool(used.shares[least] @ odds < -rules.log_doubt)
 
 
 def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
@@ -247,25 +234,18 @@ def _variance(before: Floats, model: NoiseModel, typical: float) -> float:
     return max(float(before[0] / before[1]), LEAST_VARIANCE) if is_known else typical**2
 
 
-def _by_noise(used: Matches, variance: float, model: NoiseModel) -> Matches:
-    """Matches of which what errs by more than noise counts less, and a few far off not at all."""
-    wide, met = variance + used.extra, used.shares > 0
-    far = model.errors.are_off(used, wide)
-    # where most of a sensor are far off it is out of step, or turned
-    far &= (
-        np.count_nonzero(far, axis=1, keepdims=True) <= np.count_nonzero(met, axis=1)[:, None] / 2
-    )
-    return replace(used, shares=np.where(far, 0.0, used.shares * variance / wide))
-
-
 def is_far_off(used: Matches, before: Floats, rules: AcceptanceRules, model: NoiseModel) -> bool:
     """Whether features are met far beyond the noise so far (2,), squares and degrees of freedom.
 
     Where that is not known, half as far beyond what is typical: half of σ_ε; right geometry has
-    0.2.
+    0.2.  What errs by more than noise counts less, and a few far off not at all.
     """
     variance = _variance(before, model, model.errors.typical / 2)
-    used = _by_noise(used, variance, model)
+    wide, met = variance + used.extra, used.shares > 0
+    far = model.errors.are_off(used, wide)
+    # where most of a sensor are far off it is out of step, or turned
+    far &= 2 * np.count_nonzero(far, axis=1, keepdims=True) <= met.sum(axis=1, keepdims=True)
+    used = replace(used, shares=np.where(far, 0.0, used.shares * variance / wide))
     degrees, squares = sum(used.measurements.tolist()) - 6, sum(used.squares.tolist())
     return bool(degrees >= 1 and squares >= degrees * rules.disagreeing * variance)
 

@@ -7,9 +7,9 @@ and z = UᵀXᵀr, in ν directions,
 
     ln p(r | s) = −½ ν ln s² − ½ (|r|² − Σ z² / (λ + s²)) / s² − ½ Σ ln (1 + λ / s²),
 
-of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  A mistake counts
-where the pose would then be outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes γ that
-residuals tell.
+of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts where
+the pose, with its noise, is then outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes γ
+that residuals tell.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ APART = "sensors contradict each other"
 SIZE = "the body seems to be of another size"
 
 
-def mistakes(
+def possible_mistakes(
     pose: ScoredPose, body: Body, free: Mask, model: NoiseModel
 ) -> Iterator[tuple[str, float]]:
     """What a frame of several sensors may show as wrong, and the log of how much likelier it is."""
@@ -38,19 +38,15 @@ def mistakes(
     if len(found.names) < 2 or not len(chosen):
         return
     noise = pose.variances[:, None]
-    if max(noise.tolist()) <= [model.usual**2]:
-        return  # as is usual: there is nothing to explain
     shares = found.shares * noise / (noise + found.extra)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
     r, rows = roots[:, 0] * found.offsets.ravel(), roots * found.J.reshape(-1, 6)
     J = rows[:, chosen]
     drawn = inverted(J.T @ J) @ J.T
     r = r - J @ (drawn @ r)
-    # what is usual for ranges nobody knows
-    believed = model.usual_degrees * float(np.mean(found.dimensions == 2))
-    degrees = float(met @ found.dimensions - len(chosen) + believed)
     # noise from a hundredth of σ_ε to twice that
-    given = r, degrees, believed * model.usual**2, np.asarray(1e-4 * 1.6 ** np.arange(24))
+    s2 = np.asarray(1e-4 * 1.6 ** np.arange(24))
+    given = r, float(met @ found.dimensions) - len(chosen), s2
     columns, stated = _columns(pose, body, rows, met, model), _stated(pose, body, roots, rows)
     moves = drawn @ columns
     left, stated = columns - J @ moves, stated - J @ (drawn @ stated)
@@ -67,12 +63,12 @@ def mistakes(
     usual = _beside(sizes * (fields - J @ (drawn @ fields)), stated)
     others = np.logaddexp.reduce(evidence_of(usual, *given)[0])
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
+    limit = float(chdtri(len(chosen), 1 - model.by_chance)) - len(chosen)  # besides noise
     for k in likelier:
         cases, second = evidence_of(_beside(usual, left[k]), *given)
         by_mistake = moves[k] @ second[cases.argmax(), -6:, -6:] @ moves[k].T
-        if np.vdot(own, by_mistake) > chdtri(len(chosen), 1 - model.by_chance):
-            what = SIZE if k == 1 else APART
-            yield what, float(np.logaddexp.reduce(cases) - others)
+        if np.vdot(own, by_mistake) > limit:
+            yield SIZE if k == 1 else APART, float(np.logaddexp.reduce(cases) - others)
 
 
 def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: NoiseModel) -> Floats:
@@ -110,17 +106,15 @@ def _beside(X: Floats, others: Floats) -> Floats:
     return np.concatenate([X, np.broadcast_to(others, (len(X), *others.shape))], axis=2)
 
 
-def evidence_of(
-    X: Floats, r: Floats, degrees: float, squares: float, s2: Floats
-) -> tuple[Floats, Floats]:
+def evidence_of(X: Floats, r: Floats, degrees: float, s2: Floats) -> tuple[Floats, Floats]:
     """Log evidence (K,) of columns X (K, R, p), of deviation 1; second moments of their sizes.
 
-    With what is believed of noise before, of so many degrees of freedom and squares these are.
+    For residuals r (R,) of so many degrees of freedom, and noise of any of the variances s2.
     """
     values, U = np.linalg.eigh(X.swapaxes(1, 2) @ X)
     z = ((r @ X)[:, None] @ U)[:, 0, :, None]
     wide = np.maximum(values, 0.0)[..., None] + s2
-    left = squares + r @ r - (z**2 / wide).sum(axis=1)
+    left = r @ r - (z**2 / wide).sum(axis=1)
     logs = -0.5 * (degrees * np.log(s2) + left / s2 + np.log(wide / s2).sum(axis=1))
     k = np.arange(len(X))[:, None], np.arange(U.shape[2]), logs.argmax(axis=1)[:, None]
     mean, S = (U * (z[..., 0] / wide[k])[:, None]).sum(axis=2), U * (s2[k[2]] / wide[k])[:, None]

@@ -20,12 +20,12 @@ from mixpose.judgement import (
     Alternative,
     ScoredPose,
     Verdict,
-    contradict,
     decide,
     is_far_off,
     is_open,
     is_sure,
-    mistakes,
+    one_misses,
+    possible_mistakes,
 )
 from mixpose.records import Mask
 from mixpose.tracking.frame import Frame
@@ -63,9 +63,9 @@ def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
     yield Alternative(MIRRORED, math.log(rules.mistaken) + of_reflection(data, best))
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(ALONE, _of_one_sensor(data, best))
-    for what, odds in mistakes(best, data.body, data.free, noise):
+    for what, odds in possible_mistakes(best, data.body, data.free, noise):
         yield Alternative(what, math.log(rules.mistaken) + odds)
-    if contradict(best, track.residuals.total, track.agreed, rules, noise):
+    if one_misses(best, track.residuals.total, track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
         yield Alternative(CHANGED)
