@@ -244,8 +244,13 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
     ]
     near.sort(key=lambda each: each[0].change.values)
     (best, gain), *others = near
-    rivals = [one for one, _ in others if one.change.values == best.change.values]
     change = best.change
+    # two values of the same are no two answers
+    rivals = [
+        one
+        for one, _ in others
+        if one.change.values == change.values and one.change.what != change.what
+    ]
     words = {"is": "may be", "are": "may be"} if rivals else {"is": "is", "are": "are"}
     text = f"{change.what.format(**words)}: {change.remedy}"
     if rivals:
