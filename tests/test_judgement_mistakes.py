@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from detections import TRUTH, detect
+from detections import ALL_FREE, TRUTH, detect
+from matches import Seen, scored
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
-from mixpose.judgement import APART
+from mixpose.judgement import APART, NoiseModel, ScoredPose, possible_mistakes
 from mixpose.judgement.mistakes import SIZE, evidence_of
 from mixpose.records import Estimate
 from mixpose.rigid import from_rotation_vector
@@ -90,3 +91,35 @@ def test_evidence_is_the_marginal_likelihood_over_sizes_and_noise() -> None:
         S = np.linalg.inv(X[k].T @ X[k] / best + np.eye(3))
         mean = S @ X[k].T @ r / best
         np.testing.assert_allclose(second[k], S + np.outer(mean, mean), rtol=1e-9)
+
+
+def seen_from(*twists: Floats, noise: float) -> ScoredPose:
+    """A pose by sensors that each see ten features as from a pose a twist (6,) away, in σ_ε."""
+    rng = np.random.default_rng(1)
+    sensors = []
+    for k, twist in enumerate(twists):
+        J = rng.normal(size=(10, 2, 6))
+        offsets = J @ twist + noise * rng.normal(size=(10, 2))
+        sensors.append(Seen(J, str(k), offsets, places=rng.uniform(-200.0, 200.0, (10, 2))))
+    pose = scored(TRUTH, *sensors)
+    # as residuals tell it
+    return replace(pose, variances=np.full(len(sensors), max(noise**2, 1e-4)))
+
+
+def mistakes_in(pose: ScoredPose) -> dict[str, float]:
+    return dict(possible_mistakes(pose, body(), ALL_FREE, NoiseModel()))
+
+
+def test_sensors_that_see_the_body_at_two_poses_contradict_each_other_and_at_one_do_not() -> None:
+    away = np.array([0.4, -0.3, 0.3, 0.0, 0.0, 0.0])
+    apart = mistakes_in(seen_from(-away, away, noise=0.05))
+    # far beyond the 17 nats that 2 in 10,000 sessions and 1 in 1,000 frames leave
+    assert apart[APART] > 20
+    assert mistakes_in(seen_from(0 * away, 0 * away, noise=0.05)) == {}
+
+
+def test_a_single_feature_that_is_far_off_is_no_contradiction() -> None:
+    pose = seen_from(np.zeros(6), np.zeros(6), noise=0.05)
+    offsets = pose.matches.offsets.copy()
+    offsets[0, 3] += 0.5
+    assert mistakes_in(replace(pose, matches=replace(pose.matches, offsets=offsets))) == {}

@@ -5,7 +5,6 @@ from mixpose.judgement.acceptance import (
     Alternative as Alternative,
     Verdict as Verdict,
     beliefs as beliefs,
-    one_misses as one_misses,
     convinces as convinces,
     decide as decide,
     insert as insert,
@@ -14,6 +13,7 @@ from mixpose.judgement.acceptance import (
     is_possible as is_possible,
     is_sure as is_sure,
     nearest_alike as nearest_alike,
+    one_misses as one_misses,
 )
 from mixpose.judgement.judge import (
     Case as Case,

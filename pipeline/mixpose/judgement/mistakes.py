@@ -22,7 +22,7 @@ from scipy.special import chdtri
 
 from mixpose.body import Body
 from mixpose.judgement.judge import ScoredPose
-from mixpose.judgement.noise import NoiseModel, fields_of, inverted
+from mixpose.judgement.noise import NoiseModel, fields_of_sensors, inverted
 from mixpose.records import Floats, Mask
 
 APART = "sensors contradict each other"
@@ -56,7 +56,7 @@ def possible_mistakes(
     if not likelier:
         return
     # that markers err by 1 σ_ε makes a size, too
-    fields = fields_of(found, shares, met, rows)[0][:, : -3 * shares.shape[1]]
+    fields = fields_of_sensors(found, shares, met)
     size = columns[1, :, :1]
     fields = np.hstack([fields, size * math.sqrt(len(met) / max(float(np.vdot(size, size)), 1e-9))])
     sizes = np.reshape([0.0, model.bias / 4, model.bias, 2 * model.bias], (-1, 1, 1))

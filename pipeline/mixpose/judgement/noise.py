@@ -196,8 +196,23 @@ def _level(
 def fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[Floats, Floats]:
     """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
 
+    Those of sensors first, then of each marker what it is off by along the axes of the world (3).
+    """
+    L, N = shares.shape
+    # in units of how features move with the body, the root mean square of those in view
+    by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
+    moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
+    own, kinds = _of_markers(L, N)
+    of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * own
+    both = fields_of_sensors(found, shares, met), of_markers.reshape(len(J), -1)
+    return np.concatenate(both, axis=1), kinds
+
+
+def fields_of_sensors(found: Matches, shares: Floats, met: Floats) -> Floats:
+    """Fields (R, q) of sensors, weighted by shares (L, N), of which they met (L,).
+
     Along each coordinate of a sensor an offset (kind 1), and what turns, scales and shears features
-    about their middle (kind 2); of each marker what it is off by along the axes of the world (3).
+    about their middle (kind 2).
     """
     L, N = shares.shape
     total = np.maximum(met, 1e-6)[:, None]
@@ -207,24 +222,23 @@ def fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[F
     by_feature, roots = np.empty((L, N, 3)), np.sqrt(shares)
     by_feature[..., 0] = roots
     by_feature[..., 1:] = away * (roots / np.maximum(size, 1e-6)[:, None])[..., None]
-    columns, markers, kinds = _columns(tuple(found.dimensions.tolist()), N)
-    of_sensors = by_feature[:, :, None, None, None] * columns
-    # in units of how features move with the body, the root mean square of those in view
-    by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
-    moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
-    of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * markers
-    both = of_sensors.reshape(len(J), -1), of_markers.reshape(len(J), -1)
-    return np.concatenate(both, axis=1), kinds
+    of_sensors = by_feature[:, :, None, None, None] * _of_sensors(tuple(found.dimensions.tolist()))
+    return np.asarray(of_sensors.reshape(2 * L * N, -1))
 
 
 @lru_cache(maxsize=64)
-def _columns(dimensions: tuple[int, ...], markers: int) -> tuple[Floats, Floats, Floats]:
-    """Which rows columns are of, of sensors and of markers, and the kinds of all fields."""
-    L = len(dimensions)
+def _of_sensors(dimensions: tuple[int, ...]) -> Floats:
+    """Which rows (L, 1, 2, L, 2, 1) the columns of sensors are of."""
     axes = np.arange(2) < np.array(dimensions)[:, None]
-    columns = np.einsum("lk,ij,li->likj", np.eye(L), np.eye(2), axes)[:, None, ..., None]
-    kinds = np.eye(4)[[1, 2, 2] * (2 * L) + [3] * (3 * markers)]
-    return columns, np.eye(markers)[:, None, :, None], kinds
+    own = np.einsum("lk,ij,li->likj", np.eye(len(dimensions)), np.eye(2), axes)
+    return np.asarray(own[:, None, ..., None])
+
+
+@lru_cache(maxsize=64)
+def _of_markers(sensors: int, markers: int) -> tuple[Floats, Floats]:
+    """Which rows the columns of markers are of, and the kinds of all fields."""
+    kinds = np.eye(4)[[1, 2, 2] * (2 * sensors) + [3] * (3 * markers)]
+    return np.eye(markers)[:, None, :, None], kinds
 
 
 def _lasting(

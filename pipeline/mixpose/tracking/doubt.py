@@ -107,7 +107,7 @@ def of_other_things(data: Frame, judged: ScoredPose) -> float:
 
 
 def of_reflection(data: Frame, judged: ScoredPose) -> float:
-    """Log odds of the body's mirror image; minus infinity where it is not looked for."""
+    """Log odds of the body's mirror image; minus infinity where it cannot be, or is not likely."""
     rules, seen, T = data.rules, judged.matches, judged.T_world_object
     # where a turn brings it onto its mirror image no camera tells one side's markers
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
