@@ -15,7 +15,8 @@ from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.frame import Start
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import look_alikes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))

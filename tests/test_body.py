@@ -120,6 +120,17 @@ def test_symmetries_are_found_and_map_the_points_onto_themselves(
         assert np.linalg.det(T[:3, :3]) == pytest.approx(1.0)
 
 
+def test_symmetries_of_a_triangle_whose_sides_are_nearly_equal_are_all_found() -> None:
+    # within 0.6 %: half turns and turns err by up to 1.5 times the tolerance of one of them
+    points = np.array([[-8.20, 23.21, -3.60], [14.26, -4.93, 19.54], [-6.06, -18.28, -15.94]])
+    found = Body("triangle", tuple(map(PointFeature, points))).symmetries
+    assert len(found) == 6
+    products = (found[:, None] @ found[None])[..., :3, :3].reshape(-1, 3, 3)
+    # whose traces of differences are 3 for the same turn
+    same = np.einsum("aij,bij->ab", products, found[:, :3, :3]).max(axis=1)
+    assert same.min() > 1 + 2 * np.cos(np.radians(2.0))
+
+
 def test_normals_forbid_symmetries_that_turn_them() -> None:
     points = tuple(PointFeature(np.array([x, y, 0.0])) for x in range(9) for y in range(6))
     up = np.tile([0.0, 0.0, 2.0], (54, 1))

@@ -127,8 +127,8 @@ def odds_by_volume(
 def test_a_false_point_in_space_is_one_coincidence_however_many_cameras_see_it() -> None:
     both = two_cameras_at_right_angles()
     # s = 0.4 px: the place is known to s, s and, where both see it, s / √2; a camera sees 1e-5 per
-    # px², each in a depth of 200
-    density = 1e-5 / 200
+    # px², and points in space are as dense in depth
+    density = 1e-5**1.5
     in_space = -log(density * (2 * pi) ** 1.5 * 0.4**3 / 2**0.5)
     alone = 2 * log(0.75 / (1e-5 * 2 * pi * 0.4**2))
     assert in_space < alone

@@ -98,8 +98,10 @@ def test_clutter_is_as_dense_as_detections_around_the_body_where_they_are_denser
     around = [(100.0, 100.0), (200.0, 100.0), (200.0, 200.0), (150.0, 150.0), (120.0, 180.0)]
     points = np.array([*around, (0.0, 0.0), (1000.0, 1000.0)])
     lower = np.array([[100.0, 100.0], [600.0, 100.0]])
-    found = crowding(points, lower, lower + 100.0, 30.0)
-    np.testing.assert_allclose(found, [5 / 100**2, 7 / 1000**2])
+    found = crowding(points, lower, lower + 100.0, 30.0, np.array([3.0, 0.0]))
+    np.testing.assert_allclose(found[0], [5 / 100**2, 7 / 1000**2])
+    # those that meet the body are no clutter beside it
+    np.testing.assert_allclose(found[1], [2 / 100**3, 7 / 1000**3])
 
 
 def test_detections_beside_the_body_that_belong_to_none_are_unmatched() -> None:

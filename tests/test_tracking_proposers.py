@@ -26,8 +26,8 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
     PROPOSERS,
     REFINEMENTS,

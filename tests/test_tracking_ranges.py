@@ -24,9 +24,9 @@ from mixpose.rigid import (
 )
 from mixpose.sensors import RangeSensor
 from mixpose.tracking import Rules, Tracker
+from mixpose.tracking.frame import Start
 from mixpose.tracking.likelihood import (
     AssociationTerm,
-    Start,
     _summed,
     are_associated,
     likelihood_of,

@@ -32,8 +32,8 @@ from mixpose.rigid import (
 from mixpose.search import SearchBudget, SearchReport, SearchResult, SearchState
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Rules, Track, Tracker
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import (
     disagreeing,
     is_doubtful,

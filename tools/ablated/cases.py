@@ -20,7 +20,7 @@ from mixpose.rigid import perturb, rotation_angle_deg, transform, twist_between
 from mixpose.search import Candidate, SearchState
 from mixpose.tracking import Tracker
 from mixpose.tracking import frame as tracked
-from mixpose.tracking.likelihood import Start
+from mixpose.tracking.frame import Start
 from mixpose.tracking.proposers import candidates_of, is_doubtful, searched, starts_at
 from mixpose.tracking.rules import ProposalRules
 

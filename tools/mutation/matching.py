@@ -104,15 +104,15 @@ _MET = (
     Mutant(
         "matching-crowd-of-the-whole-image",
         "matching/associate.py",
-        "np.maximum(overall, inside / sides.prod(axis=-1))",
-        "overall + 0 * sides[..., 0]",
+        "return np.maximum(number / overall, inside / own), beside",
+        "return number / overall, beside",
         "a crowd of false detections around the body counts as rare",
     ),
     Mutant(
         "matching-crowd-constant",
         "matching/associate.py",
-        "np.maximum(overall, inside / sides.prod(axis=-1))",
-        "1e-6 + 0 * sides[..., 0]",
+        "return np.maximum(number / overall, inside / own), beside",
+        "return 1e-6 + 0 * own, beside",
         "clutter does not make a pose less sure",
     ),
     Mutant(
@@ -125,7 +125,7 @@ _MET = (
     Mutant(
         "matching-unmatched-with-those-met",
         "matching/associate.py",
-        "axis=2), axis=1) - shares.sum(axis=1)",
+        "axis=2), axis=1) - met",
         "axis=2), axis=1) * 1.0",
         "every frame with a missed feature looks like a slip",
     ),

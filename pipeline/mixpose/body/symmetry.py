@@ -71,9 +71,12 @@ def _closed(rotations: Floats, centred: Floats, tree: cKDTree, tolerance: float)
         # of the same turn the trace of the difference is 3
         if np.einsum("ij,kij->k", R, rotations).max() > 1 + 2 * np.cos(_SAME_TURN):
             continue
-        distance, index = tree.query(centred @ R.T)
-        if len(set(index.tolist())) == len(centred) and distance.max() <= tolerance:
-            rotations = np.concatenate([rotations, R[None]])
+        _, mapped = tree.query(centred @ R.T)
+        if len(set(mapped.tolist())) == len(centred):
+            nearest = motions(centred, centred[mapped][None])[0, :3, :3]
+            if np.linalg.norm(centred @ nearest.T - centred[mapped], axis=1).max() <= tolerance:
+                more = np.concatenate([rotations, nearest[None]])
+                return _closed(more, centred, tree, tolerance)
     return rotations
 
 

@@ -17,7 +17,8 @@ from mixpose.records import Floats
 from mixpose.runner import begin
 from mixpose.session import Session
 from mixpose.threads import one_blas_thread
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.frame import Start
+from mixpose.tracking.likelihood import likelihood_of
 
 Views: TypeAlias = Sequence[View]
 Frames: TypeAlias = Sequence[tuple[int, Views]]

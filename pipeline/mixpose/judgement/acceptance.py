@@ -155,6 +155,10 @@ def is_open(pose: ScoredPose, free: Mask, rules: AcceptanceRules, model: NoiseMo
     used = pose.used
     if not (np.count_nonzero(used.shares < used.weights) or np.count_nonzero(used.extra)):
         return False
+    if np.count_nonzero(used.merged):  # one of two that share a detection may be hidden instead
+        by = used.detections
+        is_shared = (by >= 0) & ((by[..., None] == by[:, None]).sum(axis=2) > 1)
+        used = replace(used, shares=np.where(is_shared, 0.0, used.shares))
     inner = np.ix_(free, free)
     whole = replace(used, shares=used.weights, extra=np.zeros(used.extra.shape))
     C = inverted(information_of(used, pose.variances)[inner])

@@ -285,7 +285,8 @@ def odds_of(
     missed = np.where(shares.any(axis=-2), missed, np.maximum(missed, most))
     are_several = near.sum(axis=-2) > 1
     if detection.in_space and np.count_nonzero(are_several):
-        space, share = _in_space(found, roots, crowd, near, sizes, spreads)
+        others = found.others[..., None] * roots**3
+        space, share = _in_space(found, roots, others, near, sizes, spreads)
         likelier = are_several & (space < gained + missed)
         gained, missed = np.where(likelier, space, gained), np.where(likelier, 0.0, missed)
         coordinates = np.where(likelier, np.minimum(coordinates, 3 * share), coordinates)
@@ -319,17 +320,17 @@ def _in_space(
     A.reshape(*K, N, 9)[..., ::4] += 1 / sizes[..., None, None] ** 2
     pull = rows @ r.swapaxes(-3, -2).reshape(*K, N, 2 * L, 1)
     share = (near * found.shares).max(axis=-2)
-    # detections per area, of which each has a depth
+    # as dense as the camera shows that has the least about the body
     a, b = J[..., 0, :], J[..., 1, :]
     areas = np.vecdot(a, a) * np.vecdot(b, b) - np.vecdot(a, b) ** 2
-    squared = (crowd**2 * areas).min(axis=-2, initial=1e300, where=near)
+    squared = (crowd**2 * areas**1.5).min(axis=-2, initial=1e300, where=near)
     if spreads is not None:  # as far as it is known, and as far as the feature may be off
         place = np.linalg.solve(A, pull)
         A = np.asarray(np.linalg.solve(np.eye(3) + A @ spreads, A))
         pull = A @ place
     # det(A + p pᵀ) is det(A) (1 + pᵀA⁻¹p)
     tight, both = np.linalg.slogdet(np.array([A, A + pull @ pull.swapaxes(-2, -1)]))[1]
-    rarity = np.log(sizes[..., None] ** 2 / np.maximum(squared, 1e-300)) - 3 * math.log(2 * math.pi)
+    rarity = -np.log(np.maximum(squared, 1e-300)) - 3 * math.log(2 * math.pi)
     return share * np.maximum(0.5 * (rarity + tight - np.expm1(both - tight)), 0.0), share
 
 

@@ -224,14 +224,16 @@ def _surroundings(
     size, middle = upper - lower, (lower + upper) / 2
     smallest = sigmas[:, None] * np.where(is_flat[:, None], [rules.min_region, 1], rules.min_region)
     around = upper if rules.crowded else np.full_like(upper, np.nan)
-    crowd = crowding(detections, lower, around, smallest) * sigmas**2
+    met = shares.sum(axis=1)
+    crowd, others = crowding(detections, lower, around, smallest, met)
+    crowd, others = crowd * sigmas**2, others * sigmas**3
     count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
     missing = (seen & (shares == 0)).any(axis=1)
     if np.count_nonzero(missing):
         half = size / 2 + rules.slip * size.max(axis=1, keepdims=True)
         near = np.abs(detections - middle[:, None]) <= half[:, None]
-        beside = np.count_nonzero(near.all(axis=2), axis=1) - shares.sum(axis=1)
+        beside = np.count_nonzero(near.all(axis=2), axis=1) - met
         unmatched = np.where(missing & ~is_flat, np.maximum(beside, 0.0), 0.0)
     finest = size.max(axis=1) / (DRAWING.widest * sigmas)  # NaN where no feature is in view
     for k, one in enumerate(observations):
@@ -239,22 +241,35 @@ def _surroundings(
             near, far = (corner / one.sigma for corner in one.extent)
             count[k] = objective.tops[k, 0] / objective.energies[k, 0]
             crowd[k] = count[k] / np.maximum(far - near, rules.min_region).prod()
+            others[k] = crowd[k] / np.sqrt(np.maximum(far - near, rules.min_region).prod())
             finest[k] = 1.0
     finest = np.fmin(np.maximum(narrowest, finest), 1.0)
-    return {"count": count, "crowd": crowd, "unmatched_nearby": unmatched, "finest": finest}
+    return {
+        "count": count,
+        "crowd": crowd,
+        "others": others,
+        "unmatched_nearby": unmatched,
+        "finest": finest,
+    }
 
 
-def crowding(points: Floats, lower: Floats, upper: Floats, smallest: Floats | float) -> Floats:
-    """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,): of all, or
-    in boxes (..., m) where they are denser; a side counts as `smallest` at least.
+def crowding(
+    points: Floats, lower: Floats, upper: Floats, smallest: Floats | float, met: Floats
+) -> tuple[Floats, Floats]:
+    """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,).
+
+    Of all, or in boxes (..., m) where they are denser; a side counts as `smallest` at least.  Then
+    per unit to the power 3/2 m, without those in the boxes that meet (...,) the body: so dense are
+    points in space that are as deep as they are wide.
     """
     number = (points[..., 0] == points[..., 0]).sum(axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)
     sides = np.fmax(upper - lower, smallest)
     away = np.abs(points - ((lower + upper) / 2)[..., None, :])
     inside = (away <= sides[..., None, :] / 2).all(axis=-1).sum(axis=-1)
-    overall = number / np.fmax(extent, smallest).prod(axis=-1)
-    return np.asarray(np.maximum(overall, inside / sides.prod(axis=-1)))
+    overall, own = np.fmax(extent, smallest).prod(axis=-1), sides.prod(axis=-1)
+    beside = np.maximum(number / overall**1.5, (inside - met) / own**1.5)
+    return np.maximum(number / overall, inside / own), beside
 
 
 def _by_calibration(objective: MatchedObjective, T_world_object: Floats) -> Floats | None:

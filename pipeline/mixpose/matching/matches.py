@@ -45,6 +45,7 @@ class Matches:
     merged: Indices  # (..., L) pairs of features that share a detection
     count: Floats  # (..., L) number of detections
     crowd: Floats  # (..., L) of them per m-th power of σ_ε, around the prediction
+    others: Floats  # (..., L) points in space by those that meet no feature, per σ_ε³ across
     unmatched_nearby: Floats  # (..., L) of no feature, about the body, where some feature is missed
     beside: Floats  # (..., L, N) how far the nearest detection but its own is, σ_ε; NaN for none
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε

@@ -18,6 +18,7 @@ from scipy.spatial.distance import cdist
 
 from mixpose.body import Body
 from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import transform
 from mixpose.search.problem import SearchProblem
 from mixpose.search.three_points import (
     FIRST,
@@ -127,7 +128,7 @@ def from_point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Gu
     budget = problem.budget
     triangles = feature_triangles(problem.body, 6 * budget.sample, budget.min_sine)
     for triples in point_triples(problem, points) if len(triangles[0]) else ():
-        yield partial(_of_triples, problem, points, triangles, triples)
+        yield partial(of_triples, problem, points, triangles, triples)
 
 
 @lru_cache(maxsize=16)
@@ -135,10 +136,15 @@ def feature_triangles(body: Body, count: int, min_sine: float) -> tuple[Indices,
     """Ordered triples (K, 3) of features that span a triangle, and a tree of their sides (K, 3).
 
     Of `count` features far apart.  Left out are triangles whose height is a smaller share of the
-    longest side than `min_sine`.
+    longest side than `min_sine`, and all but the first of those that symmetries map to each other.
     """
     few = np.sort(far_apart(body.means, count))
     corners = np.stack(np.meshgrid(few, few, few, indexing="ij"), axis=-1).reshape(-1, 3)
+    if len(body.symmetries) > 1:
+        mapped = transform(body.symmetries, body.means)
+        turned = cKDTree(body.means).query(mapped)[1][:, corners]
+        numbers = turned @ [len(body) ** 2, len(body), 1]
+        corners = corners[numbers[body.identity] == numbers.min(axis=0)]
     sides, is_wide = _sides(body.means, corners, min_sine)
     return corners[is_wide], cKDTree(sides[is_wide].reshape(-1, 3))
 
@@ -159,7 +165,7 @@ def point_triples(problem: SearchProblem, points: TriangulatedPoints) -> Iterato
         yield batch[(np.diff(six, axis=1) > 0).all(axis=1)]
 
 
-def _of_triples(
+def of_triples(
     problem: SearchProblem,
     points: TriangulatedPoints,
     triangles: tuple[Indices, cKDTree],

@@ -109,35 +109,43 @@ def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tu
 
 def evidence(problem: SearchProblem, poses: Floats) -> tuple[Floats, Floats]:
     """Log odds (H,) of poses against clutter, paid by count, and shares met; all are cameras'."""
+    matches = matches_of(problem, poses)
+    shares = matches.met / np.maximum(matches.expected, 1.0)
+    return paid_by_count(odds_at(problem, matches), matches, problem.free), shares.mean(axis=1)
+
+
+def odds_at(problem: SearchProblem, matches: Matches) -> tuple[Floats, Floats, Floats]:
+    """The odds (H,) of what poses meet, before they pay for being chosen; see `odds_of`."""
     body, free, rules = problem.body, problem.free, problem.rules
-    matches = _matches_of(problem, poses)
     met = matches.measurements
     # of each sensor: what one that is covered meets by chance tells nothing of the others
     spare = met * np.maximum(1 - free.sum() / np.maximum(met.sum(axis=1), 1.0), 0.0)[:, None]
     squares, errors = np.where(spare > 0, matches.squares, 0.0), rules.noise.errors
-    degrees, size = errors.typical_degrees, np.full(len(poses), 2 * body.radius)
+    degrees, size = errors.typical_degrees, np.full(len(met), 2 * body.radius)
     variances = (degrees * errors.typical**2 + squares) / (degrees + spare)
-    odds = odds_of(matches, variances, size, rules.detection)
-    shares = matches.met / np.maximum(matches.expected, 1.0)
-    return paid_by_count(odds, matches, free), shares.mean(axis=1)
+    return odds_of(matches, variances, size, rules.detection)
 
 
-def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
+def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     """Detections that sensors have where they are predicted to see the features of poses."""
     sensors, rules = problem.detections, problem.rules.association
     projection = project_body(tuple(one.view.sensor for one in sensors), problem.body)
     sigmas, at = np.array([one.sigma for one in sensors]), projection.project(poses)
     y, J = at.y.swapaxes(0, 1), at.J.swapaxes(0, 1)
     seen, faced = at.seen.swapaxes(0, 1), at.faced.swapaxes(0, 1)
-    shares, offsets, crowd = np.zeros(seen.shape), np.zeros(y.shape), np.zeros(seen.shape[:2])
+    shares, offsets = np.zeros(seen.shape), np.zeros(y.shape)
+    crowd, others = np.zeros((2, *seen.shape[:2]))
+    by = np.full(seen.shape, -1)
     boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
     lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)
     for k, (sensor, sigma) in enumerate(zip(sensors, sigmas, strict=True)):
         points, smallest = sensor.points, rules.min_region * sigma
         pose, feature, detection = _pairs(y[:, k], seen[:, k], points, problem.reach(sensor))
-        shares[pose, k, feature] = 1.0
+        shares[pose, k, feature], by[pose, k, feature] = 1.0, detection
         offsets[pose, k, feature] = (points[detection] - y[pose, k, feature]) / sigma
-        crowd[:, k] = crowding(points, lower[:, k], upper[:, k], smallest) * sigma**2
+        boxes_of = points, lower[:, k], upper[:, k], smallest, shares[:, k].sum(axis=1)
+        in_view, in_space = crowding(*boxes_of)
+        crowd[:, k], others[:, k] = in_view * sigma**2, in_space * sigma**3
     nothing = np.zeros(crowd.shape)
     return Matches(
         names=tuple(one.view.name for one in sensors),
@@ -148,12 +156,13 @@ def _matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         places=y,
         offsets=offsets,
         J=J / sigmas[:, None, None, None],
-        detections=np.full(seen.shape, -1),
+        detections=by,
         explained=nothing,
         unseen=np.count_nonzero(faced & ~seen, axis=2),
         merged=nothing.astype(np.intp),
         count=nothing + [len(one.points) for one in sensors],
         crowd=crowd,
+        others=others,
         unmatched_nearby=nothing,
         beside=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),

@@ -28,8 +28,8 @@ from mixpose.judgement import (
     possible_mistakes,
 )
 from mixpose.records import Mask
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
 

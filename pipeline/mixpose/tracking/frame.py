@@ -12,7 +12,15 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit, free_mask
-from mixpose.judgement import AcceptanceRules, Prior, ScoredPose, flat_prior, nearest_alike
+from mixpose.judgement import (
+    AcceptanceRules,
+    Prior,
+    ScoredPose,
+    convinces,
+    flat_prior,
+    is_sure,
+    nearest_alike,
+)
 from mixpose.matching import pooled
 from mixpose.objective import MatchedObjective, View, in_image, matched_objective, project_body
 from mixpose.records import Floats, Mask
@@ -22,6 +30,18 @@ from mixpose.sensors import Motion, in_motion
 from mixpose.tracking.motion import Course, Expected, RandomWalk, per_kind
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, either
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins."""
+
+    T_world_object: Floats  # (4, 4)
+    uncertainty: Floats | None = None  # (6,), standard deviations; None: the pose is there already
+    prediction: Branch | None = None  # that it comes from
+    left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
+    T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
+    blur: float = 1.0  # in σ_ε, that the fit begins at
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +71,8 @@ class Frame(Setup):
     frame: int
     time_s: float | None
     drawn: MatchedObjective | None = None  # `finest`, where it is at hand
-    # from the first prediction, where several bodies were fitted together
-    together: tuple[Fit, ScoredPose] | None = None
+    starts: Sequence[Start] = ()  # instead of predictions, where bodies are looked for together
+    together: tuple[Start, Fit, ScoredPose] | None = None  # fitted from the first start
     # what searches of the frame cost, and where they go on in the next; the proposer adds to it
     searches: list[tuple[SearchReport, SearchState]] = field(default_factory=list)
     still: Sequence[View] = ()  # where views are as of the common time: sensors as they stand
@@ -66,6 +86,19 @@ class Frame(Setup):
     ) -> bool:
         """Whether there is a pose, and the most evident is `trusted` by the rules of acceptance."""
         return any(trusted(best, self.free, self.rules.acceptance) for best in ranked[:1])
+
+    @property
+    def is_found_at_once(self) -> bool:
+        """Whether it starts where points in space put it, and not where it was expected."""
+        return any(one.prediction is None for one in self.starts)
+
+    @property
+    def trusted(self) -> Callable[[ScoredPose, Mask, AcceptanceRules], bool]:
+        """What a pose must be so that the body is looked for nowhere else.
+
+        Among all points in space that are its features, sure is enough.
+        """
+        return is_sure if self.is_found_at_once else convinces
 
     @cached_property
     def is_timed(self) -> bool:
@@ -127,6 +160,20 @@ class Frame(Setup):
             spreads.append(one.uncertainty)
         # directions that the data leave open are as uncertain as where the pose likely comes from
         return float(reduce(np.logaddexp, terms)), spreads[terms.index(max(terms))]
+
+    def nearness(self, T: Floats) -> float:
+        """Log density of a pose where the body has moved on; of those of which nothing is known 0.
+
+        Nothing tells identical bodies apart but that, however unlikely the motion.
+        """
+        rules, body = self.rules.motion, self.body
+        return max(
+            [
+                one.log_density(nearest_alike(T, body, one.T_world_object), self.free, rules)
+                for one in self.predictions
+            ],
+            default=0.0,
+        )
 
     def without(self, names: Mapping[str, str]) -> Frame:
         """The frame without some sensors."""

@@ -12,8 +12,8 @@ c being the number of false detections to be expected and W the room they have.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,22 +33,9 @@ from mixpose.objective import NormalPrior, View, project_body
 from mixpose.optimise import Ascent, NewtonOptions, Quadratic, Sum, ascend
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import perturb
-from mixpose.tracking.frame import Frame, given
+from mixpose.tracking.frame import Frame, Start, given
 from mixpose.tracking.in_motion import fit_in_motion, with_motion_unknown
 from mixpose.tracking.rules import RangeRules
-from mixpose.tracking.track import Branch
-
-
-@dataclass(frozen=True)
-class Start:
-    """Where a fit begins."""
-
-    T_world_object: Floats  # (4, 4)
-    uncertainty: Floats | None = None  # (6,), standard deviations; None: the pose is there already
-    prediction: Branch | None = None  # that it comes from
-    left_out: Mapping[str, str] = field(default_factory=dict)  # sensors, and why
-    T_moved: Floats | None = None  # a pose that has moved as this must have, and was as likely
-    blur: float = 1.0  # in σ_ε, that the fit begins at
 
 
 class MatchedLikelihood:
@@ -67,8 +54,8 @@ class MatchedLikelihood:
             frame = frame.without(start.left_out)
         if uncertainty is None:
             return Fit(T)
-        if frame.together and start.prediction is frame.predictions[0]:
-            return frame.together[0]
+        if frame.together and start is frame.together[0]:
+            return frame.together[1]
         timed, model = frame.is_timed, frame.rules.judgement
         climbed = None if timed else self._climbed.setdefault(frozenset(start.left_out), [])
         spread = given(frame, T) if self.knows_detections and frame.body.spread else 0.0
@@ -98,8 +85,8 @@ class MatchedLikelihood:
     def judge(self, fit: Fit, start: Start) -> ScoredPose:
         """Judge a pose by matched densities at σ_ε, and take what is left out for missed."""
         frame, motion = self.frame, fit.motion
-        if frame.together and fit is frame.together[0]:
-            return frame.together[1]
+        if frame.together and fit is frame.together[1]:
+            return frame.together[2]
         if frame.is_timed:
             motion = motion or frame.expected(fit.T_world_object).at(fit.T_world_object)
             frame = frame.in_motion(motion)

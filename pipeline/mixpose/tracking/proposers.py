@@ -19,14 +19,14 @@ from scipy.special import fdtri
 
 from mixpose.body import LookAlike, like_features, other_tilt, thickness, tolerance_of
 from mixpose.fit import blur_schedule
-from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, convinces, is_sure
+from mixpose.judgement import AcceptanceRules, NoiseModel, ScoredPose, is_sure
 from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
 from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import Likelihood, Start
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import Likelihood
 
 # from the poses found so far, the most evident first
 Proposer: TypeAlias = Callable[[Frame, list[ScoredPose]], Iterable[Start]]
@@ -35,9 +35,12 @@ Refinement: TypeAlias = Callable[[Frame, Likelihood, ScoredPose], Iterable[Start
 OUT_OF_STEP = "out of step or bumped"
 
 
-def predicted(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
-    """Where the branches of the track expect the body, and another body beside it; always."""
-    return [
+def predicted(frame: Frame, ranked: list[ScoredPose]) -> Sequence[Start]:
+    """Where the branches of the track expect the body, and another body beside it; always.
+
+    Or where it was found with all bodies at once.
+    """
+    return frame.starts or [
         Start(one.T_world_object, one.uncertainty, one)
         for one in (*frame.predictions, frame.beside)
         if one
@@ -50,7 +53,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     Once it was followed for some frames, a pose convinces that misses no more all at once.
     """
     track, rules = frame.track, frame.rules
-    if ranked and convinces(ranked[0], frame.free, rules.acceptance):
+    if frame.first_is(frame.trusted, ranked):
         return False
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
@@ -286,8 +289,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
         return
     narrowest = errors.blur * float(np.sqrt(frame.variances.max()))
     blurs = [blur for blur in frame.rules.proposals.blurs if blur > narrowest]
-    for one, blur in product(frame.predictions, blurs):
-        start = Start(one.T_world_object, one.uncertainty, blur=blur)
+    for one, blur in product(predicted(frame, [])[: max(len(frame.predictions), 1)], blurs):
+        start = replace(one, blur=blur)
         found = likelihood.judge(likelihood.fit(start), start)
         # where all of a sensor are off it is out of step, and the others no better for it
         seen = found.matches

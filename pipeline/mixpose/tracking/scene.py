@@ -20,16 +20,16 @@ from itertools import permutations
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.spatial import KDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import AcceptanceRules, Alternative, ScoredPose, Verdict
+from mixpose.judgement import AcceptanceRules, Alternative, Verdict
 from mixpose.objective import View, project_body
-from mixpose.records import Estimate, Mask
+from mixpose.records import Estimate, Floats, Mask
 from mixpose.sensors import Sensor
 from mixpose.tracking.doubt import look_alikes_of
+from mixpose.tracking.identity import Rivals, distances_after, identify, no_distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track
@@ -37,8 +37,6 @@ from mixpose.tracking.tracker import Tracker, followed
 
 Box: TypeAlias = tuple[int, int, int, int]
 Tallies: TypeAlias = Mapping[str, tuple[int, int]]  # of features met, and in view
-# poses that a body may have instead of its own, with odds; its own, with those that it has none
-Rivals: TypeAlias = list[tuple[ScoredPose, float]]
 
 
 @dataclass(frozen=True)
@@ -64,10 +62,17 @@ class Scene:
             return (track,), [estimate]
         found = Sharing(self.bodies, tracks, frame, time_s, views, self.rules).explained()
         finders, rivals = {k: k for k in found}, dict[int, Rivals]()
+        apart = dict[int, Floats]()
         for name in {one.body.name for one in self.bodies if one.instance is not None}:
             group = [k for k, one in enumerate(self.bodies) if one.body.name == name]
-            given, exchanged = identify(group, found)
+            motion, before = self.bodies[group[0]].rules.motion, tracks[group[0]].distances
+            if before is None:
+                before = no_distances(len(group), self.bodies[group[0]].body.radius, motion)
+            given, exchanged = identify(group, found, before)
             finders, rivals = finders | given, rivals | exchanged
+            apart[group[0]] = distances_after(
+                before, _places([found[given[k]] for k in group]), motion
+            )
         told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
         sure, after, estimates = [k for k in told if told[k].status == "ok"], [], []
         for k, tracked in enumerate(self.bodies):
@@ -80,7 +85,7 @@ class Scene:
                 ]
                 others = [found[j].frame for j in (k, *away)]
                 verdict = told[k] = verdict.doubted(look_alikes_of(data, verdict.best, others))
-            after.append(followed(data, verdict))
+            after.append(replace(followed(data, verdict), distances=apart.get(k)))
             estimates.append(tracked.estimate(data, after[k], told[k], found[finders[k]].ranked))
         return self._acquainted(after, estimates), estimates
 
@@ -101,6 +106,12 @@ class Scene:
         return tuple(after)
 
 
+def _places(found: Sequence[Explanation]) -> Floats:
+    """Where bodies are (n, 3); NaN of those without a pose."""
+    bests = [one.verdict.best for one in found]
+    return np.array([np.full(3, np.nan) if T is None else T.T_world_object[:3, 3] for T in bests])
+
+
 def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
     """The same, told to be ambiguous with poses that it may have instead, and their odds."""
     best = verdict.best
@@ -113,38 +124,6 @@ def _in_doubt(verdict: Verdict, rivals: Rivals) -> Verdict:
     kept = [(pose, weight / total) for pose, weight in told]
     exchanged = [Alternative("", math.log(weight)) for _, weight in rivals]
     return replace(verdict, kept=kept).doubted(exchanged)
-
-
-def identify(
-    group: Sequence[int], found: Mapping[int, Explanation]
-) -> tuple[dict[int, int], dict[int, Rivals]]:
-    """Tell which of some identical bodies found the pose of each, and which are in doubt."""
-    bests = {k: best for k in group if (best := found[k].verdict.best) is not None}
-    finders = sorted(bests, key=lambda k: tuple(np.round(bests[k].T_world_object[:3, 3], 6)))
-    poses, known = [bests[k] for k in finders], [k for k in group if found[k].frame.predictions]
-    data = [found[k].frame for k in known]
-    # by body (rows) and pose; in the last column none, which says nothing
-    rows = [[*(one.prior(pose.T_world_object)[0] for pose in poses), 0.0] for one in data]
-    likely = np.reshape(rows, (len(known), len(poses) + 1))
-    pairs = zip(*linear_sum_assignment(likely[:, :-1], maximize=True), strict=True)
-    pose_of = {known[i]: int(j) for i, j in pairs}
-    spare = [j for j in range(len(poses)) if j not in pose_of.values()]
-    pose_of |= dict(zip([k for k in group if k not in known], spare, strict=False))
-    without = iter([k for k in group if k not in bests])
-    assigned = {k: finders[pose_of[k]] if k in pose_of else next(without) for k in group}
-    # how much likelier two bodies (rows, columns) are with each other's poses
-    given = likely[:, [pose_of.get(k, -1) for k in known]]
-    odds = given + given.T - given.diagonal() - given.diagonal()[:, None]
-    # no velocity is believed any more: they may have changed places, wherever they were before
-    lost = np.array([one.track.misses > one.rules.motion.coasting for one in data], np.bool_)
-    odds = np.where(lost & lost[:, None], np.maximum(odds, np.log(0.5)), odds)
-    rivals, limit = dict[int, Rivals](), found[group[0]].frame.rules.acceptance.log_doubt
-    for i, j in zip(*np.nonzero(odds > limit), strict=True):
-        if i != j and known[i] in pose_of:
-            other = pose_of.get(known[j], pose_of[known[i]])
-            share = float(np.exp(min(odds[i, j], 0.0)))
-            rivals.setdefault(known[i], []).append((poses[other], share))
-    return assigned, rivals
 
 
 @dataclass(frozen=True)

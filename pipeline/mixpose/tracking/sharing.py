@@ -10,22 +10,26 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from mixpose.fit import Fit, fit_together
-from mixpose.judgement import Case, ScoredPose, Verdict, convinces, is_possible, judge_together
+from mixpose.judgement import Case, ScoredPose, Verdict, is_possible, judge_together
 from mixpose.objective import SharedDensities, View, can_be_together, matched_objective
 from mixpose.records import Floats, Mask
+from mixpose.search import search_copies
 from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
-from mixpose.tracking.frame import Frame
-from mixpose.tracking.likelihood import MatchedLikelihood, Start, case_of
+from mixpose.tracking.frame import Frame, Start
+from mixpose.tracking.likelihood import MatchedLikelihood, case_of
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
 from mixpose.tracking.tracker import Tracker, judged_again
+
+Starts: TypeAlias = tuple[Start, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,49 +58,87 @@ class Sharing:
     rules: SceneRules
     found: dict[int, Explanation] = field(default_factory=dict)  # by body
     claimed: list[int] = field(default_factory=list)  # bodies that have what their poses meet
+    looked: bool = False  # whether they were looked for among points that cameras see together
 
     def explained(self) -> dict[int, Explanation]:
         """The poses of all bodies."""
-        self._where_expected()
+        self._all_from(self._expected())
+        if len(self.claimed) < len(self.bodies):
+            self._all_from(self._found_at_once())
         away = [k for k in range(len(self.bodies)) if k not in self.claimed]
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._judge_again()
         return self.found
 
-    def _where_expected(self) -> None:
-        """Bodies that are where they are expected, all at once, until nothing changes hands."""
-        places = {
-            k: self._features(k, self.bodies[k].predictions(track, self.frame, self.time_s)[0])
-            for k, track in enumerate(self.tracks)
-            if track.branches and not track.misses and not track.doubted
-        }
-        some, claims = list(places), self._nobody.expected(places, self.rules.gate)
+    def _expected(self) -> dict[int, Starts]:
+        """Where bodies are expected to within their own size: farther off there may be others."""
+        starts = dict[int, Starts]()
+        for k, track in enumerate(self.tracks):
+            if track.branches and not track.misses and not track.doubted:
+                first = self.bodies[k].predictions(track, self.frame, self.time_s)[0]
+                if first.uncertainty[:3].max() < self.bodies[k].body.radius:
+                    starts[k] = (Start(first.T_world_object, first.uncertainty, first),)
+        return starts
+
+    def _found_at_once(self) -> dict[int, Starts]:
+        """Where points in space put bodies that have claimed nothing yet, and rivals of that.
+
+        Of each kind as many as there are, given to those that were nearest.
+        """
+        waiting = [k for k in range(len(self.bodies)) if k not in self.claimed]
+        kinds = list({id(self.bodies[k].body): self.bodies[k] for k in waiting}.values())
+        views = self._nobody.part(self._claims().left(-1))
+        if self._shared is None or any(view.sensor.dimension != 2 for view in views):
+            return {}
+        seen, rules = [view for view in views if not view.observation.is_empty], kinds[0].rules
+        bodies, self.looked = [one.body for one in kinds], len(seen) > 1
+        copies = search_copies(seen, bodies, kinds[0].free, rules.judgement, rules.search)
+        found = dict[int, Starts]()
+        for number, body in enumerate(bodies):
+            some = [one for one in copies if one.kind == number]
+            group = [k for k in waiting if self.bodies[k].body is body]
+            frames = [self._frame(k, self._nobody.left(k)) for k in group]
+            rows = [[c.evidence + one.nearness(c.T_world_object) for c in some] for one in frames]
+            likely = np.reshape(rows, (len(group), len(some)))
+            for i, j in zip(*linear_sum_assignment(likely, maximize=True), strict=True):
+                poses = some[j].T_world_object, some[j].rival
+                found[group[i]] = tuple([Start(T, frames[i].close) for T in poses if T is not None])
+        return found
+
+    def _all_from(self, starts: Mapping[int, Starts]) -> None:
+        """Bodies that are at some poses, all at once, until nothing changes hands."""
+        places = {k: self._features(k, own[0]) for k, own in starts.items()}
+        before = self.claimed
+        some, claims = list(places), self._claims().expected(places, self.rules.gate)
         for _ in range(3):  # neighbours' neighbours are settled by then
-            self.found |= self._at_once(some, claims, places)
-            self.claimed = [
-                k for k, one in self.found.items() if one.frame.first_is(convinces, one.ranked)
+            self.found |= self._at_once({k: starts[k] for k in some}, claims, places)
+            self.claimed = before + [
+                k
+                for k, one in self.found.items()
+                if k not in before and one.frame.first_is(one.frame.trusted, one.ranked)
             ]
             claims = self._claims()
             changed = {k: self.found[k].left ^ claims.left(k) for k in self.claimed}
             some = [
                 k
                 for k, mask in changed.items()
-                if self._are_near(k, mask, self._features(k, self.found[k].ranked[0]))
+                if k in starts
+                and self._are_near(k, mask, self._features(k, self.found[k].ranked[0]))
             ]
             if not some:
                 break
 
     def _at_once(
-        self, some: Sequence[int], claims: Claims, places: Mapping[int, Floats]
+        self, starts: Mapping[int, Starts], claims: Claims, places: Mapping[int, Floats]
     ) -> dict[int, Explanation]:
-        """Bodies around their predictions, by what others leave.
+        """Bodies around their starts, by what others leave.
 
         Those that nothing of the others' is near to see all that is there, and climb together.
         """
-        left = {k: claims.left(k) for k in some}
-        frames = {k: self._frame(k, left[k]) for k in some}
-        if len(some) > 1 and self._shared:
+        left = {k: claims.left(k) for k in starts}
+        frames = {k: self._frame(k, left[k], starts=starts[k]) for k in starts}
+        if len(starts) > 1 and self._shared:
             whole = len(self._shared.totals)
             alike = {
                 k: one
@@ -147,9 +189,9 @@ class Sharing:
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
-        # bodies that are there are not held up
-        is_away = track.misses > self.bodies[k].rules.motion.coasting and self.claimed
-        if is_away and track.misses % self.rules.thorough:
+        # bodies that are there are not held up, and points in space were looked at
+        is_away = self.looked or track.misses > self.bodies[k].rules.motion.coasting
+        if self.claimed and is_away and track.misses % self.rules.thorough:
             data = replace(data, options=replace(data.options, search="live"))
         return Explanation(data, left, self.bodies[k].explain(data))
 
@@ -160,8 +202,13 @@ class Sharing:
         claims = self._nobody.taken(met).without_merged(met, places, self.rules)
         are_fitted = -2 in claims.owners
         for k, one in self.found.items():
-            if not np.array_equal(left := claims.left(k), one.left):
-                data = self._frame(k, left, beside=one.frame.beside, searches=one.frame.searches)
+            # bodies that were found at once tell where each other is
+            beside = one.frame.beside
+            if beside is None and one.frame.is_found_at_once:
+                beside = self._companion(k)
+            changed = not np.array_equal(left := claims.left(k), one.left)
+            if changed or beside is not one.frame.beside:
+                data = self._frame(k, left, beside=beside, searches=one.frame.searches)
                 self.found[k] = Explanation(
                     data, left, judged_again(data, one.ranked, fitted=are_fitted)
                 )
@@ -206,7 +253,7 @@ class Sharing:
         track = self.tracks[k]
         return not track.branches or track.misses > self.bodies[k].rules.motion.coasting
 
-    def _features(self, k: int, pose: Branch | ScoredPose) -> Floats:
+    def _features(self, k: int, pose: Start | ScoredPose) -> Floats:
         return self._nobody.features(self.bodies[k].body, pose.T_world_object)
 
     def _are_near(self, k: int, chosen: Mask, places: Floats) -> bool:
@@ -216,7 +263,7 @@ class Sharing:
 
 
 def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> dict[int, Frame]:
-    """The frames of several bodies with what is climbed from their first predictions, and judged.
+    """The frames of several bodies with what is climbed from their first starts, and judged.
 
     `shared` has all that their sensors see; what is not a body's own is out of its reach.
     """
@@ -225,7 +272,7 @@ def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> di
         for k, one in frames.items()
     }
     starts = {
-        k: Start(one.predictions[0].T_world_object, one.predictions[0].uncertainty)
+        k: one.starts[0]
         for k, one in begun.items()
         if one.options.objective == "matched" and can_be_together(one.body)
     }
@@ -241,5 +288,5 @@ def climbed_together(frames: Mapping[int, Frame], shared: SharedDensities) -> di
             cases.append(case_of(begun[k], fits[k], start))
     judged = judge_together(cases, first.free, first.rules.judgement) if cases else []
     for (k, fit), pose in zip(fits.items(), judged, strict=True):
-        begun[k] = replace(begun[k], together=(fit, pose))
+        begun[k] = replace(begun[k], together=(starts[k], fit, pose))
     return begun

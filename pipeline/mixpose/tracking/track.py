@@ -137,6 +137,8 @@ class Track:
     known: bool = False  # whether it was told from things that have three markers alike
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
+    # (3, n, n) between identical bodies, of which this is the first; see `identity`
+    distances: Floats | None = None
 
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""

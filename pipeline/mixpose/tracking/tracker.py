@@ -12,16 +12,16 @@ from scipy.special import expit
 
 from mixpose.body import Body
 from mixpose.fit import EstimatorOptions, Fit
-from mixpose.judgement import APART, ScoredPose, Verdict, convinces, insert
+from mixpose.judgement import APART, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, of_other_things
-from mixpose.tracking.frame import Frame, Setup, follow
+from mixpose.tracking.frame import Frame, Setup, Start, follow
 from mixpose.tracking.in_motion import delays_after
-from mixpose.tracking.likelihood import Start, likelihood_of
+from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
@@ -142,7 +142,7 @@ class Tracker(Setup):
                     for refine in self.refinements:
                         for better in refine(data, likelihood, judged):
                             consider(better, refine.__name__)
-            if quickly and not data.first_is(convinces, ranked):
+            if quickly and not data.first_is(data.trusted, ranked):
                 break
             quickly = False
         return ranked
@@ -247,7 +247,8 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         tallies=dict(zip(used.names, tallies)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,
-        known=is_ok or of_other_things(data, best) < data.rules.acceptance.log_doubt,
+        known=is_ok
+        or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
         doubted=not is_ok,
     )

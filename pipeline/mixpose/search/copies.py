@@ -1,0 +1,145 @@
+"""Poses of many bodies at once: points in space as features of any of them, shared out.
+
+Points where rays of several cameras meet are those of all bodies.  Triangles of them that are no
+larger than a body are its features', as `from_point_triples` has it; and what is found goes to the
+set of poses of which no two have the same detections, the more evident having what both meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mixpose.body import Body
+from mixpose.judgement import JudgementRules, paid_by_count
+from mixpose.objective import View
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import transform
+from mixpose.search.from_points import (
+    TriangulatedPoints,
+    by_promise,
+    feature_triangles,
+    of_triples,
+    triangulate,
+)
+from mixpose.search.poses import count_inliers, label_image, matches_of, odds_at, unlike
+from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
+
+
+class _Candidates(NamedTuple):
+    """Poses of one body."""
+
+    poses: Floats  # (K, 4, 4)
+    evidence: Floats  # (K,) log odds against clutter, if they had not been chosen to fit
+    numbers: Indices  # (K, L N) detections of all cameras that they meet; -1 for none
+
+
+class Copy(NamedTuple):
+    """A pose of one of several bodies, and the next best of it by some of the same detections."""
+
+    kind: int  # which of the bodies
+    T_world_object: Floats  # (4, 4)
+    evidence: float
+    rival: Floats | None  # (4, 4)
+
+
+def search_copies(
+    views: Sequence[View],
+    bodies: Sequence[Body],
+    free: Mask,
+    rules: JudgementRules = JudgementRules(),
+    budget: SearchBudget = THOROUGH,
+) -> list[Copy]:
+    """Find poses of bodies, any number of each, that explain a frame together; most evident first.
+
+    By detections of two cameras or more that meet in space; there are none without.
+    """
+    detections = sensor_detections(views, bodies[0])
+    problems = [SearchProblem(detections, body, free, np.eye(4), rules, budget) for body in bodies]
+    cameras = problems[0].cameras
+    if len(cameras) < 2 or not free.all():
+        return []
+    reaches = [problems[0].reach(sensor) for sensor, _ in cameras]
+    points = triangulate([rays for _, rays in cameras], reaches, budget.min_sine)
+    points = by_promise(problems[0], points)
+    found = [_candidates(problem, points) for problem in problems]
+    return _shared_out(found, bodies, budget)
+
+
+def _candidates(problem: SearchProblem, points: TriangulatedPoints) -> _Candidates:
+    """Poses of one body that put triangles of it onto triangles of points, and what they meet."""
+    body, budget = problem.body, problem.budget
+    triangles = feature_triangles(body, 6 * budget.sample, budget.min_sine)
+    poses = np.zeros((0, 4, 4))
+    if len(triangles[0]):
+        triples = _near_triples(points, float(triangles[1].data.max()), budget.batch)
+        poses = of_triples(problem, points, triangles, triples)
+        poses = poses[unlike(body, poses, budget.alike)]
+    if not len(poses):
+        return _Candidates(poses, np.zeros(0), np.zeros((0, 1), dtype=np.intp))
+    images = [label_image(problem, *camera) for camera in problem.cameras]
+    counts, near = count_inliers(images, body, poses)
+    ranks = counts.sum(axis=0) + 0.1 * near
+    poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]
+    matches = matches_of(problem, poses)
+    begins = np.cumsum([0, *(len(sensor.points) for sensor, _ in problem.cameras)])
+    met = matches.detections >= 0
+    numbers = np.where(met, matches.detections + begins[:-1, None], -1).reshape(len(poses), -1)
+    odds = odds_at(problem, matches)
+    # against each other they are as free to fit
+    possible = paid_by_count(odds, matches, problem.free) > budget.hopeless
+    return _Candidates(poses[possible], (odds[0] + odds[1])[possible], numbers[possible])
+
+
+def _near_triples(points: TriangulatedPoints, longest: float, most: int) -> Indices:
+    """Triples (K, 3) of points that share no ray and are as near to each other as features are.
+
+    The most promising first, so many at most.
+    """
+    reach = longest + 2 * float(points.tolerance.max(initial=0.0))
+    pairs = cKDTree(points.points).query_pairs(reach, output_type="ndarray")
+    count = len(points.points)
+    rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
+    pairs = pairs[(rays[pairs[:, 0], :, None] != rays[pairs[:, 1], None]).all(axis=(1, 2))]
+    are_near = np.zeros((count, count), dtype=np.bool_)
+    are_near[pairs[:, 0], pairs[:, 1]] = True
+    # i < j < k, each pair of them near
+    pair, third = np.nonzero(are_near[pairs[:, 0]] & are_near[pairs[:, 1]])
+    first = np.argsort(third, kind="stable")[:most]
+    return np.column_stack([pairs[pair], third])[first]
+
+
+def _are_alike(body: Body, a: Floats, b: Floats, budget: SearchBudget) -> bool:
+    """Whether two poses (4, 4) put the body, symmetries aside, into the same place."""
+    away = transform(a @ body.symmetries, body.means) - transform(b, body.means)
+    return bool(np.linalg.norm(away, axis=-1).max(axis=-1).min() < budget.alike * body.radius)
+
+
+def _shared_out(
+    found: Sequence[_Candidates], bodies: Sequence[Body], budget: SearchBudget
+) -> list[Copy]:
+    """The poses of which no two have the same detections, the most evident first."""
+    kinds = np.repeat(np.arange(len(found)), [len(one.poses) for one in found]).tolist()
+    poses = np.concatenate([one.poses for one in found])
+    evidence = np.concatenate([one.evidence for one in found])
+    rows = [row[row >= 0].tolist() for one in found for row in one.numbers]
+    owners, rivals = dict[int, int](), dict[int, int]()
+    order = np.argsort(-evidence, kind="stable")
+    kept = list[int]()
+    for k in order.tolist():
+        others = [owners[number] for number in rows[k] if number in owners]
+        if len(others) <= (1 - budget.convincing) * len(rows[k]):
+            kept.append(k)
+            owners = dict.fromkeys(rows[k], k) | owners
+            continue
+        for j in set(others) - set(rivals):
+            is_near = kinds[j] == kinds[k] and evidence[k] > evidence[j] - budget.outdone
+            if is_near and not _are_alike(bodies[kinds[k]], poses[j], poses[k], budget):
+                rivals[j] = k
+    return [
+        Copy(kinds[k], poses[k], float(evidence[k]), poses[rivals[k]] if k in rivals else None)
+        for k in kept
+    ]

@@ -1,0 +1,79 @@
+"""Poses of all bodies of a frame, from the points that cameras see together."""
+
+from __future__ import annotations
+
+import numpy as np
+from bodies_in_view import CAMERAS, at, body
+from detections import ALL_FREE
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import PointPattern
+from mixpose.rigid import transform
+from mixpose.search import search_copies
+from mixpose.search.from_points import feature_triangles
+
+Floats = NDArray[np.float64]
+
+# equal sides but for a hundredth, and a triangle of its own
+TRIANGLE = body("triangle", np.array([[0.0, 0, 0], [43.0, 0, 0], [21.4, 37.5, 0]]))
+HEAD = body("head", np.array([[0.0, 0, 0], [42.0, 0, 0], [11.0, 49.5, 0]]))
+PLACES = [at(-150.0), at(-60.0, 90.0, turn=0.7), at(40.0, -80.0, turn=-0.5), at(130.0, 30.0)]
+
+
+def seen(bodies: list[Body], poses: list[Floats], seed: int, cameras: int = 2) -> list[View]:
+    """With 0.15 px of noise, and ten false spots each."""
+    rng, views = np.random.default_rng(seed), []
+    for name, one in list(CAMERAS.items())[:cameras]:
+        spots = [one.project(transform(T, b.means))[0] for b, T in zip(bodies, poses, strict=True)]
+        points = rng.permutation(
+            np.concatenate([*spots, rng.uniform([0, 0], [1280, 1024], (10, 2))])
+        )
+        points = points + 0.15 * rng.standard_normal(points.shape)
+        views.append(View(name, one, Observation(PointPattern(points, np.ones(len(points))), 1.5)))
+    return views
+
+
+def test_equal_triangles_and_another_one_are_found_at_once_each_in_its_place() -> None:
+    there = [TRIANGLE, HEAD, TRIANGLE, TRIANGLE]
+    for seed in range(10):
+        found = search_copies(seen(there, PLACES, seed), [TRIANGLE, HEAD], ALL_FREE)
+        best = found[:4]
+        assert sorted(one.kind for one in best) == [0, 0, 0, 1]
+        middles = [transform(T, b.means).mean(axis=0) for b, T in zip(there, PLACES, strict=True)]
+        nearest = []
+        for one in best:
+            own = transform(one.T_world_object, [TRIANGLE, HEAD][one.kind].means).mean(axis=0)
+            away = np.linalg.norm(middles - own, axis=1)
+            nearest.append(int(away.argmin()))
+            # of 0.15 px at 1200 mm and 1000 px, two rays at 57° to each other
+            assert away.min() < 1.5
+        assert sorted(nearest) == [0, 1, 2, 3]
+
+
+def test_no_two_poses_have_the_same_markers() -> None:
+    only, *rest = search_copies(seen([TRIANGLE], PLACES[:1], 0), [TRIANGLE], ALL_FREE)
+    middle = transform(only.T_world_object, TRIANGLE.means).mean(axis=0)
+    others = [transform(one.T_world_object, TRIANGLE.means).mean(axis=0) for one in rest]
+    assert all(np.linalg.norm(one - middle) > 20.0 for one in others)
+
+
+def test_another_point_that_may_be_a_marker_makes_a_rival() -> None:
+    # a fourth marker, as far from two of the triangle as the third, on the other side of both
+    pair = body("pair", np.concatenate([TRIANGLE.means, [[21.4, -37.5, 0.0]]]))
+    found = search_copies(seen([pair], PLACES[:1], 1), [TRIANGLE], ALL_FREE)
+    assert found[0].rival is not None
+
+
+def test_one_camera_sees_no_points_in_space() -> None:
+    views = seen([TRIANGLE, TRIANGLE], PLACES[:2], 0, cameras=1)
+    assert search_copies(views, [TRIANGLE], ALL_FREE) == []
+
+
+def test_of_triangles_that_symmetries_map_to_each_other_one_is_tried() -> None:
+    corners, _ = feature_triangles(TRIANGLE, 48, 0.02)
+    assert len(TRIANGLE.symmetries) == 6
+    assert corners.tolist() == [[0, 1, 2]]
+    assert len(feature_triangles(HEAD, 48, 0.02)[0]) == 6
