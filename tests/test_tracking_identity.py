@@ -3,48 +3,57 @@
 from __future__ import annotations
 
 from itertools import permutations
-from math import log1p
+from math import log, sqrt
 
 import numpy as np
 import pytest
 from bodies_in_view import TOOL, at, body, off, scene_of, views_of
+from scipy.stats import t as student
 
 from mixpose.records import Indices
-from mixpose.tracking.identity import Assignment, distances_after, no_distances
-from mixpose.tracking.motion import MotionRules
+from mixpose.tracking.identity import Assignment
+from mixpose.tracking.motion import Distances, MotionRules
 
-DEGREES = 3.0
+DEGREES, ROOM = 3.0, 900.0
 
 
-def drawn(seed: int, bodies: int = 5, poses: int = 5) -> Assignment:
-    """Bodies that have poses, and distances, by chance; what is known of two of them is nothing."""
+def drawn(seed: int, bodies: int = 5, poses: int = 5, *, hidden: int = 0) -> Assignment:
+    """Bodies that have poses, and distances, by chance; two of them were never seen together.
+
+    Each was `hidden` for so many frames at the most.
+    """
     rng = np.random.default_rng(seed)
     likely = np.column_stack([rng.normal(0.0, 6.0, (bodies, poses)), np.zeros(bodies)])
     places = np.concatenate([rng.uniform(0.0, 300.0, (poses, 3)), np.full((1, 3), np.nan)])
     before = rng.uniform(50.0, 300.0, (bodies, bodies))
     before = (before + before.T) / 2
     before[0, 1] = before[1, 0] = np.nan
-    sums = np.array([before, np.full_like(before, 800.0), np.full_like(before, 2.0)])
+    missed = np.add.outer(*2 * [rng.integers(0, hidden + 1, bodies)])
+    known = Distances(before, np.full_like(before, 800.0), np.full_like(before, 2.0), missed)
     now = np.linalg.norm(places[:, None] - places, axis=2)
-    return Assignment(likely, sums, now, DEGREES)
+    return Assignment(likely, known, now, DEGREES, ROOM)
 
 
 def log_likelihood(one: Assignment, given: Indices) -> float:
     """Written out: of each body its pose, of each pair of them the change of its distance."""
-    total, (before, squares, count) = 0.0, one.before
+    total, (before, squares, count, missed) = 0.0, one.before
     for i, p in enumerate(given):
         total += one.likely[i, p]
         for j in range(i):
-            off = one.now[p, given[j]] - before[i, j]
-            if np.isfinite(off):
-                scaled = off**2 / (squares[i, j] / count[i, j])
-                total -= 0.5 * (DEGREES + 1) * log1p(scaled / DEGREES)
+            now, scale = one.now[p, given[j]], sqrt(squares[i, j] / count[i, j])
+            if np.isnan(now):
+                continue
+            if np.isnan(before[i, j]):
+                total -= log(ROOM)
+            else:
+                scale *= 1 + missed[i, j]
+                total += student.logpdf(now, DEGREES, before[i, j], scale)
     return total
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_odds_of_an_exchange_are_those_of_all_bodies_together(seed: int) -> None:
-    one, given = drawn(seed), np.array([3, 1, 5, 0, 4])  # the third has no pose
+    one, given = drawn(seed, hidden=2), np.array([3, 1, 5, 0, 4])  # the third has no pose
     odds = one.exchanged(given)
     for i, j in permutations(range(5), 2):
         other = given.copy()
@@ -66,17 +75,20 @@ def test_exchanges_of_two_lead_to_the_likeliest_assignment() -> None:
 
 def test_changes_of_distance_are_learnt_where_both_bodies_are_seen() -> None:
     rules, places = MotionRules(), np.array([[0.0, 0, 0], [30.0, 0, 0], [0, 40.0, 0]])
-    first = distances_after(no_distances(3, 25.0, rules), places, rules)
-    np.testing.assert_allclose(first[0], [[0, 30, 40], [30, 0, 50], [40, 50, 0]])
+    unknown = Distances.unknown(3, 25.0, rules)
+    first = unknown.after(places, rules)
+    np.testing.assert_allclose(first.last, [[0, 30, 40], [30, 0, 50], [40, 50, 0]])
     # nothing is known to have changed yet
-    np.testing.assert_allclose(first[1:], no_distances(3, 25.0, rules)[1:])
+    np.testing.assert_allclose(first[1:], unknown[1:])
     moved = places + np.array([[0, 0, 0], [6.0, 0, 0], [np.nan, 0, 0]])
-    after = distances_after(first, moved, rules)
-    guess = rules.guess_weight
-    assert after[1, 0, 1] == pytest.approx(rules.recall * guess * 25.0**2 + 6.0**2)
-    assert after[2, 0, 1] == pytest.approx(rules.recall * guess + 1)
-    assert np.isnan(after[0, 0, 2])
-    assert after[2, 0, 2] == guess
+    after, guess = first.after(moved, rules), rules.guess_weight
+    assert after.squares[0, 1] == pytest.approx(rules.recall * guess * 25.0**2 + 6.0**2)
+    assert after.numbers[0, 1] == pytest.approx(rules.recall * guess + 1)
+    # of a body that is hidden the last distance is remembered, and how long ago that was
+    assert (after.last[0, 2], after.numbers[0, 2], after.missed[0, 2]) == (40.0, guess, 1.0)
+    back = after.after(places + np.array([[0.0, 0, 0], [6.0, 0, 0], [0, 8.0, 0]]), rules)
+    assert back.squares[0, 2] == pytest.approx(rules.recall * guess * 25.0**2 + (8.0 / 2) ** 2)
+    assert (back.missed == 0).all()
 
 
 def test_bodies_that_move_together_farther_than_they_are_apart_keep_their_numbers() -> None:

@@ -4,15 +4,17 @@ Nothing in a frame tells identical bodies apart; only where they were before doe
 of densities p_k, and distances d_kj between bodies that change by s_kj from frame to frame, poses x
 are given to bodies by the assignment a of the largest
 
-    Σ_k ln p_k(x_a(k)) + Σ_k<j ln t((|x_a(k) − x_a(j)| − d_kj) / s_kj),
+    Σ_k ln p_k(x_a(k)) + Σ_k<j ln [t((|x_a(k) − x_a(j)| − d_kj) / s_kj) / s_kj],
 
-of Student's t, as velocities and changes of distance are of few frames.  It is found from that of
-the first sum by exchanges of two; what one more exchange leaves of the odds is how far two bodies
-are in doubt.
+of Student's t, as velocities and changes of distance are of few frames.  Bodies that were not seen
+for m frames have distances that may have changed by m + 1 times as much, and pairs never seen
+together any up to where bodies may be.  It is found from that of the first sum by exchanges of two;
+what one more exchange leaves of the odds is how far two bodies are in doubt.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -22,41 +24,22 @@ from scipy.optimize import linear_sum_assignment
 
 from mixpose.judgement import ScoredPose
 from mixpose.records import Floats, Indices
-from mixpose.tracking.motion import MotionRules
+from mixpose.tracking.motion import Distances
 from mixpose.tracking.sharing import Explanation
 
 # poses that a body may have instead of its own, with odds; its own, with those that it has none
 Rivals: TypeAlias = list[tuple[ScoredPose, float]]
 
 
-def distances_after(before: Floats, places: Floats, rules: MotionRules) -> Floats:
-    """Distances (n, n) between bodies at places (n, 3), and the sums that tell how they change.
-
-    With sums of squared changes and their numbers (3, n, n) in all; NaN where one of two has no
-    place, and at first.
-    """
-    now = np.linalg.norm(places[:, None] - places, axis=2)
-    changes, (_, squares, count) = now - before[0], before
-    is_seen, changes = np.isfinite(changes), np.nan_to_num(changes)
-    squares = np.where(is_seen, rules.recall * squares + changes**2, squares)
-    return np.array([now, squares, np.where(is_seen, rules.recall * count + 1, count)])
-
-
-def no_distances(count: int, radius: float, rules: MotionRules) -> Floats:
-    """The same before anything was seen (3, n, n): changes are about as large as the body."""
-    guess = np.array([np.nan, (rules.unknown[0] * radius) ** 2, 1.0])
-    guess[1:] *= rules.guess_weight
-    return np.broadcast_to(guess[:, None, None], (3, count, count))
-
-
 @dataclass(frozen=True)
 class Assignment:
     """How likely n bodies have m poses, or none, and pairs of them their distances."""
 
-    likely: Floats  # (n, m + 1) log densities; 0 of none, in the last column
-    before: Floats  # (3, n, n) as of `distances_after`
+    likely: Floats  # (n, m + 1) log densities; of none in the last column
+    before: Distances  # between the bodies
     now: Floats  # (m + 1, m + 1) distances between poses; NaN of none
     degrees: float  # of Student's t
+    room: float  # largest distance of two of which nothing is known
 
     def best(self) -> Indices:
         """The likeliest poses (n,), from the likeliest one by one, by exchanges of two."""
@@ -74,13 +57,8 @@ class Assignment:
 
     def exchanged(self, given: Indices) -> Floats:
         """How much likelier two bodies (n, n) have each other's poses than their own."""
-        away, squares, count = self.before
         # of body i with the pose of body j, beside that of body k
-        off = self.now[given][:, given][None] - away[:, None]
-        squared = off**2 * (count / np.maximum(squares, 1e-12))[:, None]
-        terms = np.nan_to_num(np.log1p(squared / self.degrees))
-        terms *= -0.5 * (self.degrees + 1)
-        i = np.arange(len(given))
+        terms, i = self._likely_distances(self.now[given][:, given]), np.arange(len(given))
         # beside all but the two that change; the distance between these stays
         beside = terms.sum(axis=2) - terms[i, :, i] - terms[:, i, i]
         stays = terms[i, i]
@@ -91,28 +69,42 @@ class Assignment:
         np.fill_diagonal(odds, -np.inf)
         return np.asarray(odds)
 
+    def _likely_distances(self, now: Floats) -> Floats:
+        """Log densities (n, n, n) of bodies i to be as far from k as j is now (n, n); 0 of none."""
+        n, before = self.degrees, self.before
+        squared = np.maximum(before.squares / before.numbers, 1e-12) * (1 + before.missed) ** 2
+        off = (now - before.last[:, None]) ** 2 / squared[:, None]
+        peak = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+        known = peak - 0.5 * (n + 1) * np.log1p(off / n) - 0.5 * np.log(squared)[:, None]
+        logs = np.where(np.isnan(off), -math.log(self.room), known)
+        return np.where(np.isnan(now), 0.0, logs)
+
 
 def identify(
-    group: Sequence[int], found: Mapping[int, Explanation], before: Floats
+    group: Sequence[int], found: Mapping[int, Explanation], before: Distances
 ) -> tuple[dict[int, int], dict[int, Rivals]]:
     """Tell which of some identical bodies found the pose of each, and which are in doubt.
 
-    By distances between them (3, n, n) before, as of `distances_after`.
+    By distances between them before.
     """
     bests = {k: best for k in group if (best := found[k].verdict.best) is not None}
     finders = sorted(bests, key=lambda k: tuple(np.round(bests[k].T_world_object[:3, 3], 6)))
     poses, known = [bests[k] for k in finders], [k for k in group if found[k].frame.predictions]
     data = [found[k].frame for k in known]
-    # by body (rows) and pose; in the last column none, which says nothing
-    rows = [[*(one.nearness(pose.T_world_object) for pose in poses), 0.0] for one in data]
+    # by body (rows) and pose; in the last column none, as it is of one in view now and then
+    rules, rows = found[group[0]].frame.rules, list[list[float]]()
+    for one in data:
+        hidden = 0.5 if one.track.misses else rules.motion.hidden
+        logs = [math.log1p(-hidden) + one.nearness(pose.T_world_object) for pose in poses]
+        rows.append([*logs, math.log(hidden)])
     places = np.array([*(pose.T_world_object[:3, 3] for pose in poses), np.full(3, np.nan)])
-    rules = found[group[0]].frame.rules
     chosen = [group.index(k) for k in known]
     assignment = Assignment(
         np.reshape(rows, (len(known), len(poses) + 1)),
-        before[:, chosen][:, :, chosen],
+        before.of(chosen),
         np.linalg.norm(places[:, None] - places, axis=2),
         rules.motion.known_from,
+        rules.judgement.detection.room * found[group[0]].frame.body.radius,
     )
     given = assignment.best()
     pose_of = {k: j for k, j in zip(known, given.tolist()) if j < len(poses)}

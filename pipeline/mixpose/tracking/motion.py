@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -44,6 +45,7 @@ class MotionRules:
         1.5, "of the mean square: steps that follow each other are alike, so that errors add up"
     )
     surprise: float = constant(0.02, "chance per frame that the body is somewhere else")
+    hidden: float = constant(0.05, "chance per frame that a body in view is not found in the next")
     beside: float = constant(
         0.5, "weight of where another body lets a lost one be expected: a wrong one costs half"
     )
@@ -100,6 +102,39 @@ class RandomWalk:
     def variance(self, elapsed: float) -> Floats:
         """Variance (6,) of the displacement in a time."""
         return np.asarray(self.rules.persistence * self.rates / self.count * elapsed)
+
+
+class Distances(NamedTuple):
+    """What is known of distances (n, n) between identical bodies, and how these change."""
+
+    last: Floats  # NaN of two that were never seen together
+    squares: Floats  # sums of squared changes per frame,
+    numbers: Floats  # and how many there were; both fade
+    missed: Floats  # frames since the last
+
+    @classmethod
+    def unknown(cls, bodies: int, radius: float, rules: MotionRules) -> Distances:
+        """Before anything was seen: changes are about as large as a body of that radius."""
+        guess = (rules.unknown[0] * radius) ** 2
+        start = np.array([np.nan, rules.guess_weight * guess, rules.guess_weight, 0.0])
+        return cls(*np.broadcast_to(start[:, None, None], (4, bodies, bodies)))
+
+    def after(self, places: Floats, rules: MotionRules) -> Distances:
+        """With one more frame, of bodies at places (n, 3); NaN of those without."""
+        now = np.linalg.norm(places[:, None] - places, axis=2)
+        is_seen, changes = np.isfinite(now), (now - self.last) / (1 + self.missed)
+        is_change = np.isfinite(changes)
+        squares = rules.recall * self.squares + np.nan_to_num(changes) ** 2
+        return Distances(
+            np.where(is_seen, now, self.last),
+            np.where(is_change, squares, self.squares),
+            np.where(is_change, rules.recall * self.numbers + 1, self.numbers),
+            np.where(is_seen, 0.0, self.missed + 1),
+        )
+
+    def of(self, chosen: Sequence[int]) -> Distances:
+        """Those of some of the bodies."""
+        return Distances(*[one[np.ix_(chosen, chosen)] for one in self])
 
 
 class Expected(NamedTuple):

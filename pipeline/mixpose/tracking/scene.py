@@ -29,7 +29,8 @@ from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
 from mixpose.sensors import Sensor
 from mixpose.tracking.doubt import look_alikes_of
-from mixpose.tracking.identity import Rivals, distances_after, identify, no_distances
+from mixpose.tracking.identity import Rivals, identify
+from mixpose.tracking.motion import Distances
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track
@@ -62,17 +63,17 @@ class Scene:
             return (track,), [estimate]
         found = Sharing(self.bodies, tracks, frame, time_s, views, self.rules).explained()
         finders, rivals = {k: k for k in found}, dict[int, Rivals]()
-        apart = dict[int, Floats]()
+        apart = dict[int, Distances]()
         for name in {one.body.name for one in self.bodies if one.instance is not None}:
             group = [k for k, one in enumerate(self.bodies) if one.body.name == name]
             motion, before = self.bodies[group[0]].rules.motion, tracks[group[0]].distances
             if before is None:
-                before = no_distances(len(group), self.bodies[group[0]].body.radius, motion)
+                radius = self.bodies[group[0]].body.radius
+                before = Distances.unknown(len(group), radius, motion)
             given, exchanged = identify(group, found, before)
             finders, rivals = finders | given, rivals | exchanged
-            apart[group[0]] = distances_after(
-                before, _places([found[given[k]] for k in group]), motion
-            )
+            places = _places([found[given[k]] for k in group])
+            apart[group[0]] = before.after(places, motion)
         told = {k: _in_doubt(found[finders[k]].verdict, rivals.get(k, [])) for k in found}
         sure, after, estimates = [k for k in told if told[k].status == "ok"], [], []
         for k, tracked in enumerate(self.bodies):

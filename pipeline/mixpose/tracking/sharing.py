@@ -149,9 +149,20 @@ class Sharing:
             }
             frames |= climbed_together(alike, self._shared)
         return {
-            k: Explanation(one, left[k], self.bodies[k].explain(one, quickly=True))
+            k: Explanation(
+                one,
+                left[k],
+                self.bodies[k].explain(one, quickly=True) if self._is_near(one) else [],
+            )
             for k, one in frames.items()
         }
+
+    def _is_near(self, data: Frame) -> bool:
+        """Whether a fit may begin at σ_ε; others wait for what points in space say."""
+        if self._shared is None or len(data.views) < 2 or not data.starts:
+            return True
+        values = data.finest.value(data.starts[0].T_world_object[None])
+        return bool(values[0] >= data.rules.fit.near * len(data.views))
 
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
@@ -189,11 +200,14 @@ class Sharing:
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
-        # bodies that are there are not held up, and points in space were looked at
-        is_away = self.looked or track.misses > self.bodies[k].rules.motion.coasting
-        if self.claimed and is_away and track.misses % self.rules.thorough:
+        # bodies that are there are not held up
+        is_due = not self.claimed or (self.frame + k) % self.rules.thorough == 0
+        if not is_due and track.misses > self.bodies[k].rules.motion.coasting:
             data = replace(data, options=replace(data.options, search="live"))
-        return Explanation(data, left, self.bodies[k].explain(data))
+        # points in space were looked at
+        return Explanation(
+            data, left, self.bodies[k].explain(data, quickly=self.looked and not is_due)
+        )
 
     def _judge_again(self) -> None:
         """Judge poses for which other detections are left by now; without merged ones, fit them."""

@@ -16,7 +16,7 @@ from mixpose.objective import View
 from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
-from mixpose.tracking.motion import Course, MotionRules, RandomWalk, per_kind
+from mixpose.tracking.motion import Course, Distances, MotionRules, RandomWalk, per_kind
 from mixpose.tracking.static_clutter import StaticClutter
 
 
@@ -137,8 +137,7 @@ class Track:
     known: bool = False  # whether it was told from things that have three markers alike
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
-    # (3, n, n) between identical bodies, of which this is the first; see `identity`
-    distances: Floats | None = None
+    distances: Distances | None = None  # between identical bodies, of which this is the first
 
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
