@@ -200,14 +200,14 @@ class Sharing:
     def _everywhere(self, k: int, left: Mask, track: Track) -> Explanation:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
+        coasting = self.bodies[k].rules.motion.coasting
         # bodies that are there are not held up
-        is_due = not self.claimed or (self.frame + k) % self.rules.thorough == 0
-        if not is_due and track.misses > self.bodies[k].rules.motion.coasting:
+        is_due = track.misses % self.rules.thorough == (coasting if track.branches else 0)
+        if self.claimed and not is_due and track.misses > coasting:
             data = replace(data, options=replace(data.options, search="live"))
         # points in space were looked at
-        return Explanation(
-            data, left, self.bodies[k].explain(data, quickly=self.looked and not is_due)
-        )
+        quickly = bool(self.looked and self.claimed and not is_due)
+        return Explanation(data, left, self.bodies[k].explain(data, quickly=quickly))
 
     def _judge_again(self) -> None:
         """Judge poses for which other detections are left by now; without merged ones, fit them."""
