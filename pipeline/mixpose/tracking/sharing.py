@@ -25,6 +25,7 @@ from mixpose.tracking.claims import Claims, Met
 from mixpose.tracking.doubt import decided
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import MatchedLikelihood, case_of
+from mixpose.tracking.proposers import predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
 from mixpose.tracking.tracker import Tracker, judged_again
@@ -148,20 +149,18 @@ class Sharing:
                 and not self._are_near(k, ~left[k], places[k])
             }
             frames |= climbed_together(alike, self._shared)
-        return {
-            k: Explanation(
-                one,
-                left[k],
-                self.bodies[k].explain(one, quickly=True) if self._is_near(one) else [],
-            )
-            for k, one in frames.items()
-        }
+        found = dict[int, Explanation]()
+        for k, one in frames.items():
+            is_near = self._is_near(one, one.starts[0])
+            ranked = self.bodies[k].explain(one, quickly=True) if is_near else []
+            found[k] = Explanation(one, left[k], ranked)
+        return found
 
-    def _is_near(self, data: Frame) -> bool:
-        """Whether a fit may begin at σ_ε; others wait for what points in space say."""
-        if self._shared is None or len(data.views) < 2 or not data.starts:
+    def _is_near(self, data: Frame, start: Start) -> bool:
+        """Whether a fit may begin at σ_ε; from farther off, points in space lead there."""
+        if self._shared is None or len(data.views) < 2:
             return True
-        values = data.finest.value(data.starts[0].T_world_object[None])
+        values = data.finest.value(start.T_world_object[None])
         return bool(values[0] >= data.rules.fit.near * len(data.views))
 
     def _on_the_rest(self, waiting: list[int]) -> None:
@@ -205,9 +204,13 @@ class Sharing:
         is_due = track.misses % self.rules.thorough == (coasting if track.branches else 0)
         if self.claimed and not is_due and track.misses > coasting:
             data = replace(data, options=replace(data.options, search="live"))
+        if not (self.looked and self.claimed) or is_due:
+            return Explanation(data, left, self.bodies[k].explain(data))
         # points in space were looked at
-        quickly = bool(self.looked and self.claimed and not is_due)
-        return Explanation(data, left, self.bodies[k].explain(data, quickly=quickly))
+        near = tuple(one for one in predicted(data, []) if self._is_near(data, one))
+        data = replace(data, starts=near)
+        ranked = self.bodies[k].explain(data, quickly=True) if near else []
+        return Explanation(data, left, ranked)
 
     def _judge_again(self) -> None:
         """Judge poses for which other detections are left by now; without merged ones, fit them."""
