@@ -25,7 +25,14 @@ from mixpose.search.from_points import (
     of_triples,
     triangulate,
 )
-from mixpose.search.poses import count_inliers, label_image, matches_of, odds_at, unlike
+from mixpose.search.poses import (
+    LabelImage,
+    count_inliers,
+    label_image,
+    matches_of,
+    odds_at,
+    unlike,
+)
 from mixpose.search.problem import THOROUGH, SearchBudget, SearchProblem, sensor_detections
 
 
@@ -65,11 +72,14 @@ def search_copies(
     reaches = [problems[0].reach(sensor) for sensor, _ in cameras]
     points = triangulate([rays for _, rays in cameras], reaches, budget.min_sine)
     points = by_promise(problems[0], points)
-    found = [_candidates(problem, points) for problem in problems]
+    images = [label_image(problems[0], *camera) for camera in cameras]
+    found = [_candidates(problem, points, images) for problem in problems]
     return _shared_out(found, bodies, budget)
 
 
-def _candidates(problem: SearchProblem, points: TriangulatedPoints) -> _Candidates:
+def _candidates(
+    problem: SearchProblem, points: TriangulatedPoints, images: Sequence[LabelImage]
+) -> _Candidates:
     """Poses of one body that put triangles of it onto triangles of points, and what they meet."""
     body, budget = problem.body, problem.budget
     triangles = feature_triangles(body, 6 * budget.sample, budget.min_sine)
@@ -80,7 +90,6 @@ def _candidates(problem: SearchProblem, points: TriangulatedPoints) -> _Candidat
         poses = poses[unlike(body, poses, budget.alike)]
     if not len(poses):
         return _Candidates(poses, np.zeros(0), np.zeros((0, 1), dtype=np.intp))
-    images = [label_image(problem, *camera) for camera in problem.cameras]
     counts, near = count_inliers(images, body, poses)
     ranks = counts.sum(axis=0) + 0.1 * near
     poses = poses[np.argsort(-ranks, kind="stable")[: budget.shortlist]]

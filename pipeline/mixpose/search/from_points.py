@@ -115,10 +115,11 @@ def by_promise(problem: SearchProblem, points: TriangulatedPoints) -> Triangulat
             support += met
             error += np.where(met, away / problem.reach(sensor), 0.0)
         left = np.ones(len(places), dtype=np.bool_)
+        beside = cKDTree(places).query_ball_point(places, points.tolerance, p=np.inf)
         for k in np.lexsort((error / np.maximum(support, 1.0), -support)):
             if left[k] and len(kept) < most:
                 kept.append(k)
-                left &= np.abs(places - places[k]).max(axis=1) > points.tolerance[k]
+                left[beside[k]] = False
         first = np.array(kept, dtype=np.intp)
     return TriangulatedPoints._make(array[first] for array in points)
 

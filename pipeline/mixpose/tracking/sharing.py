@@ -206,8 +206,9 @@ class Sharing:
             data = replace(data, options=replace(data.options, search="live"))
         if not (self.looked and self.claimed) or is_due:
             return Explanation(data, left, self.bodies[k].explain(data))
-        # points in space were looked at
-        near = tuple(one for one in predicted(data, []) if self._is_near(data, one))
+        # points in space were looked at: about where it must be, if it was there just now
+        around = predicted(data, [])
+        near = tuple(one for one in around if not track.misses or self._is_near(data, one))
         data = replace(data, starts=near)
         ranked = self.bodies[k].explain(data, quickly=True) if near else []
         return Explanation(data, left, ranked)
@@ -219,12 +220,15 @@ class Sharing:
         claims = self._nobody.taken(met).without_merged(met, places, self.rules)
         are_fitted = -2 in claims.owners
         for k, one in self.found.items():
-            # bodies that were found at once tell where each other is
-            beside = one.frame.beside
-            if beside is None and one.frame.is_found_at_once:
+            beside, changed = one.frame.beside, one.left ^ (left := claims.left(k))
+            is_changed = bool(changed.any())
+            if k in places and one.verdict.status == "ok":
+                # what is gone from around a body makes clutter a little less likely
+                is_changed = is_changed and self._are_near(k, changed, places[k])
+            elif beside is None and one.frame.is_found_at_once:
+                # bodies that were found at once tell where each other is
                 beside = self._companion(k)
-            changed = not np.array_equal(left := claims.left(k), one.left)
-            if changed or beside is not one.frame.beside:
+            if is_changed or beside is not one.frame.beside:
                 data = self._frame(k, left, beside=beside, searches=one.frame.searches)
                 self.found[k] = Explanation(
                     data, left, judged_again(data, one.ranked, fitted=are_fitted)
