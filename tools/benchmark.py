@@ -23,6 +23,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from benchmarks import (  # noqa: E402
     calls_case,
+    many_case,
     memory_case,
     objective_case,
     pose_case,
@@ -40,6 +41,7 @@ CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "stream": stream_case.run,
     "search": search_rows.run,
     "scaling": scaling_case.run,
+    "many": many_case.run,
     "memory": memory_case.run,
     "workers": workers_case.run,
     "startup": startup_case.run,

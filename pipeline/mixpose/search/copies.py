@@ -70,24 +70,26 @@ def search_copies(
     if len(cameras) < 2 or not free.all():
         return []
     reaches = [problems[0].reach(sensor) for sensor, _ in cameras]
+    triangles = [feature_triangles(one, 6 * budget.sample, budget.min_sine) for one in bodies]
+    longest = max(float(tree.data.max(initial=0.0)) for _, tree in triangles)
     points = triangulate([rays for _, rays in cameras], reaches, budget.min_sine)
+    # a point that may be anywhere in a body tells nothing of it
+    points = TriangulatedPoints._make(one[points.tolerance < longest / 2] for one in points)
     points = by_promise(problems[0], points)
+    triples = _near_triples(points, longest, budget.batch)
     images = [label_image(problems[0], *camera) for camera in cameras]
-    found = [_candidates(problem, points, images) for problem in problems]
+    poses = [
+        of_triples(problem, points, own, triples if len(own[0]) else triples[:0])
+        for problem, own in zip(problems, triangles, strict=True)
+    ]
+    found = [_candidates(*case, images) for case in zip(problems, poses, strict=True)]
     return _shared_out(found, bodies, budget)
 
 
-def _candidates(
-    problem: SearchProblem, points: TriangulatedPoints, images: Sequence[LabelImage]
-) -> _Candidates:
-    """Poses of one body that put triangles of it onto triangles of points, and what they meet."""
+def _candidates(problem: SearchProblem, poses: Floats, images: Sequence[LabelImage]) -> _Candidates:
+    """Of poses (K, 4, 4) of one body those that may be, and what they meet."""
     body, budget = problem.body, problem.budget
-    triangles = feature_triangles(body, 6 * budget.sample, budget.min_sine)
-    poses = np.zeros((0, 4, 4))
-    if len(triangles[0]):
-        triples = _near_triples(points, float(triangles[1].data.max()), budget.batch)
-        poses = of_triples(problem, points, triangles, triples)
-        poses = poses[unlike(body, poses, budget.alike)]
+    poses = poses[unlike(body, poses, budget.alike)]
     if not len(poses):
         return _Candidates(poses, np.zeros(0), np.zeros((0, 1), dtype=np.intp))
     counts, near = count_inliers(images, body, poses)
@@ -108,9 +110,10 @@ def _near_triples(points: TriangulatedPoints, longest: float, most: int) -> Indi
 
     The most promising first, so many at most.
     """
-    reach = longest + 2 * float(points.tolerance.max(initial=0.0))
-    pairs = cKDTree(points.points).query_pairs(reach, output_type="ndarray")
-    count = len(points.points)
+    pairs = cKDTree(points.points).query_pairs(2 * longest, output_type="ndarray")
+    first, second, count = *pairs.T, len(points.points)
+    away = np.linalg.norm(points.points[first] - points.points[second], axis=1)
+    pairs = pairs[away < longest + points.tolerance[first] + points.tolerance[second]]
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
     pairs = pairs[(rays[pairs[:, 0], :, None] != rays[pairs[:, 1], None]).all(axis=(1, 2))]
     are_near = np.zeros((count, count), dtype=np.bool_)
