@@ -58,6 +58,7 @@ class EstimatorOptions:
     # how long a frame is searched where no prediction convinces; None: live for cameras and streams
     search: SearchName | None = None
     confidence: float | None = None  # from which a pose is ok; None: as the rules have it
+    mirrors: bool = False  # whether some show the body
 
 
 def free_mask(options: EstimatorOptions) -> Mask:

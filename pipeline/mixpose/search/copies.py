@@ -111,12 +111,11 @@ def _near_triples(points: TriangulatedPoints, longest: float, most: int) -> Indi
     The most promising first, so many at most.
     """
     pairs = cKDTree(points.points).query_pairs(2 * longest, output_type="ndarray")
-    first, second, count = *pairs.T, len(points.points)
-    away = np.linalg.norm(points.points[first] - points.points[second], axis=1)
-    pairs = pairs[away < longest + points.tolerance[first] + points.tolerance[second]]
+    away = np.linalg.norm(np.subtract(*points.points[pairs.T]), axis=1)
+    pairs = pairs[away < longest + points.tolerance[pairs].sum(axis=1)]
     rays = points.sensors * (points.rays.max(initial=0) + 1) + points.rays
     pairs = pairs[(rays[pairs[:, 0], :, None] != rays[pairs[:, 1], None]).all(axis=(1, 2))]
-    are_near = np.zeros((count, count), dtype=np.bool_)
+    are_near = np.zeros((len(rays), len(rays)), dtype=np.bool_)
     are_near[pairs[:, 0], pairs[:, 1]] = True
     # i < j < k, each pair of them near
     pair, third = np.nonzero(are_near[pairs[:, 0]] & are_near[pairs[:, 1]])

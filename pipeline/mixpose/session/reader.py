@@ -153,4 +153,5 @@ def _estimator(table: EstimatorTable, objects: Sequence[ObjectSetup]) -> Estimat
         table.fuse,
         table.search,
         table.confidence,
+        table.mirrors,
     )

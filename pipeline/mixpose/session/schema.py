@@ -222,6 +222,12 @@ class EstimatorTable(Table):
 
     Example: `confidence = 0.99`
     """
+    mirrors: Annotated[bool, Field(description="true or false")] = False
+    """Whether windows, polished tables or screens show the body as in a mirror.  A flat body looks
+    the same there, and is never `ok` then; of others the mirror image is as likely as the body.
+
+    Example: `mirrors = true`
+    """
 
 
 class SessionTable(Table):

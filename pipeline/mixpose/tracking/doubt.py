@@ -32,6 +32,7 @@ from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
+from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat, second_pose
 
 FEW = "few markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
@@ -48,19 +49,35 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
         return verdict
     if verdict.status != "ok":
         rivals = [one for one, _ in verdict.kept if one is not best]
-        if why := reason(data, best, rivals):
+        why = reason(data, best, rivals)
+        if not why and any(are_both(best, one) for one in rivals):
+            why = TWICE
+        if why:
             clutter, *others = verdict.against
             named = [one._replace(what=why) for one in others]
             return replace(verdict, against=(clutter, *named))
     # a sure pose that has rivals may have them for a reason that can be told
-    sure = is_sure(best, data.free, data.rules.acceptance)
-    return verdict.doubted(_alternatives(data, best)) if sure else verdict
+    if not is_sure(best, data.free, data.rules.acceptance):
+        return verdict
+    verdict = verdict.doubted(_alternatives(data, best))
+    return _with_second(verdict, second_pose(data, best)) if verdict.status == "ok" else verdict
+
+
+def _with_second(verdict: Verdict, second: ScoredPose | None) -> Verdict:
+    """The same where the body may be there twice: either may be it, whichever was followed."""
+    if second is None:
+        return verdict
+    kept = [*((one, weight / 2) for one, weight in verdict.kept), (second, 0.5)]
+    return replace(verdict, kept=kept).doubted([Alternative(TWICE)])
 
 
 def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
-    yield Alternative(MIRRORED, math.log(rules.mistaken) + of_reflection(data, best))
+    mirrored = 0.5 if data.options.mirrors else rules.mistaken
+    yield Alternative(MIRRORED, math.log(mirrored) + of_reflection(data, best))
+    if data.options.mirrors and is_flat(data):
+        yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(ALONE, _of_one_sensor(data, best))
     for what, odds in possible_mistakes(best, data.body, data.free, noise):

@@ -20,6 +20,12 @@ class ProposalRules:
     steps: int = constant(3, "Newton steps that these take at each blur: the fit takes the rest")
     narrowing: float = constant(3.0, "drawn poses are so much surer than starts; searched: squared")
     blurs: tuple[float, ...] = constant((0.5, 0.25, 0.12), "σ_ε, to begin at where spots pull")
+    whole: int = constant(
+        30,
+        "poses that are ok, before which images of a flat body are looked at whole: what was "
+        "followed so far may be its mirror image",
+    )
+    seconds: int = constant(3, "candidates for a second pose: of clutter the best is the likeliest")
     static: int = constant(10, "frames without the body that a lamp is in; what moves is in two")
     believed: int = constant(3, "poses that are ok, after which no mirror image is looked for")
 

@@ -35,6 +35,7 @@ from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.sharing import Explanation, Sharing
 from mixpose.tracking.track import Branch, Companion, Track
 from mixpose.tracking.tracker import Tracker, followed
+from mixpose.tracking.twin import is_flat
 
 Box: TypeAlias = tuple[int, int, int, int]
 Tallies: TypeAlias = Mapping[str, tuple[int, int]]  # of features met, and in view
@@ -235,6 +236,7 @@ class WindowedScene:
         """Whether the last frame was sure of all bodies, and met most of each."""
         return all(
             not (track.misses or track.doubted)
+            and (track.believed >= tracked.rules.proposals.whole or not is_flat(tracked))
             and is_convincing(track.tallies, self.cameras, tracked.rules.acceptance)
             for tracked, track in zip(self.scene.bodies, tracks, strict=True)
         )

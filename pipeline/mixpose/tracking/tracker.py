@@ -26,6 +26,7 @@ from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, predict
+from mixpose.tracking.twin import tried_after
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +252,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
         doubted=not is_ok,
+        tried=tried_after(data, best),
     )
 
 
