@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -62,6 +62,8 @@ class Verdict:
     kept: list[tuple[ScoredPose, float]]  # poses worth telling with their beliefs, best first
     against: tuple[Alternative, ...] = ()  # the best of them
     most: float = -math.inf  # log odds against it up to which it is ok
+    # detections that sensors had left where the body was sought a second time
+    tried: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def confidence(self) -> float:

@@ -32,7 +32,7 @@ from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
 from mixpose.tracking.track import Track
-from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat, second_pose
+from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat
 
 FEW = "few markers are met, which other things may have alike"
 ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
@@ -59,16 +59,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     # a sure pose that has rivals may have them for a reason that can be told
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
-    verdict = verdict.doubted(_alternatives(data, best))
-    return _with_second(verdict, second_pose(data, best)) if verdict.status == "ok" else verdict
-
-
-def _with_second(verdict: Verdict, second: ScoredPose | None) -> Verdict:
-    """The same where the body may be there twice: either may be it, whichever was followed."""
-    if second is None:
-        return verdict
-    kept = [*((one, weight / 2) for one, weight in verdict.kept), (second, 0.5)]
-    return replace(verdict, kept=kept).doubted([Alternative(TWICE)])
+    return verdict.doubted(_alternatives(data, best))
 
 
 def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:

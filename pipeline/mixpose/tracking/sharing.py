@@ -29,6 +29,7 @@ from mixpose.tracking.proposers import predicted
 from mixpose.tracking.rules import SceneRules
 from mixpose.tracking.track import Branch, Track
 from mixpose.tracking.tracker import Tracker, judged_again
+from mixpose.tracking.twin import with_second
 
 Starts: TypeAlias = tuple[Start, ...]
 
@@ -40,11 +41,12 @@ class Explanation:
     frame: Frame
     left: Mask  # (D,), see `Claims.left`
     ranked: Sequence[ScoredPose]  # distinct poses, the most evident first
+    rest: Sequence[View] = ()  # what no body has
 
     @cached_property
     def verdict(self) -> Verdict:
         """The decision about the frame, and why it is in doubt."""
-        return decided(self.frame, self.ranked)
+        return with_second(decided(self.frame, self.ranked), self.frame, self.rest)
 
 
 @dataclass
@@ -70,7 +72,11 @@ class Sharing:
         for is_forgotten in (False, True):
             self._on_the_rest([k for k in away if self._is_forgotten(k) == is_forgotten])
         self._judge_again()
-        return self.found
+        left = self._nobody.part(self._claims().left(-1))
+        rest = [view for view in left if not view.observation.is_empty]
+        # of identical bodies another one is no surprise
+        alone = [k for k in self.claimed if self.bodies[k].instance is None]
+        return self.found | {k: replace(self.found[k], rest=rest) for k in alone}
 
     def _expected(self) -> dict[int, Starts]:
         """Where bodies are expected to within their own size: farther off there may be others."""

@@ -136,7 +136,7 @@ class Track:
     believed: int = 0  # frames whose pose was ok
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain
-    tried: Mapping[str, float] = field(default_factory=dict)
+    tried: Mapping[str, int] = field(default_factory=dict)
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
     distances: Distances | None = None  # between identical bodies, of which this is the first

@@ -26,7 +26,7 @@ from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
 from mixpose.tracking.track import Branch, Track, predict
-from mixpose.tracking.twin import tried_after
+from mixpose.tracking.twin import left_by, with_second
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +90,8 @@ class Tracker(Setup):
         data = self.data(track, frame, time_s, views)
         ranked = self.explain(data)
         verdict = decided(data, ranked)
+        if verdict.best is not None and verdict.status == "ok":
+            verdict = with_second(verdict, data, left_by(verdict.best, data.views))
         after = followed(data, verdict)
         return after, self.estimate(data, after, verdict, ranked)
 
@@ -252,7 +254,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         or (track.known and of_other_things(data, best) < data.rules.acceptance.log_doubt),
         believed=track.believed + is_ok,
         doubted=not is_ok,
-        tried=tried_after(data, best),
+        tried={**track.tried, **verdict.tried},
     )
 
 

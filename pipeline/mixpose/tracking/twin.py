@@ -8,14 +8,15 @@ in vain before, and every few frames anyway.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from mixpose.body import thickness
-from mixpose.judgement import ScoredPose, is_sure
+from mixpose.judgement import Alternative, ScoredPose, Verdict, is_sure
 from mixpose.objective import View
+from mixpose.search import Candidate, Copy, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of
@@ -30,16 +31,66 @@ def is_flat(data: Setup) -> bool:
     return data.body.is_exact and thickness(data.body) < data.rules.look_alikes.alike
 
 
-def second_pose(data: Frame, best: ScoredPose) -> ScoredPose | None:
-    """A pose of what the best one leaves, that is sure by itself and meets as much; or None."""
-    if not is_due(data, best):
-        return None
+def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
+    """The same; in doubt where what is left of the frame's views shows the body once more.
+
+    Either may be it then, whichever was followed so far.
+    """
+    best, left = verdict.best, {one.name: one.observation.cells for one in rest}
+    if best is None or verdict.status != "ok" or not _is_due(data, best, left):
+        return verdict
+    verdict, second = replace(verdict, tried=left), _second_pose(data, best, rest)
+    if second is None:
+        return verdict
+    kept = [*((one, weight / 2) for one, weight in verdict.kept), (second, 0.5)]
+    return replace(verdict, kept=kept).doubted([Alternative(TWICE)])
+
+
+def left_by(pose: ScoredPose, views: Sequence[View]) -> list[View]:
+    """What a pose leaves of the views; those without single detections leave nothing."""
+    numbers = dict(zip(pose.matches.names, pose.matches.detections, strict=True))
+    rest = []
+    for view in views:
+        points = view.observation.points
+        is_left = np.ones(0 if points is None else len(points), dtype=np.bool_)
+        if len(is_left) and view.name in numbers:
+            is_left[numbers[view.name][numbers[view.name] >= 0]] = False
+        if is_left.any():
+            rest.append(replace(view, observation=view.observation.only(is_left)))
+    return rest
+
+
+def are_both(a: ScoredPose, b: ScoredPose) -> bool:
+    """Whether two poses are sure, and meet detections of their own."""
+    if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
+        return False
+    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
+    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
+    return bool(shared < 0.5 * (a.matches.detections >= 0).sum())
+
+
+def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
+    """Whether as many detections as are left may be the body once more, and were not searched."""
+    used, rules = best.matches, data.rules
+    if (used.dimensions != 2).any():
+        return False
+    rest = np.array([left.get(name, 0) for name in used.names])
+    # as much as would convince, by as many sensors
+    if np.minimum(rest, used.met).sum() < rules.acceptance.convincing * used.met.sum():
+        return False
+    is_more = any(count > data.track.tried.get(name, 0) for name, count in left.items())
+    return is_more or data.track.doubted or data.frame % rules.proposals.static == 0
+
+
+def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
+    """A pose that is sure by itself and meets as much as the best one."""
     live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
     rest = data.seen_otherwise(
-        views=_rest(data, best),
+        views=views,
         still=(),
         predictions=(),
         beside=None,
+        starts=(),
         searches=[],
         track=track,
         options=live,
@@ -55,57 +106,13 @@ def second_pose(data: Frame, best: ScoredPose) -> ScoredPose | None:
 
 def _starts(data: Frame, rest: Frame) -> Iterator[Start]:
     """Where a second pose may be: where one was, then what a search finds."""
-    for one in data.predictions:
-        yield Start(one.T_world_object, one.uncertainty)
-    for candidate in candidates_of(rest)[: data.rules.proposals.seconds]:
-        yield Start(candidate.T_world_object, data.close)
-
-
-def are_both(a: ScoredPose, b: ScoredPose) -> bool:
-    """Whether two poses are sure, and meet detections of their own."""
-    if min(a.log_evidence, b.log_evidence) <= 0 or a.matches.names != b.matches.names:
-        return False
-    pairs = zip(a.matches.detections, b.matches.detections, strict=True)
-    shared = sum(np.isin(one[one >= 0], other).sum() for one, other in pairs)
-    return bool(shared < 0.5 * (a.matches.detections >= 0).sum())
-
-
-def is_due(data: Frame, best: ScoredPose) -> bool:
-    """Whether what a pose leaves may be the body once more, and was not searched before."""
-    if any(view.observation.points is None or view.sensor.dimension != 2 for view in data.views):
-        return False
-    used, rules = best.matches, data.rules
-    rest, met = used.count - used.met, used.met
-    # as much as would convince, by as many sensors
-    if np.minimum(rest, met).sum() < rules.acceptance.convincing * met.sum():
-        return False
-    tried = data.track.tried
-    is_more = any(count > tried.get(name, 0) for name, count in counts_left(best).items())
-    return is_more or data.track.doubted or data.frame % rules.proposals.static == 0
-
-
-def tried_after(data: Frame, best: ScoredPose) -> Mapping[str, float]:
-    """How many detections each sensor had left where a second pose was sought in vain."""
-    if not is_due(data, best):
-        return data.track.tried
-    return {**data.track.tried, **counts_left(best)}
-
-
-def counts_left(best: ScoredPose) -> dict[str, float]:
-    """How many detections of each sensor a pose does not meet."""
-    used = best.matches
-    return dict(zip(used.names, (used.count - used.met).tolist(), strict=True))
-
-
-def _rest(data: Frame, best: ScoredPose) -> list[View]:
-    """What a pose leaves of the views."""
-    numbers = dict(zip(best.matches.names, best.matches.detections, strict=True))
-    rest = []
-    for view in data.views:
-        points = view.observation.points
-        assert points is not None
-        is_left = np.ones(len(points), dtype=np.bool_)
-        if view.name in numbers:
-            is_left[numbers[view.name][numbers[view.name] >= 0]] = False
-        rest.append(replace(view, observation=view.observation.only(is_left)))
-    return [view for view in rest if not view.observation.is_empty]
+    for branch in data.predictions:
+        yield Start(branch.T_world_object, branch.uncertainty)
+    views, rules = rest.views, data.rules
+    found: Sequence[Copy | Candidate]
+    if len(views) > 1:  # quickly, by points that cameras see together
+        found = search_copies(views, [data.body], data.free, rules.judgement, rules.search)
+    else:
+        found = candidates_of(rest)
+    for one in found[: rules.proposals.seconds]:
+        yield Start(one.T_world_object, data.close)

@@ -1,0 +1,77 @@
+"""A body that is in the frame twice: in a mirror, or one more of which nobody told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies_in_view import OTHER, TOOL, at, body, scene_of, views_of
+
+from mixpose.body import Body
+from mixpose.fit import EstimatorOptions
+from mixpose.records import Estimate
+from mixpose.tracking import Scene, Tracker
+from mixpose.tracking.twin import IN_A_MIRROR, TWICE
+
+FLAT = body("flat", TOOL * [1.0, 1.0, 0.0])
+SOLID = body("solid", TOOL)
+HERE, THERE = at(-120.0), at(130.0, 60.0, turn=0.4)
+
+
+def estimates_of(
+    tracked: Body, shown: list[list[np.ndarray]], options: EstimatorOptions = EstimatorOptions()
+) -> list[Estimate]:
+    """Of frames that show the body at some poses each."""
+    scene = Scene((Tracker.create(tracked, options),))
+    tracks, found = scene.begin(), list[Estimate]()
+    for frame, poses in enumerate(shown):
+        views = views_of([tracked] * len(poses), poses, frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        found += estimates
+    return found
+
+
+@pytest.mark.parametrize("tracked", [FLAT, SOLID], ids=["flat", "solid"])
+def test_a_second_body_makes_every_frame_ambiguous_from_its_first_on(tracked: Body) -> None:
+    found = estimates_of(tracked, [[HERE]] * 4 + [[HERE, THERE]] * 8)
+    assert [one.status for one in found] == ["ok"] * 4 + ["ambiguous"] * 8
+    assert {one.doubt for one in found[4:]} == {TWICE}
+    for one in found[4:]:
+        places = np.array([each.T_world_object[:3, 3] for each in one.hypotheses])
+        for T in (HERE, THERE):  # both are told
+            assert np.linalg.norm(places - T[:3, 3], axis=1).min() < 2.0
+
+
+def test_the_frame_is_ok_again_once_the_other_one_is_gone() -> None:
+    found = estimates_of(SOLID, [[HERE]] * 3 + [[HERE, THERE]] * 3 + [[HERE]] * 4)
+    assert found[-1].status == "ok"
+    assert found[-1].T_world_object is not None
+    assert np.linalg.norm(found[-1].T_world_object[:3, 3] - HERE[:3, 3]) < 2.0
+
+
+def test_as_many_other_spots_are_no_second_body() -> None:
+    other = body("other", OTHER)
+    scene = Scene((Tracker.create(SOLID, EstimatorOptions()),))
+    tracks = scene.begin()
+    for frame in range(12):
+        poses = [HERE, at(130.0 + 3.0 * frame)]
+        views = views_of([SOLID, other], poses, frame)
+        tracks, (estimate,) = scene.advance(tracks, frame, None, views)
+        assert estimate.status == "ok"
+
+
+def test_identical_bodies_that_the_session_counts_are_no_surprise() -> None:
+    scene = scene_of(SOLID, SOLID)
+    tracks = scene.begin()
+    for frame in range(4):
+        views = views_of([SOLID, SOLID], [HERE, THERE], frame)
+        tracks, estimates = scene.advance(tracks, frame, None, views)
+        assert [one.status for one in estimates] == ["ok", "ok"]
+
+
+def test_where_there_are_mirrors_a_flat_body_is_never_ok() -> None:
+    options = replace(EstimatorOptions(), mirrors=True)
+    found = estimates_of(FLAT, [[HERE]] * 6, options)
+    assert {(one.status, one.doubt) for one in found} == {("ambiguous", IN_A_MIRROR)}
+    assert all(one.status == "ok" for one in estimates_of(SOLID, [[HERE]] * 6, options))
