@@ -60,7 +60,7 @@ class Setup:
             K = camera.camera_matrix.tolist()
             parts.append(
                 f'[[sensor]]\nname = "{name}"\nmodel = "pinhole"\nsource = "{name}.csv"\n'
-                f"resolution = {list(RESOLUTION)}\nfps = 50\ncamera_matrix = {K}\n"
+                f"resolution = {list(camera.resolution or RESOLUTION)}\nfps = 50\ncamera_matrix = {K}\n"
                 f"T_sensor_world = {camera.T_sensor_world.tolist()}"
             )
         return "\n\n".join(parts) + "\n"

@@ -12,7 +12,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from several_bodies import (
     NOISE_PX,
-    RESOLUTION,
     Setup,
     by_frame,
     camera_at,
@@ -43,6 +42,7 @@ AWAY_MM = 4500.0
 HIDDEN, FRAMES_HIDDEN = 0.1, 12  # share of markers that a camera does not see, for so long
 LAMPS = 6
 FPS = 60.0
+FOCAL = 1800.0  # px, of four megapixels: a room of 3 m is in view
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,11 @@ def setup_of(rng: np.random.Generator, equal: int, others: int) -> Setup:
     bodies = [random_body(rng, 5)] + [
         random_body(rng, int(rng.integers(4, 6))) for _ in range(others)
     ]
-    cameras = {
-        f"cam{k}": camera_at(360.0 * k / CAMERAS, 15.0 + 10.0 * (k % 2), AWAY_MM)
-        for k in range(CAMERAS)
-    }
+    cameras = {}
+    for k in range(CAMERAS):
+        there = camera_at(360.0 * k / CAMERAS, 15.0 + 10.0 * (k % 2), AWAY_MM)
+        K, wide = np.array([[FOCAL, 0, 1023.5], [0, FOCAL, 1023.5], [0, 0, 1.0]]), (2048, 2048)
+        cameras[f"cam{k}"] = replace(there, camera_matrix=K, resolution=wide)
     return Setup(cameras, bodies, [equal] + [1] * others)
 
 
@@ -109,7 +110,7 @@ def record(setup: Setup, frames: int, folder: Path, rng: np.random.Generator) ->
             z, lit = camera.project(lamps)
             spots = merged(np.concatenate([y[shown], z[lit]]))
             spots = rng.permutation(spots + NOISE_PX * rng.standard_normal(spots.shape))
-            inside = ((spots > 0) & (spots < np.array(RESOLUTION) - 1)).all(axis=1)
+            inside = ((spots > 0) & (spots < np.array(camera.resolution or (0, 0)) - 1)).all(axis=1)
             lines[name] += [f"{frame},{u:.3f},{v:.3f}\n" for u, v in spots[inside]]
     for name, own in lines.items():
         (folder / f"{name}.csv").write_text("frame,u,v\n" + "".join(own))
