@@ -183,7 +183,7 @@ def test_three_markers_of_a_body_that_gives_way_may_be_three_of_its_others() -> 
     assert told[1:] == ["ok"] * 3
 
 
-def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
+def test_a_body_that_is_away_is_searched_for_in_the_first_frame_and_in_one_of_ten(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[float] = []
@@ -201,15 +201,16 @@ def test_a_body_that_is_away_is_searched_for_thoroughly_in_one_frame_of_ten(
     tool, other = body("tool", TOOL), body("other", OTHER)
     scene = scene_of(tool, other)
     tracks = scene.begin()
-    for frame in range(12):
+    for frame in range(24):
         views = views_of([tool], [at(2.0 * frame)], frame)
         tracks, estimates = scene.advance(tracks, frame, None, views)
         assert estimates[1].status == "lost"
-    thorough = [frame for frame, most in zip(frames, asked, strict=True) if most == np.inf]
-    # points that both cameras see are looked at in each frame; all else again after ten
-    assert sorted(set(thorough)) == sorted(set(frames)) == [0, 10]
-    views = views_of([tool, other], [at(24.0), at(150.0, 60.0)], 12)
-    _, estimates = scene.advance(tracks, 12, None, views)
+    # points that both cameras see are looked at in each frame; all else again in every tenth,
+    # in which the tool that is there is not held up
+    assert sorted(set(frames)) == [0, 9, 19]
+    assert max(asked) < np.inf
+    views = views_of([tool, other], [at(48.0), at(150.0, 60.0)], 24)
+    _, estimates = scene.advance(tracks, 24, None, views)
     assert [one.status for one in estimates] == ["ok", "ok"]
 
 

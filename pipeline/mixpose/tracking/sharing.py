@@ -206,11 +206,12 @@ class Sharing:
         """A body by all proposers; one that is away is not searched for thoroughly each time."""
         data = self._frame(k, left, track, beside=self._companion(k))
         coasting = self.bodies[k].rules.motion.coasting
-        # bodies that are there are not held up
-        is_due = track.misses % self.rules.thorough == (coasting if track.branches else 0)
-        if self.claimed and not is_due and track.misses > coasting:
+        # bodies that are there are not held up: others in turn, and what nobody saw yet at once
+        is_turn = track.misses >= coasting and (track.misses + k) % self.rules.thorough == 0
+        is_due = is_turn or not (track.branches or track.misses)
+        if self.claimed and (self.looked or not is_due and track.misses > coasting):
             data = replace(data, options=replace(data.options, search="live"))
-        if not (self.looked and self.claimed) or is_due:
+        if not self.looked or is_due:
             return Explanation(data, left, self.bodies[k].explain(data))
         # points in space were looked at: about where it must be, if it was there just now
         around = predicted(data, [])
