@@ -209,7 +209,7 @@ class Sharing:
         # bodies that are there are not held up: others in turn, and what nobody saw yet at once
         is_turn = track.misses >= coasting and (track.misses + k) % self.rules.thorough == 0
         is_due = is_turn or not (track.branches or track.misses)
-        if self.claimed and (self.looked or not is_due and track.misses > coasting):
+        if self.claimed and (self.looked or (not is_due and track.misses > coasting)):
             data = replace(data, options=replace(data.options, search="live"))
         if not self.looked or is_due:
             return Explanation(data, left, self.bodies[k].explain(data))

@@ -16,6 +16,7 @@ import numpy as np
 from mixpose.body import thickness
 from mixpose.judgement import Alternative, ScoredPose, Verdict, is_sure
 from mixpose.objective import View
+from mixpose.rigid import transform
 from mixpose.search import Candidate, Copy, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
@@ -39,7 +40,8 @@ def with_second(verdict: Verdict, data: Frame, rest: Sequence[View]) -> Verdict:
     best, left = verdict.best, {one.name: one.observation.cells for one in rest}
     if best is None or verdict.status != "ok" or not _is_due(data, best, left):
         return verdict
-    verdict, second = replace(verdict, tried=left), _second_pose(data, best, rest)
+    most = {name: max(count, data.track.tried.get(name, 0)) for name, count in left.items()}
+    verdict, second = replace(verdict, tried=most), _second_pose(data, best, rest)
     if second is None:
         return verdict
     kept = [*((one, weight / 2) for one, weight in verdict.kept), (second, 0.5)]
@@ -97,17 +99,20 @@ def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> Scored
     )
     rules, least = data.rules, data.rules.acceptance.convincing * best.measurements
     likelihood = likelihood_of(rest)
-    for start in _starts(data, rest):
+    for start in _starts(data, best, rest):
         pose = likelihood.judge(likelihood.fit(start), start)
         if is_sure(pose, data.free, rules.acceptance) and pose.measurements >= least:
             return replace(pose, proposer="second_pose")
     return None
 
 
-def _starts(data: Frame, rest: Frame) -> Iterator[Start]:
+def _starts(data: Frame, best: ScoredPose, rest: Frame) -> Iterator[Start]:
     """Where a second pose may be: where one was, then what a search finds."""
+    here = transform(best.T_world_object, data.body.means)
     for branch in data.predictions:
-        yield Start(branch.T_world_object, branch.uncertainty)
+        off = np.linalg.norm(transform(branch.T_world_object, data.body.means) - here, axis=1)
+        if off.min() > data.body.radius:
+            yield Start(branch.T_world_object, branch.uncertainty)
     views, rules = rest.views, data.rules
     found: Sequence[Copy | Candidate]
     if len(views) > 1:  # quickly, by points that cameras see together
