@@ -57,10 +57,10 @@ class Setup:
             many = f"\ncount = {count}" if count > 1 else ""
             parts.append(f'[[object]]\nname = "body{k}"{many}\npoints = {points.tolist()}')
         for name, camera in self.cameras.items():
-            K = camera.camera_matrix.tolist()
+            K, size = camera.camera_matrix.tolist(), list(camera.resolution or RESOLUTION)
             parts.append(
                 f'[[sensor]]\nname = "{name}"\nmodel = "pinhole"\nsource = "{name}.csv"\n'
-                f"resolution = {list(camera.resolution or RESOLUTION)}\nfps = 50\ncamera_matrix = {K}\n"
+                f"resolution = {size}\nfps = 50\ncamera_matrix = {K}\n"
                 f"T_sensor_world = {camera.T_sensor_world.tolist()}"
             )
         return "\n\n".join(parts) + "\n"
