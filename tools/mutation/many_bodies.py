@@ -83,14 +83,6 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
-        "twin-of-identical-bodies",
-        "tracking/sharing.py",
-        "if self.bodies[k].instance is None]",
-        "]",
-        "identical bodies that the session counts make each other ambiguous",
-        (_SCENE, _TWIN),
-    ),
-    Mutant(
         "mirrors-that-nobody-asks-for",
         "tracking/doubt.py",
         "if data.options.mirrors and is_flat(data):",
