@@ -11,7 +11,7 @@ _SCENE = "test_several_bodies_scene.py"
 
 MUTANTS = (
     Mutant(
-        "copies-share-markers",
+        "search-copies-share-markers",
         "search/copies.py",
         "if len(others) <= (1 - budget.convincing) * len(rows[k]):",
         "if True:",
@@ -19,7 +19,7 @@ MUTANTS = (
         (_COPIES,),
     ),
     Mutant(
-        "copies-of-one-kind-only",
+        "search-copies-of-one-kind-only",
         "search/copies.py",
         "for problem, own in zip(problems, triangles, strict=True)",
         "for problem, own in zip(problems, triangles[:1] * len(problems), strict=True)",
@@ -27,7 +27,7 @@ MUTANTS = (
         (_COPIES,),
     ),
     Mutant(
-        "copies-without-rivals",
+        "search-copies-without-rivals",
         "search/copies.py",
         "rivals[j] = k",
         "pass",
@@ -35,7 +35,7 @@ MUTANTS = (
         (_COPIES,),
     ),
     Mutant(
-        "identity-by-motion-alone",
+        "tracking-identity-by-motion-alone",
         "tracking/identity.py",
         "beside = terms.sum(axis=2) - terms[i, :, i] - terms[:, i, i]",
         "beside = 0.0 * terms.sum(axis=2)",
@@ -43,7 +43,7 @@ MUTANTS = (
         (_IDENTITY,),
     ),
     Mutant(
-        "identity-new-distances-cost-nothing",
+        "tracking-identity-new-distances-cost-nothing",
         "tracking/identity.py",
         "np.where(np.isnan(off), -math.log(self.room), known)",
         "np.where(np.isnan(off), 0.0, known)",
@@ -51,7 +51,7 @@ MUTANTS = (
         (_IDENTITY,),
     ),
     Mutant(
-        "identity-old-distances-as-sure-as-new-ones",
+        "tracking-identity-old-distances-as-sure-as-new-ones",
         "tracking/identity.py",
         "* (1 + before.missed) ** 2",
         "",
@@ -59,7 +59,7 @@ MUTANTS = (
         (_IDENTITY,),
     ),
     Mutant(
-        "identity-distances-forgotten",
+        "tracking-identity-distances-forgotten",
         "tracking/motion.py",
         "np.where(is_seen, now, self.last),",
         "now,",
@@ -67,7 +67,7 @@ MUTANTS = (
         (_IDENTITY,),
     ),
     Mutant(
-        "twin-never-sought",
+        "tracking-twin-never-sought",
         "tracking/twin.py",
         'verdict.status != "ok" or not _is_due(data, best, left)',
         "True",
@@ -75,7 +75,7 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
-        "twin-among-what-is-met",
+        "tracking-twin-among-what-is-met",
         "tracking/twin.py",
         "is_left[numbers[view.name][numbers[view.name] >= 0]] = False",
         "pass",
@@ -83,7 +83,7 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
-        "mirrors-that-nobody-asks-for",
+        "tracking-mirrors-that-nobody-asks-for",
         "tracking/doubt.py",
         "if data.options.mirrors and is_flat(data):",
         "if is_flat(data):",
@@ -91,7 +91,7 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
-        "mirrors-not-believed",
+        "tracking-mirrors-not-believed",
         "tracking/doubt.py",
         "if data.options.mirrors and is_flat(data):",
         "if False:",
@@ -99,7 +99,7 @@ MUTANTS = (
         (_TWIN,),
     ),
     Mutant(
-        "those-away-are-sought-in-every-frame",
+        "tracking-those-away-are-sought-in-every-frame",
         "tracking/sharing.py",
         "if not self.looked or is_due:",
         "if True:",
