@@ -126,6 +126,16 @@ def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
     assert {"left_0.png", "right_0.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
+def test_the_page_about_markers_can_be_followed_from_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("ezc3d")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "data").symlink_to(ROOT / "data", target_is_directory=True)
+    follow("docs/markers.md", capfd)
+    assert (tmp_path / "markers.c3d").stat().st_size > 0
+
+
 @pytest.mark.parametrize(
     ("page", "written"), [("importing", "poses.jsonl"), ("design", "design.png")]
 )

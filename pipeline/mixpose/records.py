@@ -186,6 +186,39 @@ class DelaySeen:
 
 
 @dataclass(frozen=True)
+class Label:
+    """What a sensor met a feature by.
+
+    Attributes
+    ----------
+    at : (m,) float64
+        Its sensor coordinates.
+    detection : int or None
+        Its place among the sensor's detections of the frame, from 0; None where there are no single
+        ones.
+    """
+
+    at: Floats
+    detection: int | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredPoint:
+    """Where sensors together put a feature, by what they met it by.
+
+    Attributes
+    ----------
+    at : (3,) float64
+        In the world.
+    residual : float
+        Root mean square distance, in length units, from what each of them saw of it.
+    """
+
+    at: Floats
+    residual: float
+
+
+@dataclass(frozen=True)
 class SensorReport:
     """How one sensor took part in an estimate.
 
@@ -202,6 +235,8 @@ class SensorReport:
     residuals : mapping of str to float or None
         How far off each feature in view was met, px or length units, by what it is called; None
         where it was not met.
+    labels : mapping of str to Label
+        What each feature was met by, where `mixpose.run` was asked for labels.
     """
 
     used: bool
@@ -209,6 +244,7 @@ class SensorReport:
     rms: float | None = None
     why: str | None = None
     residuals: Mapping[str, float | None] = field(default_factory=dict)
+    labels: Mapping[str, Label] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -224,12 +260,18 @@ class Offsets:
         Observed minus predicted place, sensor units; 0 where it was not met.
     by_shift : (n, m, 3) float64
         Derivative of the predicted place by a shift of the body in the world.
+    observed : (n, m) float64
+        Place of what met each, sensor units; that of the prediction where it was not met.
+    shared : (n,) bool
+        Whether another feature was met by the same detection.
     """
 
     features: NDArray[np.intp]
     met: NDArray[np.bool_]
     offsets: Floats
     by_shift: Floats
+    observed: Floats
+    shared: Mask
 
 
 @dataclass(frozen=True)
@@ -280,6 +322,9 @@ class Estimate:
         Why a frame is ambiguous, other than for its rivals; no part of it either.
     measured : callable
         Works out `offsets`.
+    points : mapping of str to MeasuredPoint
+        Features that sensors together put in space without the pose, where `mixpose.run` was asked
+        for labels.
     """
 
     frame: int
@@ -300,6 +345,7 @@ class Estimate:
     delays: Mapping[str, DelaySeen] = field(default_factory=dict, compare=False)
     doubt: str = field(default="", compare=False)
     measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)
+    points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
 
     @property
     def offsets(self) -> Mapping[str, Offsets]:

@@ -31,7 +31,7 @@ from mixpose.records import (
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.sensors import doubted
 from mixpose.threads import one_blas_thread
-from mixpose.tracking import DelayEvidence, Scene, Track, Tracker, WindowedScene
+from mixpose.tracking import DelayEvidence, Scene, Track, Tracker, WindowedScene, labelled
 
 if TYPE_CHECKING:
     from mixpose.body import Body
@@ -72,6 +72,7 @@ def run(
     watch: Watch | None = None,
     memory: Memory | None = None,
     remember: Remember | None = None,
+    labels: bool = False,
 ) -> Generator[Estimate, None, None]:
     """Estimate the poses of every frame of a recording, one per body.
 
@@ -96,6 +97,9 @@ def run(
         What a run knew after the frame before the first of `selection`; None: nothing.
     remember : callable or None
         Called with what is known after a frame, before its first estimate is yielded.
+    labels : bool
+        Whether estimates say which detection is which feature (`SensorReport.labels`), and where
+        features are in space by these alone (`Estimate.points`).
 
     Returns
     -------
@@ -123,7 +127,7 @@ def run(
     scene = scene_of(session, starts)
     frames = pair(opened, selection.start, selection.stop, selection.step)
     begun = Memory(scene.begin()) if memory is None else memory
-    return _estimates(session, scene, begun, frames, watch, remember)
+    return _estimates(session, scene, begun, frames, watch, remember, labels=labels)
 
 
 def scene_of(session: Session, starts: Starts | None = None) -> Scene:
@@ -210,8 +214,11 @@ def _estimates(
     frames: Generator[FrameSet, None, None],
     watch: Watch | None,
     remember: Remember | None,
+    *,
+    labels: bool,
 ) -> Generator[Estimate, None, None]:
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
+    bodies = {one.body.name: one.body for one in session.objects}
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -225,7 +232,8 @@ def _estimates(
                 )
             latency_ms = 1e3 * (time.perf_counter() - began)
             for k, one in enumerate(estimates):
-                estimate = _with_silent_sensors(one, session.sensors)
+                estimate = labelled(one, views, bodies[one.object]) if labels else one
+                estimate = _with_silent_sensors(estimate, session.sensors)
                 estimate = replace(estimate, latency_ms=latency_ms)
                 if watch is not None:
                     watch(frame_set, views, estimate)

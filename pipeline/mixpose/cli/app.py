@@ -84,6 +84,14 @@ Overlay = Annotated[
     Path | None,
     typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
 ]
+Labels = Annotated[
+    bool,
+    typer.Option(
+        "--labels",
+        help="Say in each pose line which detection is which feature, and where features are in "
+        "space by these alone; .jsonl only.",
+    ),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -108,11 +116,13 @@ def run(
     workers: Workers = 1,
     overlay: Overlay = None,
     scheduler: Scheduler = None,
+    labels: Labels = False,
     allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
     from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
+    from mixpose.errors import SessionError  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
@@ -121,8 +131,10 @@ def run(
     named = None if format is None else format.value
     written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
     request = RunRequest(
-        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler
+        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler, labels
     )
+    if labels and written != "jsonl":
+        raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
     if many:
         raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415
@@ -229,7 +241,9 @@ def convert(
     ] = None,
     format: Annotated[
         ConvertFormat | None,
-        typer.Option(help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun)."),
+        typer.Option(
+            help="Else by the suffix: .jsonl .csv .tum .yaml (ros) .rrd (rerun) .c3d .trc."
+        ),
     ] = None,
     unit: Annotated[
         str | None, typer.Option(help="Unit of lengths where POSES does not say: m, cm, mm, um.")
@@ -251,6 +265,16 @@ def convert(
         list[str] | None,
         typer.Option(metavar="NAME=PATH", help="rerun: as for run."),
     ] = None,
+    measured: Annotated[
+        bool,
+        typer.Option(
+            "--measured", help="c3d, trc: leave gaps where a marker was not measured by itself."
+        ),
+    ] = False,
+    fps: Annotated[
+        float | None,
+        typer.Option(min=1e-6, max=1e6, help="c3d, trc: frames a second, in place of times."),
+    ] = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Write poses in the format of another program."""
@@ -268,6 +292,8 @@ def convert(
         session=session,
         sources=tuple(source or ()),
         allow_code=allow_code,
+        measured=measured,
+        fps=fps,
     )
     convert_poses(poses, request)
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from mixpose import __version__
+from mixpose.cli.markers import FORMATS as MARKER_FORMATS
+from mixpose.cli.markers import write_markers
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import (
     Output,
@@ -37,7 +39,7 @@ from mixpose.records import Floats
 from mixpose.sensors import RangeSensor
 from mixpose.whole_files import appearing_whole
 
-_BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun"}
+_BY_SUFFIX = {**SUFFIXES, ".rrd": "rerun", ".c3d": "c3d", ".trc": "trc"}
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,8 @@ class ConvertRequest:
     session: Path | None
     sources: tuple[str, ...]
     allow_code: bool = False
+    measured: bool = False
+    fps: float | None = None
 
 
 def convert_poses(path: Path, request: ConvertRequest) -> None:
@@ -75,7 +79,7 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
         warn(f"{path}: no pose is ok, and --only-ok leaves out the others; nothing is left")
     labels = tuple(dict.fromkeys(line.label for line in lines))
     outputs = [] if request.output is None else written_paths(request.output, name, labels)
-    for output in outputs:
+    for output in outputs if name not in MARKER_FORMATS else ():
         if output.is_file() | (not output.exists()):
             refuse_to_overwrite(output, [path])
     if name == "rerun":
@@ -89,6 +93,19 @@ def convert_poses(path: Path, request: ConvertRequest) -> None:
             request.sources,
             allow_code=request.allow_code,
         )
+    elif name in MARKER_FORMATS:
+        session = session_of(poses, request.session, allow_code=request.allow_code)
+        _unit(poses, request)
+        write_markers(
+            poses,
+            lines,
+            session,
+            request.output,
+            name,
+            measured=request.measured,
+            fps=request.fps,
+        )
+        return
     else:
         _write(poses, lines, name, request)
     if request.output is not None:
@@ -165,14 +182,19 @@ def _refuse_options_of_other_formats(name: str, request: ConvertRequest) -> None
         "--obj-id": (request.obj_id, ("bop",)),
         "--relative-to": (request.relative_to, ("bop", "ros", "tum")),
         "--source": (request.sources or None, ("rerun",)),
+        "--measured": (request.measured or None, MARKER_FORMATS),
+        "--fps": (request.fps, MARKER_FORMATS),
     }
     for option, (value, owners) in given.items():
         if value is not None and name not in owners:
             raise SessionError(
                 f"{option}: belongs to --format {' or '.join(owners)}, found --format {name}"
             )
-    if request.session is not None and name != "rerun" and request.relative_to is None:
-        raise SessionError("--session: belongs to --format rerun and to --relative-to")
+    with_session = ("rerun", *MARKER_FORMATS)
+    if request.session is not None and name not in with_session and request.relative_to is None:
+        raise SessionError(
+            f"--session: belongs to --format {', '.join(with_session)} and to --relative-to"
+        )
 
 
 def _unit(poses: PoseFile, request: ConvertRequest) -> str:

@@ -35,6 +35,7 @@ class RunRequest:
     debug: bool = False
     allow_code: bool = False
     scheduler: str | None = None
+    labels: bool = False
 
 
 def format_of(output: Path | None, named: str | None) -> str:

@@ -77,6 +77,7 @@ def run_session(path: Path, request: RunRequest) -> None:
             watch=watch,
             memory=go_on.memory,
             remember=memories.append,
+            labels=request.labels,
         )
         stack.enter_context(closing(estimates))
         notes = stack.enter_context(_notes(request))

@@ -220,6 +220,7 @@ def _options(request: RunRequest) -> tuple[str, ...]:
     options += [f"--start={chosen.start}"] if chosen.start is not None else []
     options += [f"--stop={chosen.stop}"] if chosen.stop is not None else []
     options += ["--allow-code"] if request.allow_code else []
+    options += ["--labels"] if request.labels else []
     options += ["--debug"] if request.debug else []
     return tuple(options)
 

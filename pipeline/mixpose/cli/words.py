@@ -46,6 +46,8 @@ class ConvertFormat(StrEnum):
     bop = "bop"
     ros = "ros"
     rerun = "rerun"
+    c3d = "c3d"
+    trc = "trc"
 
 
 Step = Annotated[int, typer.Option(min=1, help="Take every N-th frame number.")]

@@ -44,6 +44,7 @@ def estimate_of(line: PoseLine) -> Estimate:
         latency_ms=0.0 if line.latency_ms is None else line.latency_ms,
         instance=line.instance,
         confidence=line.confidence,
+        points=line.points,
     )
 
 

@@ -17,7 +17,7 @@ from mixpose.limits import MOST_BYTES
 from mixpose.poses.header import COVARIANCE, FORMAT, VERSION, Header
 from mixpose.poses.plain import plain, plain_or_none, pose_of, require_finite
 from mixpose.poses.poseline import PoseLine, parse_header, parse_pose
-from mixpose.records import Estimate, Floats
+from mixpose.records import Estimate, Floats, Label, MeasuredPoint
 
 _NUMBERS = re.compile(r"([-+0-9.eE]+ ){7}[-+0-9.eE]+")  # a line of a .tum trajectory
 
@@ -105,9 +105,11 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
                 "rms": plain_or_none(report.rms),
                 **({"why": report.why} if report.why else {}),
                 **({"residuals": _rounded(report.residuals)} if report.residuals else {}),
+                **({"labels": _labels(report.labels)} if report.labels else {}),
             }
             for name, report in estimate.sensors.items()
         },
+        **({"points": _points(estimate.points)} if estimate.points else {}),
         "hypotheses": [
             {
                 "T_world_object": plain(rival.T_world_object),
@@ -122,6 +124,24 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
 def _rounded(residuals: Mapping[str, float | None]) -> dict[str, float | None]:
     """To the digits that anybody looks at."""
     return {k: None if r is None else float(f"{r:.4g}") for k, r in residuals.items()}
+
+
+def _labels(labels: Mapping[str, Label]) -> dict[str, Any]:
+    """What features were met by, exactly as it was detected."""
+    return {
+        name: {
+            "at": plain(label.at),
+            **({} if label.detection is None else {"detection": label.detection}),
+        }
+        for name, label in labels.items()
+    }
+
+
+def _points(points: Mapping[str, MeasuredPoint]) -> dict[str, Any]:
+    return {
+        name: {"at": plain(point.at), "residual": float(f"{point.residual:.4g}")}
+        for name, point in points.items()
+    }
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -12,7 +12,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mixpose import rigid
 from mixpose.errors import RecordingError
 from mixpose.poses.header import FORMAT, UNITS_PER_METRE, VERSION
-from mixpose.records import Floats, Hypothesis, SensorReport, Status, label_of
+from mixpose.records import (
+    Floats,
+    Hypothesis,
+    Label,
+    MeasuredPoint,
+    SensorReport,
+    Status,
+    label_of,
+)
 
 # Files by other people round their rotations to a few digits.
 RIGID_TOLERANCE = 1e-3
@@ -44,6 +52,7 @@ class PoseLine:
     latency_ms: float | None
     instance: int | None = None
     confidence: float | None = None
+    points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -66,12 +75,23 @@ class _Hypothesis(_Line):
     weight: float
 
 
+class _Label(_Line):
+    at: Annotated[list[float], Field(min_length=1, max_length=3)]
+    detection: Annotated[int, Field(ge=0)] | None = None
+
+
+class _Point(_Line):
+    at: Annotated[list[float], Field(min_length=3, max_length=3)]
+    residual: Annotated[float, Field(ge=0)]
+
+
 class _Sensor(_Line):
     used: bool = True
     explained: float | None = None
     rms: float | None = None
     why: str | None = None
     residuals: dict[str, Annotated[float, Field(ge=0)] | None] = {}
+    labels: dict[str, _Label] = {}
 
 
 class _Pose(_Line):
@@ -87,6 +107,7 @@ class _Pose(_Line):
     hypotheses: list[_Hypothesis] = []
     latency_ms: float | None = None
     confidence: Annotated[float, Field(ge=0, le=1)] | None = None
+    points: dict[str, _Point] = {}
 
 
 class _Header(_Line):
@@ -133,12 +154,7 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         T_world_object=T,
         covariance=_covariance(pose.covariance, where),
         score=pose.score,
-        sensors={
-            name: SensorReport(
-                report.used, report.explained, report.rms, report.why, report.residuals
-            )
-            for name, report in pose.sensors.items()
-        },
+        sensors={name: _report(report) for name, report in pose.sensors.items()},
         hypotheses=tuple(
             Hypothesis(_motion(rival.T_world_object, f"{where}: hypotheses"), rival.weight)
             for rival in pose.hypotheses
@@ -146,6 +162,21 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         latency_ms=pose.latency_ms,
         instance=pose.instance,
         confidence=pose.confidence,
+        points={
+            name: MeasuredPoint(np.array(point.at), point.residual)
+            for name, point in pose.points.items()
+        },
+    )
+
+
+def _report(sensor: _Sensor) -> SensorReport:
+    return SensorReport(
+        sensor.used,
+        sensor.explained,
+        sensor.rms,
+        sensor.why,
+        sensor.residuals,
+        {name: Label(np.array(one.at), one.detection) for name, one in sensor.labels.items()},
     )
 
 

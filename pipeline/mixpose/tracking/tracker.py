@@ -273,6 +273,13 @@ def _offsets(used: Matches) -> dict[str, Offsets]:
     offsets = {}
     for k, (name, m, sigma) in enumerate(zip(used.names, used.dimensions, used.sigmas.tolist())):
         i = np.flatnonzero(used.weights[k])
-        y, by_shift = used.offsets[k, i, :m], used.J[k, i, :m, :3]
-        offsets[name] = Offsets(i, used.shares[k, i] > 0, sigma * y, sigma * by_shift)
+        y, by_shift = sigma * used.offsets[k, i, :m], used.J[k, i, :m, :3]
+        by, places = used.detections[k, i], used.places[k, i, :m]
+        alike = (by[:, None] == by) & (by >= 0)[:, None]
+        shared = alike.sum(axis=1) > 1
+        # offsets of two that share a detection are those of their middle
+        middle = alike @ places / np.maximum(alike.sum(axis=1), 1)[:, None]
+        observed = np.where(shared[:, None], middle, places) + y
+        met = used.shares[k, i] > 0
+        offsets[name] = Offsets(i, met, y, sigma * by_shift, observed, shared)
     return offsets

@@ -1,0 +1,189 @@
+"""``mixpose convert -o markers.c3d`` or ``.trc``: trajectories of the labelled markers."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.cli.notices import say, warn
+from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.errors import SessionError
+from mixpose.poses.c3d_file import write_c3d
+from mixpose.poses.jsonl import PoseFile
+from mixpose.poses.poseline import PoseLine
+from mixpose.poses.trajectories import Trajectories, rate_of
+from mixpose.poses.trc import write_trc
+from mixpose.rigid import transform
+from mixpose.session import Session
+from mixpose.whole_files import appearing_whole
+
+FORMATS = ("c3d", "trc")
+
+MOST_PLACES = 50_000_000
+"""Of all markers in all frames: they are held in memory, with 50 bytes each."""
+
+
+def write_markers(
+    poses: PoseFile,
+    lines: Sequence[PoseLine],
+    session: Session,
+    output: Path | None,
+    format_name: str,
+    *,
+    measured: bool,
+    fps: float | None,
+) -> None:
+    """Write where the markers of all bodies were: measured where they were, else by the pose.
+
+    Parameters
+    ----------
+    poses : PoseFile
+    lines : sequence of PoseLine
+        Of these, those to write.
+    session : Session
+        That of the poses: it has the markers.
+    output : Path or None
+        None is standard output, for ``trc``.
+    format_name : {"c3d", "trc"}
+    measured : bool
+        Whether what no sensors measured stays a gap.
+    fps : float or None
+        Frames per second, in place of the times of the poses.
+
+    Raises
+    ------
+    SessionError
+        If a package is missing, or poses and options do not go together.
+    RecordingError
+        If the poses hold what such a file cannot.
+    """
+    if format_name == "c3d":
+        _require_c3d(output)
+    if output is not None:
+        refuse_to_overwrite_but(output, [poses.path], "mixpose")
+    if not any(line.points for line in lines):
+        without = f"{poses.path}: no frame has a marker that was measured"
+        hint = "run again with --labels, and two sensors or more that see a marker"
+        if measured:
+            raise SessionError(f"--measured: {without}; {hint}")
+        warn(f"{without}; all places are by the pose; {hint}")
+    trajectories = trajectories_of(poses, lines, session, measured=measured, fps=fps)
+    if output is None:
+        write_trc(sys.stdout, trajectories, "markers.trc")
+        return
+    with appearing_whole(output) as part:
+        if format_name == "trc":
+            with part.open("w", encoding="utf-8", newline="\n") as stream:
+                write_trc(stream, trajectories, output.name)
+        else:
+            if not write_c3d(part, trajectories):
+                warn(f"{output}: frames are numbered from 1, not from {trajectories.first}")
+    _say(trajectories, output)
+
+
+def trajectories_of(
+    poses: PoseFile,
+    lines: Sequence[PoseLine],
+    session: Session,
+    *,
+    measured: bool,
+    fps: float | None = None,
+) -> Trajectories:
+    """Collect the places of all markers from pose lines; arguments as in `write_markers`."""
+    bodies = _bodies(poses, lines, session)
+    names = [(label, name) for label, body in bodies.items() for name in body.labels]
+    columns = {pair: k for k, pair in enumerate(names)}
+    frames = [line.frame for line in poses.poses]
+    first, count = min(frames), max(frames) - min(frames) + 1
+    if count * len(names) > MOST_PLACES:
+        raise SessionError(
+            f"{poses.path}: {len(names)} markers in frames {first} to {max(frames)}, allowed are "
+            f"{MOST_PLACES} places; convert one object with --object, or run a part"
+        )
+    shape = count, len(names)
+    places, residuals = np.full((*shape, 3), np.nan), np.full(shape, np.nan)
+    sensors = [setup.name for setup in session.sensors]
+    by_sensor = np.zeros((*shape, len(sensors)), dtype=np.bool_)
+    for line in lines:
+        if line.T_world_object is None:
+            continue
+        row, body = line.frame - first, bodies[line.label]
+        own = [columns[line.label, name] for name in body.labels]
+        if not measured:
+            places[row, own] = transform(line.T_world_object, body.means)
+        for name, point in line.points.items():
+            k = columns.get((line.label, name))
+            if k is None:
+                raise SessionError(
+                    f"{poses.path}: frame {line.frame}: {line.label} has no marker {name!r} in "
+                    f"{session.path}; name the session of the poses with --session"
+                )
+            places[row, k], residuals[row, k] = point.at, point.residual
+            by_sensor[row, k] = [
+                name in line.sensors[one].labels if one in line.sensors else False
+                for one in sensors
+            ]
+    several = len(bodies) > 1
+    return Trajectories(
+        tuple(f"{label}:{name}" if several else name for label, name in names),
+        places,
+        residuals,
+        by_sensor,
+        first,
+        fps or _rate(poses),
+        session.unit,
+    )
+
+
+def _bodies(poses: PoseFile, lines: Sequence[PoseLine], session: Session) -> Mapping[str, Body]:
+    """The bodies that lines are of, by their labels, in the order of the session."""
+    known = {label: one.body for one in session.objects for label in one.labels}
+    wanted = {line.label for line in lines}
+    for label in wanted - known.keys():
+        raise SessionError(
+            f"{poses.path}: has poses of {label}, and {session.path} has {', '.join(known)}; "
+            "name the session of the poses with --session"
+        )
+    if not wanted:
+        raise SessionError(f"{poses.path}: no pose is left to write")
+    return {label: body for label, body in known.items() if label in wanted}
+
+
+def _rate(poses: PoseFile) -> float:
+    """Frames per second by the times of the poses; 1 where they have none."""
+    found = rate_of(poses.poses)
+    if found is None:
+        warn(f"{poses.path}: has no times; the rate is told as 1 frame a second; --fps says more")
+        return 1.0
+    rate, off = found
+    if off > 0.5:
+        warn(
+            f"{poses.path}: frames are up to {off:.2g} of a frame's time off an even rate of "
+            f"{rate:.6g} a second, which is all that the file can say"
+        )
+    return rate
+
+
+def _require_c3d(output: Path | None) -> None:
+    if output is None:
+        raise SessionError("--format c3d: needs -o FILE.c3d, it is no text")
+    if find_spec("ezc3d") is None:
+        raise SessionError(
+            "--format c3d: needs the package ezc3d; install it with: "
+            "python -m pip install 'mixpose[c3d]'; .trc needs none"
+        )
+
+
+def _say(trajectories: Trajectories, output: Path) -> None:
+    frames, markers = trajectories.is_known.shape
+    known, measured = trajectories.is_known.sum(), trajectories.is_measured.sum()
+    say(
+        f"{markers} marker{'s' * (markers != 1)} in {frames} frame{'s' * (frames != 1)}: "
+        f"{measured} places measured, {known - measured} by the pose, "
+        f"{trajectories.is_known.size - known} gaps -> {output}"
+    )
