@@ -80,9 +80,8 @@ def write_markers(
         if format_name == "trc":
             with part.open("w", encoding="utf-8", newline="\n") as stream:
                 write_trc(stream, trajectories, output.name)
-        else:
-            if not write_c3d(part, trajectories):
-                warn(f"{output}: frames are numbered from 1, not from {trajectories.first}")
+        elif not write_c3d(part, trajectories):
+            warn(f"{output}: frames are numbered from 1, not from {trajectories.first}")
     _say(trajectories, output)
 
 
