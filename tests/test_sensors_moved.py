@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from mixpose.rigid import from_rotation_vector, inverse, perturb, transform
 from mixpose.sensors import (
     SENSOR_MODELS,
+    CloudSensor,
     FisheyeCamera,
     ParallelBeam,
     PinholeCamera,
@@ -27,8 +28,10 @@ SENSORS: dict[str, Sensor] = {
     "pinhole with a lens": PinholeCamera(K, BARREL, IMAGE, PLACE),
     "fisheye": FisheyeCamera(K / 1.5, np.array([0.05, -0.01, 2e-3, -3e-4]), IMAGE, PLACE),
     "parallel": ParallelBeam(0.5, np.array([640.0, 512.0]), IMAGE, PLACE),
+    "cloud": CloudSensor(PLACE),
     "lateration": RangeSensor(np.array([100.0, -900.0, 30.0]), 2.0, (500.0, 1400.0)),
 }
+WITHOUT_RAYS = ("cloud", "lateration")
 MOTION = perturb(np.eye(4), np.array([30.0, -20.0, 50.0, 0.2, -0.5, 0.3]))
 
 
@@ -63,7 +66,7 @@ def test_a_moved_sensor_stays_the_sensor_that_it_was(name: str) -> None:
     np.testing.assert_allclose(back.project(x)[0], sensor.project(x)[0], rtol=1e-12, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", [name for name in SENSORS if name != "lateration"])
+@pytest.mark.parametrize("name", [name for name in SENSORS if name not in WITHOUT_RAYS])
 def test_rays_pass_through_the_points_that_are_seen_there(name: str) -> None:
     sensor, x = SENSORS[name], points()
     y, seen = sensor.project(x)
@@ -82,7 +85,7 @@ def test_rays_pass_through_the_points_that_are_seen_there(name: str) -> None:
     assert ((rays.directions * sensor.towards(x[seen])).sum(axis=1) < 0).all()
 
 
-@pytest.mark.parametrize("name", [name for name in SENSORS if name != "lateration"])
+@pytest.mark.parametrize("name", [name for name in SENSORS if name not in WITHOUT_RAYS])
 def test_points_along_a_ray_are_seen_at_its_pixel(name: str) -> None:
     sensor = SENSORS[name]
     y, seen = sensor.project(points(60))
@@ -94,7 +97,7 @@ def test_points_along_a_ray_are_seen_at_its_pixel(name: str) -> None:
         np.testing.assert_allclose(again, rays.pixels, atol=2e-3)
 
 
-@pytest.mark.parametrize("name", [name for name in SENSORS if name != "lateration"])
+@pytest.mark.parametrize("name", [name for name in SENSORS if name not in WITHOUT_RAYS])
 def test_a_pixel_covers_the_length_across_a_ray_that_is_stated(name: str) -> None:
     sensor, x = SENSORS[name], points(60)
     y, J, seen = sensor.linearise(x)
@@ -111,6 +114,7 @@ def test_a_pixel_covers_the_length_across_a_ray_that_is_stated(name: str) -> Non
 
 def test_a_range_leaves_no_line_of_sight() -> None:
     assert SENSORS["lateration"].rays(np.array([[900.0]])) is None
+    assert SENSORS["cloud"].rays(np.zeros((1, 3))) is None
 
 
 def test_detections_that_no_point_causes_have_no_ray() -> None:

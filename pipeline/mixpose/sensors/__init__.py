@@ -7,6 +7,14 @@ from __future__ import annotations
 
 from mixpose.sensors.base import OUTSIDE, AffineSensor, Sensor
 from mixpose.sensors.batch import SensorBatch
+from mixpose.sensors.cloud import (
+    PLANES,
+    CloudPlane,
+    CloudSensor,
+    as_images,
+    clouds_among,
+    from_planes,
+)
 from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted
 from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
@@ -21,13 +29,17 @@ SENSOR_MODELS: dict[str, type[Sensor]] = {
     "fisheye": FisheyeCamera,
     "parallel": ParallelBeam,
     "lateration": RangeSensor,
+    "cloud": CloudSensor,
 }
 
 __all__ = [
     "OUTSIDE",
+    "PLANES",
     "SENSOR_MODELS",
     "AffineSensor",
     "CalibrationError",
+    "CloudPlane",
+    "CloudSensor",
     "FisheyeCamera",
     "Motion",
     "ParallelBeam",
@@ -37,9 +49,12 @@ __all__ = [
     "RollingSensor",
     "Sensor",
     "SensorBatch",
+    "as_images",
     "by_calibration",
+    "clouds_among",
     "doubted",
     "facing",
+    "from_planes",
     "in_motion",
     "moments",
     "side_by_side",

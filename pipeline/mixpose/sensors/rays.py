@@ -31,6 +31,9 @@ class Rays:
     offset, slope : float
         Length that a px covers across the ray at a distance d from its origin:
         ``offset + slope * d``.
+    cloud : object or None
+        Of lines that images of one cloud of points give: the same for each of its images, in which
+        the lines of one point have the same number.
     """
 
     origins: Floats
@@ -39,6 +42,7 @@ class Rays:
     central: bool
     offset: float
     slope: float
+    cloud: object = None
 
     def __len__(self) -> int:
         return len(self.origins)
@@ -52,6 +56,7 @@ class Rays:
             self.central,
             self.offset,
             self.slope,
+            self.cloud,
         )
 
 
