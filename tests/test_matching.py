@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from detections import view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.density import peak
+from mixpose.density import Observation, peak
 from mixpose.matching import AssociationRules, ErrorRules, Matches, associate, crowding
 from mixpose.matching.associate import _residuals
-from mixpose.objective import matched_objective
+from mixpose.objective import View, matched_objective
+from mixpose.records import PointPattern
 from mixpose.rigid import from_parts
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import PLANES, CloudSensor, PinholeCamera
 
 Floats = NDArray[np.float64]
 
@@ -115,3 +119,20 @@ def test_detections_beside_the_body_that_belong_to_none_are_unmatched() -> None:
     assert met([*corners, *beside], *corners).unmatched_nearby.tolist() == [0.0]
     assert met([(226.0, 150.0)], *corners).unmatched_nearby.tolist() == [0.0]
     assert met([(224.0, 150.0)], *corners).unmatched_nearby.tolist() == [1.0]
+
+
+def test_what_is_one_behind_the_other_in_an_image_is_told_apart_in_space() -> None:
+    body = Body("b", tuple(PointFeature(p) for p in 40 * np.eye(3)))
+    at = body.means
+    # nearer to the first marker than its own point in the first image, and 100 mm behind it
+    points = np.concatenate([at + np.array([0.5, 0.5, 0]), at[:1] + np.array([0, 0, 100])])
+    seen = Observation(PointPattern(points, np.ones(4)), 1.5)
+    views = [
+        View(name, plane, replace(seen, pattern=PointPattern(points[:, axes], np.ones(4))))
+        for plane, (name, axes) in zip(CloudSensor().planes, PLANES, strict=True)
+    ]
+    objective = matched_objective(views, body, [1.5] * 3)
+    found = associate(objective, np.eye(4), AssociationRules(), 0.05)
+    np.testing.assert_array_equal(found.detections, [[0, 1, 2]] * len(PLANES))
+    assert float(found.measurements.sum()) == 9.0
+    assert float(found.squares.sum()) == pytest.approx(3 * 0.5 / 1.5**2)

@@ -172,9 +172,23 @@ _RECORD = (
     Mutant(
         "matching-ranges-have-two-coordinates",
         "matching/matches.py",
-        "return self.met * self.dimensions",
-        "return self.met * 2",
+        "self.met * self.dimensions * self.parts",
+        "self.met * 2 * self.parts",
         "ranges seem to fix poses that they leave open",
+    ),
+    Mutant(
+        "matching-points-in-space-have-six-coordinates",
+        "matching/associate.py",
+        "parts[planes] = 0.5",
+        "parts[planes] = 1.0",
+        "points in space fix poses that they leave open",
+    ),
+    Mutant(
+        "matching-images-of-a-cloud-are-met-apart",
+        "matching/associate.py",
+        "for planes in clouds:  # each coordinate",
+        "for planes in ():  # each coordinate",
+        "a point that is one behind another in an image is taken for it",
     ),
     Mutant(
         "matching-filled-up-with-the-first-detection",

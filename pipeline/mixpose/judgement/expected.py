@@ -10,7 +10,7 @@ from mixpose.body import Body
 from mixpose.judgement.noise import inverted
 from mixpose.objective import project_body
 from mixpose.records import Floats, Mask
-from mixpose.sensors import Sensor
+from mixpose.sensors import Sensor, as_images
 
 
 def invert_information(information: Floats, free: Mask) -> Floats:
@@ -37,8 +37,9 @@ def expected_covariance(
     As `invert_information` has it, in the axes of `mixpose.rigid`; and the number of features
     that each sensor sees.
     """
-    at = project_body(tuple(sensors), body).project(T_world_object[None])
-    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(sigmas)[:, None]
+    images, deviations, first = as_images(sensors, sigmas)
+    at = project_body(images, body).project(T_world_object[None])
+    J, weights = at.J[:, 0], at.weights[:, 0] / np.square(deviations)[:, None]
     information = np.einsum("ln,lnmi,lnmj->ij", weights, J, J)
-    counts = np.rint(at.weights[:, 0].sum(axis=1)).astype(int).tolist()
+    counts = np.rint(at.weights[first, 0].sum(axis=1)).astype(int).tolist()
     return invert_information(information, free), counts

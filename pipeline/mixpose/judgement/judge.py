@@ -315,7 +315,9 @@ def _in_space(
     """
     *K, L, N = near.shape
     J, r = found.J[..., :3] / roots[..., None, None], found.offsets / roots[..., None]
-    rows = (J * near[..., None, None]).swapaxes(-4, -3).reshape(*K, N, 2 * L, 3).swapaxes(-2, -1)
+    roots_of_parts = np.sqrt(found.each_part)[:, None]
+    r, weighed = r * roots_of_parts[..., None], near * roots_of_parts
+    rows = (J * weighed[..., None, None]).swapaxes(-4, -3).reshape(*K, N, 2 * L, 3).swapaxes(-2, -1)
     A = rows @ rows.swapaxes(-2, -1)
     A.reshape(*K, N, 9)[..., ::4] += 1 / sizes[..., None, None] ** 2
     pull = rows @ r.swapaxes(-3, -2).reshape(*K, N, 2 * L, 1)

@@ -333,7 +333,7 @@ def information_of(found: Matches, variances: Floats, spreads: Floats | None = N
     *poses, sensors, n, m, _ = found.J.shape
     by_feature, weights = (
         (*poses, n, sensors * m, 6),
-        found.shares / (variances[..., None] + found.extra),
+        found.shares * found.each_part[:, None] / (variances[..., None] + found.extra),
     )
     rows = found.J, weights[..., None, None] * found.J
     J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]

@@ -20,7 +20,7 @@ from mixpose.matching.matches import Matches
 from mixpose.objective import MatchedObjective, View, in_image
 from mixpose.records import Floats, Indices, Mask, PointPattern
 from mixpose.rigid import transform
-from mixpose.sensors import by_calibration
+from mixpose.sensors import by_calibration, clouds_among, from_planes
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,9 @@ def associate(
     met = np.zeros(weights.shape), np.zeros(y.shape), *np.full((2, *weights.shape), -1)
     shares, offsets, by, partner = met
     is_open = seen & (product > 0)[:, None]
+    clouds = clouds_among([view.sensor for view in views])
     others = _to_nearest(
-        y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met
+        y, weights, detections, rules.reach_squared * reach, is_open, rules.merged, met, clouds
     )
     is_grid = [view.observation.cell is not None for view in views]
     for k in np.flatnonzero(is_grid & is_open.any(axis=1)).tolist() if any(is_grid) else ():
@@ -87,9 +88,20 @@ def associate(
         unseen=(match.faced[:, 0] & ~seen) @ body.nodes.weights,
         merged=merged,
         beside=np.where(seen, np.sqrt(others) / sigmas[:, None], np.nan),
+        parts=parts_of(len(views), clouds),
         **_surroundings(objective, y, seen, shares, detections, rules, narrowest),
         by_calibration=_by_calibration(objective, T_world_object),
     )
+
+
+def parts_of(count: int, clouds: Sequence[Sequence[int]]) -> Floats | float:
+    """`Matches.parts` of so many sensors: a coordinate of a cloud is in two of its images."""
+    if not clouds:
+        return 1.0
+    parts = np.ones(count)
+    for planes in clouds:
+        parts[planes] = 0.5
+    return parts
 
 
 def _detections(views: Sequence[View]) -> Floats:
@@ -123,14 +135,19 @@ def _to_nearest(
     is_open: Mask,
     merged: bool,
     met: tuple[Floats, Floats, Indices, Indices],
+    clouds: Sequence[Sequence[int]] = (),
 ) -> Floats:
     """Write what the nearest detections meet, each taken once or by a pair of features.
+
+    Images of one of the `clouds` are met together, by distances in space.
 
     Returns squared distances (L, n) to the nearest detections but these.
     """
     shares, offsets, by, _ = met
     away = detections[:, None] - y[:, :, None]
     squared = np.vecdot(away, away)
+    for planes in clouds:  # each coordinate is in two of them
+        squared[planes] = squared[planes].sum(axis=0) / 2
     pairs = np.nonzero((squared <= reach[..., None]) & is_open[..., None])
     order, taken = squared[pairs].argsort(kind="stable"), set[tuple[int, int]]()
     for k, i, j in zip(*(index[order].tolist() for index in pairs), strict=True):
@@ -139,7 +156,8 @@ def _to_nearest(
             shares[k, i], offsets[k, i], by[k, i] = weights[k, i], away[k, i, j], j
     if merged and len(taken) < len(order):
         # only a feature near a detection that is taken can share it
-        for k in np.unique(pairs[0][by[pairs[:2]] < 0]).tolist():
+        in_clouds = {k for planes in clouds for k in planes}  # where points do not run together
+        for k in set(np.unique(pairs[0][by[pairs[:2]] < 0]).tolist()) - in_clouds:
             _run_together(y[k], weights[k], reach[k], is_open[k], [array[k] for array in met])
     own = (by >= 0).nonzero()
     squared[*own, by[own]] = np.nan
@@ -226,6 +244,10 @@ def _surroundings(
     around = upper if rules.crowded else np.full_like(upper, np.nan)
     met = shares.sum(axis=1)
     crowd, others = crowding(detections, lower, around, smallest, met)
+    for planes in clouds_among([view.sensor for view in objective.views]):
+        points, low, high = (from_planes(one[planes]) for one in (detections, lower, around))
+        least = rules.min_region * float(sigmas[planes[0]])
+        others[planes] = crowding(points, low, high, least, met[planes[0]], deep=1.0)[1]
     crowd, others = crowd * sigmas**2, others * sigmas**3
     count = (detections[..., 0] == detections[..., 0]).sum(axis=1).astype(np.float64)
     unmatched = np.zeros(len(sigmas))
@@ -254,13 +276,18 @@ def _surroundings(
 
 
 def crowding(
-    points: Floats, lower: Floats, upper: Floats, smallest: Floats | float, met: Floats
+    points: Floats,
+    lower: Floats,
+    upper: Floats,
+    smallest: Floats | float,
+    met: Floats,
+    deep: float = 1.5,
 ) -> tuple[Floats, Floats]:
     """Detections (..., M, m), NaN where there are fewer, per unit of coordinates (...,).
 
     Of all, or in boxes (..., m) where they are denser; a side counts as `smallest` at least.  Then
-    per unit to the power 3/2 m, without those in the boxes that meet (...,) the body: so dense are
-    points in space that are as deep as they are wide.
+    per unit to the power `deep` m, without those in the boxes that meet (...,) the body: so dense
+    are points in space that images show, which are as deep as they are wide.
     """
     number = (points[..., 0] == points[..., 0]).sum(axis=-1)
     extent = np.fmax.reduce(points, axis=-2) - np.fmin.reduce(points, axis=-2)
@@ -268,7 +295,7 @@ def crowding(
     away = np.abs(points - ((lower + upper) / 2)[..., None, :])
     inside = (away <= sides[..., None, :] / 2).all(axis=-1).sum(axis=-1)
     overall, own = np.fmax(extent, smallest).prod(axis=-1), sides.prod(axis=-1)
-    beside = np.maximum(number / overall**1.5, (inside - met) / own**1.5)
+    beside = np.maximum(number / overall**deep, (inside - met) / own**deep)
     return np.maximum(number / overall, inside / own), beside
 
 

@@ -51,6 +51,7 @@ class Matches:
     finest: Floats  # (..., L) narrowest blur at which the density can be looked up, σ_ε
     extra: Floats  # (..., L, N) variances of what meets them beyond the noise, σ_ε²: of what is cut
     by_calibration: Floats | None = None  # (..., L, N, 2, Q) offsets, σ_ε, by Q stated errors
+    parts: Floats | float = 1.0  # (L,) that a coordinate counts: 1/2 where two images show it
 
     def at(self, index: int | list[int] | None) -> Matches:
         """At one of K poses; None makes K = 1 of one."""
@@ -58,7 +59,7 @@ class Matches:
             name: None if (array := getattr(self, name)) is None else array[index]
             for name in _BY_POSE
         }
-        return Matches(self.names, self.dimensions, self.sigmas, **arrays)
+        return Matches(self.names, self.dimensions, self.sigmas, **arrays, parts=self.parts)
 
     def of_sensors(self, chosen: Sequence[int] | Mask | Indices) -> Matches:
         """Some of the sensors, by numbers or a mask, at one pose."""
@@ -68,6 +69,7 @@ class Matches:
             names=tuple([self.names[k] for k in numbers]),
             dimensions=self.dimensions[numbers],
             sigmas=self.sigmas[numbers],
+            parts=self.each_part[numbers],
         )
 
     @classmethod
@@ -113,14 +115,19 @@ class Matches:
         return np.asarray(self.met / np.maximum(self.expected + self.unseen, 1e-12))
 
     @property
+    def each_part(self) -> Floats:
+        """`parts` as an array (L,)."""
+        return np.zeros(len(self.names)) + self.parts
+
+    @property
     def measurements(self) -> Floats:
         """Number of coordinates that are met (..., L)."""
-        return self.met * self.dimensions
+        return np.asarray(self.met * self.dimensions * self.parts)
 
     @cached_property
     def squares(self) -> Floats:
-        """Sum of the squared offsets (..., L), σ_ε²."""
-        return np.asarray(np.vecdot(self.shares, self.squared))
+        """Sum of the squared offsets (..., L), σ_ε², of coordinates that count."""
+        return np.asarray(np.vecdot(self.shares, self.squared) * self.parts)
 
     @cached_property
     def met_by(self) -> Indices:
@@ -130,7 +137,8 @@ class Matches:
     @property
     def rms(self) -> list[float | None]:
         """Root mean square of the offsets of each sensor at one pose, sensor units."""
-        mean = self.sigmas * np.sqrt(self.squares / np.maximum(self.met, 1e-12))
+        squares = np.vecdot(self.shares, self.squared)
+        mean = self.sigmas * np.sqrt(squares / np.maximum(self.met, 1e-12))
         return [r if m > 0 else None for r, m in zip(mean.tolist(), self.met.tolist())]
 
     def rows(self) -> tuple[Floats, Floats]:
@@ -141,7 +149,7 @@ class Matches:
         return J, (roots * self.offsets).reshape(L, m * N)
 
 
-_BY_SENSOR = ("names", "dimensions", "sigmas")
+_BY_SENSOR = ("names", "dimensions", "sigmas", "parts")
 _BY_POSE = tuple([one.name for one in fields(Matches) if one.name not in _BY_SENSOR])
 
 
@@ -232,7 +240,7 @@ def _seen_at(
     expected = ((before / rules.blur) ** 2)[:, None]
     alike = expected / (expected + matches.extra)
     squared = matches.squared * alike
-    weights = matches.shares * alike * welsch(squared, blurs)
+    weights = matches.shares * alike * welsch(squared, blurs) * matches.each_part[:, None]
     sums = map(sum, weights.tolist()), np.vecdot(weights, squared).tolist()
     coordinates, squares, degrees = [], [], []
     for m, blur, weight, square in zip(matches.dimensions.tolist(), blurs.tolist(), *sums):

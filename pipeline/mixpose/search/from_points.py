@@ -86,6 +86,8 @@ def triangulate(
         )
         good = (gap <= tolerance) & (sine2 > min_sine**2)
         good &= ~((a.central & (s <= 0)) | (b.central & (t <= 0)))
+        if a.cloud is not None and a.cloud is b.cloud:  # which belong together is known
+            good &= np.eye(*good.shape, dtype=np.bool_)
         points, pairs, allowed = (on_a + on_b)[good] / 2, np.argwhere(good), tolerance[good]
         meetings.append(
             TriangulatedPoints(

@@ -19,13 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from mixpose.body import Body
 from mixpose.judgement import odds_of, paid_by_count
-from mixpose.matching import Matches, crowding
+from mixpose.matching import Matches, crowding, parts_of
 from mixpose.objective import MatchedObjective, View, matched_objective, project_body
 from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
-from mixpose.sensors import Rays
+from mixpose.sensors import Rays, clouds_among, from_planes
 
 
 class LabelImage(NamedTuple):
@@ -48,6 +48,8 @@ def label_image(problem: SearchProblem, sensor: SensorDetections, rays: Rays) ->
     to_plane, eye = np.column_stack([axes, -axes @ centre]), np.append(centre, 1.0)
     if not rays.central:
         to_plane[2], eye = [0.0, 0.0, 0.0, 1.0], np.append(-middle, 0.0)
+    if rays.cloud is not None:
+        eye = np.zeros(4)  # seen from all sides
     unit = rays.slope if rays.central else rays.offset
     points = rays.origins + rays.directions
     plane = points @ to_plane[:, :3].T + to_plane[:, 3]
@@ -95,7 +97,7 @@ def count_inliers(images: Sequence[LabelImage], body: Body, poses: Floats) -> tu
             column = np.clip(u * scale, 0.0, columns - 1.0).astype(np.int32)
             row = np.clip(v * scale, 0.0, rows - 1.0).astype(np.int32)
             met = np.take(image.cells, row * columns + column)
-            if body.normals is not None:
+            if body.normals is not None and image.eye.any():
                 outward = (axes[..., :3] @ body.normals.T).reshape(3, -1)
                 towards = image.eye[:3, None] - image.eye[3] * world
                 met = np.where((outward * towards).sum(axis=0) > 0, met, 0)
@@ -138,14 +140,24 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
     by = np.full(seen.shape, -1)
     boxes = np.where(seen[..., None] & rules.crowded, y, np.nan)
     lower, upper = np.fmin.reduce(boxes, axis=2), np.fmax.reduce(boxes, axis=2)
+    pairs = _met_in_space(problem, y, seen)
     for k, (sensor, sigma) in enumerate(zip(sensors, sigmas, strict=True)):
         points, smallest = sensor.points, rules.min_region * sigma
-        pose, feature, detection = _pairs(y[:, k], seen[:, k], points, problem.reach(sensor))
+        pose, feature, detection = pairs.get(k) or _pairs(
+            y[:, k], seen[:, k], points, problem.reach(sensor)
+        )
         shares[pose, k, feature], by[pose, k, feature] = 1.0, detection
         offsets[pose, k, feature] = (points[detection] - y[pose, k, feature]) / sigma
         boxes_of = points, lower[:, k], upper[:, k], smallest, shares[:, k].sum(axis=1)
         in_view, in_space = crowding(*boxes_of)
         crowd[:, k], others[:, k] = in_view * sigma**2, in_space * sigma**3
+    clouds = clouds_among([one.view.sensor for one in sensors])
+    for planes in clouds:
+        points = from_planes(np.array([sensors[k].points for k in planes]))
+        low, high = (from_planes(one[:, planes].swapaxes(0, 1)) for one in (lower, upper))
+        least, met = rules.min_region * sigmas[planes[0]], shares[:, planes[0]].sum(axis=1)
+        dense = crowding(points, low, high, least, met, deep=1.0)[1]
+        others[:, planes] = dense[:, None] * sigmas[planes] ** 3
     nothing = np.zeros(crowd.shape)
     return Matches(
         names=tuple(one.view.name for one in sensors),
@@ -167,7 +179,21 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         beside=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),
         finest=nothing + 1.0,
+        parts=parts_of(len(sensors), clouds),
     )
+
+
+def _met_in_space(
+    problem: SearchProblem, y: Floats, seen: Mask
+) -> dict[int, tuple[Indices, Indices, Indices]]:
+    """By sensor what `_pairs` gives, for images of clouds: the same in all three."""
+    sensors, pairs = problem.detections, dict[int, tuple[Indices, Indices, Indices]]()
+    for planes in clouds_among([one.view.sensor for one in sensors]):
+        points = from_planes(np.array([sensors[k].points for k in planes]))
+        places = from_planes(y[:, planes].swapaxes(0, 1))
+        found = _pairs(places, seen[:, planes[0]], points, problem.reach(sensors[planes[0]]))
+        pairs |= dict.fromkeys(planes, found)
+    return pairs
 
 
 def _pairs(y: Floats, seen: Mask, points: Floats, reach: float) -> tuple[Indices, Indices, Indices]:

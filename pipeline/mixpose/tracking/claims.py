@@ -17,6 +17,7 @@ from mixpose.body import Body
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, Indices, Mask
+from mixpose.sensors import clouds_among
 from mixpose.tracking.rules import SceneRules
 
 Met: TypeAlias = tuple[Indices, Floats]  # detections (K,) of a pose, squared offsets (K,) in σ_ε²
@@ -68,7 +69,7 @@ class Claims:
         """Each detection is that of the nearest feature of bodies, `gate` σ_ε off at most."""
         whose = np.array([-1, *(k for k, some in places.items() for _ in some)], dtype=np.intp)
         away = cdist(self.places, np.concatenate([self.places[:0], *places.values()]))
-        return replace(self, owners=whose[np.insert(away, 0, gate, axis=1).argmin(axis=1)])
+        return self._agreed(whose[np.insert(away, 0, gate, axis=1).argmin(axis=1)])
 
     def met_by(self, pose: ScoredPose, left: Mask) -> Met:
         """What a pose meets of the detections that are left for its body."""
@@ -84,7 +85,7 @@ class Claims:
         for k, (numbers, squared) in met.items():
             nearer = squared < nearest[numbers]
             owners[numbers[nearer]], nearest[numbers[nearer]] = k, squared[nearer]
-        return replace(self, owners=owners)
+        return self._agreed(owners)
 
     def without_merged(
         self, met: Mapping[int, Met], places: Mapping[int, Floats], rules: SceneRules
@@ -96,6 +97,18 @@ class Claims:
             others = np.concatenate([self.places[:0], *(places[j] for j in places if j != k)])
             near = cdist(self.places[loose], others).min(axis=1, initial=np.inf) < rules.touching
             owners[loose[near]] = -2
+        return self._agreed(owners)
+
+    def _agreed(self, owners: Indices) -> Claims:
+        """With owners (D,); a point of a cloud belongs to whom two of its three images give it."""
+        owners = owners.copy()
+        for planes in clouds_among([view.sensor for view in self.views]):
+            rows = [slice(*self.begins[k : k + 2].tolist()) for k in planes]
+            first, second, third = (owners[row] for row in rows)
+            both = np.where(second == third, second, -1)
+            common = np.where((first == second) | (first == third), first, both)
+            for row in rows:
+                owners[row] = common
         return replace(self, owners=owners)
 
 
