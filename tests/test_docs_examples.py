@@ -137,7 +137,8 @@ def test_the_page_about_markers_can_be_followed_from_a_checkout(
 
 
 @pytest.mark.parametrize(
-    ("page", "written"), [("importing", "poses.jsonl"), ("design", "design.png")]
+    ("page", "written"),
+    [("importing", "poses.jsonl"), ("design", "design.png"), ("clouds", "markers.trc")],
 )
 def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(
     page: str,

@@ -19,7 +19,6 @@ from mixpose.body import Body, PointFeature
 from mixpose.cli import main, markers
 from mixpose.density import Observation
 from mixpose.errors import RecordingError
-from mixpose.objective import View
 from mixpose.poses.jsonl import PoseFile, read_poses
 from mixpose.poses.poseline import PoseLine
 from mixpose.poses.trajectories import Trajectories, rate_of
@@ -132,21 +131,19 @@ ASIDE = np.array([0.02, -0.01, 0.03])  # by which the second marker is not where
 
 def seen_aside(angle_deg: float, *, shared: bool = False) -> Estimate:
     """The body as two parallel-beam cameras at an angle see it, its second marker bent aside."""
-    views, offsets = [], {}
+    seen, offsets = {}, {}
     for name, turn in (("a", 0.0), ("b", angle_deg)):
         T = from_rotation_vector([0, np.radians(turn), 0], [0, 0, 0])
         sensor = ParallelBeam(0.5, np.zeros(2), None, T)
         at = sensor.linearise(BODY.means)
         points = BODY.means + np.eye(3)[1][:, None] * ASIDE
-        seen, _ = sensor.project(points)
-        views.append(View(name, sensor, Observation(PointPattern(seen, np.ones(3)), 1.5)))
+        y, _ = sensor.project(points)
+        seen[name] = Observation(PointPattern(y, np.ones(3)), 1.5)
         pair = np.array([shared, shared, False])
-        offsets[name] = Offsets(
-            np.arange(3), np.ones(3, dtype=bool), seen - at[0], at[1], seen, pair
-        )
+        offsets[name] = Offsets(np.arange(3), np.ones(3, dtype=bool), y - at[0], at[1], y, pair)
     reports = {name: SensorReport(True) for name in offsets}
     pose = Estimate(0, None, "cube", "ok", np.eye(4), None, 1.0, reports, measured=lambda: offsets)
-    return labelled(pose, views, BODY)
+    return labelled(pose, seen, BODY)
 
 
 def test_a_marker_that_is_bent_aside_is_measured_where_it_is() -> None:

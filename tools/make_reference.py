@@ -39,6 +39,7 @@ from mixpose.session.schema_sensors import (
     CalibrationErrorTable,
     CalibrationTable,
     CameraTable,
+    CloudTable,
     LaterationTable,
     ParallelTable,
     PlacedTable,
@@ -64,6 +65,7 @@ SECTIONS: list[tuple[str, type[Table], tuple[type[Table], ...]]] = [
     ("`calibration_error = { ... }`", CalibrationErrorTable, ()),
     ('`[[sensor]]` with `model = "parallel"`', ParallelTable, (PlacedTable,)),
     ('`[[sensor]]` with `model = "lateration"`', LaterationTable, (SensorTable,)),
+    ('`[[sensor]]` with `model = "cloud"`', CloudTable, (SensorTable,)),
 ]
 
 SESSION_HEAD = f"""\

@@ -15,7 +15,7 @@ import numpy as np
 from mixpose.density import Observation
 from mixpose.errors import SessionError
 from mixpose.extraction import Window, extract
-from mixpose.frames import Source, SourceSpec, open_source, pair, paired_by_stamp
+from mixpose.frames import SensorKind, Source, SourceSpec, open_source, pair, paired_by_stamp
 from mixpose.limits import MOST_DETECTIONS
 from mixpose.objective import View
 from mixpose.records import (
@@ -29,9 +29,19 @@ from mixpose.records import (
     SensorReport,
 )
 from mixpose.selection import ALL_FRAMES, Selection
-from mixpose.sensors import doubted
+from mixpose.sensors import CloudSensor, doubted
 from mixpose.threads import one_blas_thread
-from mixpose.tracking import DelayEvidence, Scene, Track, Tracker, WindowedScene, labelled
+from mixpose.tracking import (
+    DelayEvidence,
+    Scene,
+    Track,
+    Tracker,
+    WindowedScene,
+    labelled,
+    plane_names,
+    plane_views,
+    with_clouds,
+)
 
 if TYPE_CHECKING:
     from mixpose.body import Body
@@ -57,6 +67,10 @@ class Memory:
     """
 
     tracks: tuple[Track, ...]
+
+
+_KINDS: dict[str, SensorKind] = {"lateration": "lateration", "cloud": "cloud"}
+"""What is read for sensors that are no cameras."""
 
 
 Remember: TypeAlias = Callable[[Memory], None]
@@ -198,7 +212,7 @@ def source_spec(session: Session, setup: SensorSetup, replaced: str | None) -> S
         sensor=setup.name,
         source=setup.source if replaced is None else replaced,
         base=session.folder if replaced is None else Path(),
-        kind="lateration" if setup.model == "lateration" else "camera",
+        kind=_KINDS.get(setup.model, "camera"),
         resolution=setup.resolution,
         times=setup.times,
         fps=setup.fps,
@@ -219,6 +233,7 @@ def _estimates(
 ) -> Generator[Estimate, None, None]:
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
     bodies = {one.body.name: one.body for one in session.objects}
+    clouds = clouds_of(session)
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -231,8 +246,12 @@ def _estimates(
                     _images(frame_set),
                 )
             latency_ms = 1e3 * (time.perf_counter() - began)
+            views = as_sensors(session, frame_set, views)
+            seen = {view.name: view.observation for view in views}
             for k, one in enumerate(estimates):
-                estimate = labelled(one, views, bodies[one.object]) if labels else one
+                estimate = with_clouds(one, clouds)
+                if labels:
+                    estimate = labelled(estimate, seen, bodies[one.object])
                 estimate = _with_silent_sensors(estimate, session.sensors)
                 estimate = replace(estimate, latency_ms=latency_ms)
                 if watch is not None:
@@ -256,7 +275,7 @@ def _windowed(session: Session) -> dict[str, Sensor]:
     return {
         setup.name: setup.sensor
         for setup in session.sensors
-        if setup.model != "lateration"
+        if setup.model not in _KINDS
         and setup.extract.method == "blobs"
         and (setup.extract.threshold == "auto" or not isinstance(setup.extract.threshold, str))
     }
@@ -271,7 +290,11 @@ def observe(
         frame = frame_set.frames.get(setup.name)
         if frame is not None:
             observation = observation_of(session, setup, frame, (windows or {}).get(setup.name))
-            views.append(_view(setup, observation, frame_set, frame))
+            view = _view(setup, observation, frame_set, frame)
+            if isinstance(setup.sensor, CloudSensor):
+                views += plane_views(view.name, setup.sensor, observation, view.delay)
+            else:
+                views.append(view)
     return views
 
 
@@ -337,6 +360,28 @@ def _refuse_code(session: Session, method: str) -> None:
             "names; if you trust it, add --allow-code (in Python: load_session(..., "
             "allow_code=True))"
         )
+
+
+def clouds_of(session: Session) -> dict[str, CloudSensor]:
+    """The clouds among the sensors of a session."""
+    found = {setup.name: setup.sensor for setup in session.sensors}
+    return {name: one for name, one in found.items() if isinstance(one, CloudSensor)}
+
+
+def as_sensors(session: Session, frame_set: FrameSet, views: list[View]) -> list[View]:
+    """A view of each sensor that has a frame: clouds in space, not by their images."""
+    clouds = clouds_of(session)
+    if not clouds:
+        return views
+    by_name = {view.name: view for view in views}
+    for setup in session.sensors:
+        frame = frame_set.frames.get(setup.name)
+        if setup.name in clouds and frame is not None:
+            observation = observation_of(session, setup, frame)
+            by_name[setup.name] = _view(setup, observation, frame_set, frame)
+            for name in plane_names(setup.name):
+                by_name.pop(name)
+    return list(by_name.values())
 
 
 def _with_silent_sensors(estimate: Estimate, setups: Sequence[SensorSetup]) -> Estimate:

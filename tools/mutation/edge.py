@@ -302,7 +302,7 @@ _RUNNER = (
     Mutant(
         "runner-ranges-are-cameras",
         "runner.py",
-        'kind="lateration" if setup.model == "lateration" else "camera"',
+        'kind=_KINDS.get(setup.model, "camera")',
         'kind="camera"',
         "tables of ranges are refused",
     ),

@@ -13,8 +13,8 @@ from mixpose.fit import EstimatorOptions
 from mixpose.objective import View
 from mixpose.records import Floats, PointPattern
 from mixpose.rigid import inverse
-from mixpose.sensors import Sensor
-from mixpose.tracking import Tracker
+from mixpose.sensors import CloudSensor, Sensor
+from mixpose.tracking import Tracker, plane_views
 
 _LEAST = 4  # detections: three leave four poses of any triangle
 
@@ -60,7 +60,10 @@ def hypotheses(
     # the world is put where the camera is, so that poses are relative to it
     own = sensor.moved(inverse(sensor.T_sensor_world))  # type: ignore[attr-defined]
     pattern = PointPattern(points, np.ones(len(points)))
-    views = [View(name, own, Observation(pattern, sigma))]
+    seen = Observation(pattern, sigma)
+    views = [View(name, own, seen)]
+    if isinstance(own, CloudSensor):
+        views = plane_views(name, own, seen, 0.0)
     tracker = Tracker.create(body, EstimatorOptions())
     frame = tracker.data(tracker.begin(), 0, None, views)
     ranked = tracker.explain(frame)

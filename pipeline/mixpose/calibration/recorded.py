@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from contextlib import closing
 
 import numpy as np
@@ -17,7 +17,7 @@ from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, pair
 from mixpose.objective import View
 from mixpose.records import Floats, FrameSet, GridPattern, PointPattern
-from mixpose.runner import observe, open_sources
+from mixpose.runner import as_sensors, observe, open_sources
 from mixpose.search import is_pointlike, peaks
 from mixpose.session import Session
 
@@ -110,7 +110,7 @@ def _stretches(
 
 
 def _seen(session: Session, frame_set: FrameSet, index: Mapping[str, int]) -> SeenFrame:
-    views: Sequence[View] = observe(session, frame_set)
+    views = as_sensors(session, frame_set, observe(session, frame_set))
     points = {index[view.name]: _points(view) for view in views}
     times = {
         index[name]: frame.time_s

@@ -13,7 +13,7 @@ from mixpose.body import Body
 from mixpose.objective.projection import pose_jacobian
 from mixpose.records import Floats
 from mixpose.rigid import from_parts, inverse
-from mixpose.sensors import RangeSensor, Sensor
+from mixpose.sensors import CloudSensor, RangeSensor, Sensor
 
 Kind: TypeAlias = Literal[
     "pose",
@@ -129,6 +129,8 @@ def kinds_of(sensor: Sensor) -> tuple[Kind, ...]:
         return ("position", "range_bias", "delay", "drift")
     if not hasattr(sensor, "T_sensor_world"):
         return ("delay", "drift")
+    if isinstance(sensor, CloudSensor):
+        return ("pose", "delay", "drift")
     if hasattr(sensor, "camera_matrix"):
         return ("pose", "focal", "principal_point", "distortion", "delay", "drift")
     return ("pose", "principal_point", "delay", "drift")

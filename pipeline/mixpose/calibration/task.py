@@ -13,7 +13,7 @@ from mixpose.calibration.alone import Hypotheses
 from mixpose.calibration.frames import SeenFrame
 from mixpose.calibration.rig import Kind, Rig
 from mixpose.records import Floats
-from mixpose.sensors import CalibrationError
+from mixpose.sensors import CalibrationError, CloudSensor
 
 Progress = Callable[[str, int, int], None]
 """Called with a stage, how much of it is done, and of how much."""
@@ -72,7 +72,11 @@ class Task:
     @property
     def cameras(self) -> tuple[int, ...]:
         """Sensors that know a pose alone."""
-        return tuple(k for k, one in enumerate(self.rig.sensors) if hasattr(one, "camera_matrix"))
+        alone = [
+            hasattr(one, "camera_matrix") or isinstance(one, CloudSensor)
+            for one in self.rig.sensors
+        ]
+        return tuple(np.flatnonzero(alone).tolist())
 
     @property
     def times_matter(self) -> bool:

@@ -19,7 +19,7 @@ from mixpose.optimise import NewtonOptions, Quadratic, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import perturb, rotation_angle_deg
 from mixpose.search import far_apart, sparse, spread_turns
-from mixpose.sensors import RangeSensor
+from mixpose.sensors import RangeSensor, as_images
 from mixpose.session import SensorSetup
 
 NOISE_OF_SIGMA = 0.2
@@ -58,10 +58,11 @@ def look_alikes(
 
     Each is other than the pose, the body's symmetries and the others in the list by a degree.
     """
-    sensors, few = tuple(setup.sensor for setup in setups), sparse(body, _MOST_FEATURES)
+    noises = [noise_of(setup) for setup in setups]
+    sensors, noise, _ = as_images([setup.sensor for setup in setups], noises)
+    few = sparse(body, _MOST_FEATURES)
     projection = project_body(sensors, body)
     here = projection.project(T_world_object[None])
-    noise = np.array([noise_of(setup) for setup in setups])
     measured = _Measured(projection, here.y[:, 0], here.seen[:, 0], noise)
     if not measured.seen.any() or not free[3:].any():
         return []

@@ -11,7 +11,14 @@ import numpy as np
 from mixpose.checking.typical import typical_poses
 from mixpose.records import Floats, Mask
 from mixpose.rigid import inverse, rotation_angle_deg, transform
-from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor, Sensor
+from mixpose.sensors import (
+    CloudSensor,
+    FisheyeCamera,
+    ParallelBeam,
+    PinholeCamera,
+    RangeSensor,
+    Sensor,
+)
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.visible_spots import facing
 
@@ -29,6 +36,8 @@ def placement_lines(setup: SensorSetup, unit: str) -> list[str]:
     sensor = setup.sensor
     if isinstance(sensor, RangeSensor):
         return [f"at {_numbers(sensor.position)} {unit} in the world"]
+    if isinstance(sensor, CloudSensor):
+        return [f"axes from {_numbers(inverse(sensor.T_sensor_world)[:3, 3])} {unit} in the world"]
     if not isinstance(sensor, Looking):
         return []
     looks = f"looks along {_numbers(sensor.T_sensor_world[2, :3], 3)}"

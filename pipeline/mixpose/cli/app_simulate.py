@@ -35,7 +35,8 @@ Rotation = Annotated[
 Period = Annotated[float, typer.Option("--period", help="Seconds in which the motion comes round.")]
 PixelNoise = Annotated[float, typer.Option(help="Error of detections in a camera's table, px.")]
 RangeNoise = Annotated[
-    float | None, typer.Option(help="Error of detections in a range table, length units.")
+    float | None,
+    typer.Option(help="Error of detections in tables of ranges and of clouds, length units."),
 ]
 RangeSnr = Annotated[float, typer.Option(help="Height of a profile's peak over its noise.")]
 Deform = Annotated[

@@ -253,7 +253,7 @@ def _geometry(setup: SensorSetup) -> str:
 
 def _extraction(setup: SensorSetup, length_unit: str) -> str:
     unit = "px" if setup.sensor.unit == "px" else length_unit
-    if setup.model == "lateration":
+    if setup.model in ("lateration", "cloud"):
         return f"sigma {setup.extract.sigma:g} {unit}"
     # corners are where dark and bright meet
     polarity = "" if setup.extract.method == "corners" else f" ({setup.extract.polarity})"

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from mixpose.body import Body
@@ -20,9 +21,10 @@ from mixpose.pictures.sheet import BODIES, inspection_pictures, possible_names, 
 from mixpose.pictures.signature import refuse_foreign, write_png
 from mixpose.poses.estimates import estimate_of
 from mixpose.poses.jsonl import read_poses
-from mixpose.records import Estimate, FrameSet
-from mixpose.runner import observe, open_sources, scene_of
+from mixpose.records import Estimate, FrameSet, PointPattern
+from mixpose.runner import clouds_of, observe, open_sources, scene_of
 from mixpose.session import Session, load_session
+from mixpose.tracking import with_clouds
 
 
 def inspect_frame(
@@ -70,23 +72,28 @@ def inspect_frame(
     else:
         estimates = _from_file(poses, session, number)
     bodies = [tracked.body for tracked in scene.bodies]
-    found = find_several(session.sensors, frame_set.frames, views, bodies, estimates)
+    clouds = clouds_of(session)
+    estimates = [with_clouds(one, clouds) for one in estimates]
+    drawn = tuple(setup for setup in session.sensors if setup.name not in clouds)
+    found = find_several(drawn, frame_set.frames, views, bodies, estimates)
+    shown = replace(session, sensors=drawn)
     pictures: dict[str, Picture] = {}
     lines = []
-    if len(bodies) > 1:
-        pictures[BODIES] = draw_scene(session, frame_set, *estimates)
+    if len(bodies) > 1 and drawn:
+        pictures[BODIES] = draw_scene(shown, frame_set, *estimates)
     each = zip(prefixes_of(session.labels), bodies, found, estimates, strict=True)
     for prefix, body, findings, estimate in each:
-        made = inspection_pictures(session, body, findings, estimate)
+        made = inspection_pictures(shown, body, findings, estimate) if drawn else {}
         pictures |= {prefix + name: picture for name, picture in made.items()}
         lines += _summary(session, body, estimate, findings, poses)
+        lines += _of_clouds(session, frame_set, body, estimate)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise SessionError(f"-o {folder}: cannot be made: {error.strerror}") from error
     for name, picture in pictures.items():
         write_png(folder / name, picture)
-    lines.append(f"pictures in {folder}: {', '.join(pictures)}")
+    lines.append(f"pictures in {folder}: {', '.join(pictures) or 'none'}")
     sys.stdout.write("\n".join(lines) + "\n")
 
 
@@ -138,6 +145,26 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
             )
         found.append(estimate_of(of_frame[0]))
     return found
+
+
+def _of_clouds(
+    session: Session, frame_set: FrameSet, body: Body, estimate: Estimate
+) -> Iterator[str]:
+    """What a pose meets of each cloud, of which there are no pictures."""
+    for name in clouds_of(session):
+        frame, report = frame_set.frames.get(name), estimate.sensors.get(name)
+        data = None if frame is None else frame.data
+        if not isinstance(data, PointPattern):
+            yield f"{name}: no frame"
+            continue
+        met = [r for r in report.residuals.values() if r is not None] if report else []
+        within = ""
+        if report is not None and report.rms is not None:
+            within = f" within {report.rms:.3g} {session.unit} RMS"
+        yield (
+            f"{name}: {len(data.points)} points found; the pose meets {len(met)} of {len(body)} "
+            f"features{within}; clouds are not drawn"
+        )
 
 
 def _summary(

@@ -44,6 +44,7 @@ _FIT_FOR: dict[SensorKind, tuple[set[SourceKind], str]] = {
         {"detections", "profiles"},
         "a .csv table of detections with a column range, or range profiles (.npy or .csv)",
     ),
+    "cloud": ({"detections"}, "a .csv table of points with columns x,y,z"),
 }
 
 

@@ -10,7 +10,7 @@ from typing import Literal, Protocol, TypeAlias
 from mixpose.errors import SessionError
 from mixpose.records import RawFrame
 
-SensorKind: TypeAlias = Literal["camera", "lateration"]
+SensorKind: TypeAlias = Literal["camera", "lateration", "cloud"]
 SourceKind: TypeAlias = Literal["images", "video", "live", "detections", "profiles"]
 
 # Frame numbers come from file names, which hold at most 255 digits.
@@ -33,7 +33,7 @@ class SourceSpec:
         list of images.
     base : Path
         Folder that a relative `source` starts from.
-    kind : {"camera", "lateration"}
+    kind : {"camera", "lateration", "cloud"}
         What the sensor measures.
     resolution : (width, height) or None
         Size of every image in px; None means like the first one.

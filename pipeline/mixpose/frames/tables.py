@@ -21,7 +21,11 @@ from mixpose.frames.times import Clock, FrameTimes, require_times
 from mixpose.limits import MOST_DETECTIONS, MOST_UNSORTED_ROWS
 from mixpose.records import Floats, PointPattern, RawFrame
 
-_COORDINATES: dict[SensorKind, tuple[str, ...]] = {"camera": ("u", "v"), "lateration": ("range",)}
+_COORDINATES: dict[SensorKind, tuple[str, ...]] = {
+    "camera": ("u", "v"),
+    "lateration": ("range",),
+    "cloud": ("x", "y", "z"),
+}
 
 # Squares of larger numbers overflow; shares of smaller weights are lost beside others.
 _LARGEST = 1e12

@@ -109,7 +109,7 @@ class ExtractTable(Table):
     """
     sigma: Annotated[
         Positive | None,
-        Field(description="greater than 0: px for cameras, a length for lateration"),
+        Field(description="greater than 0: px for cameras, a length for lateration and clouds"),
     ] = None
     """σ_ε, the width that each feature is given: up to about this far apart, in px or in `unit`,
     a predicted and a found feature draw each other in the final fit. For ranges set it to what they
@@ -119,7 +119,7 @@ class ExtractTable(Table):
     """
     spot_sigma: Annotated[
         Number | None,
-        Field(ge=0, description="at least 0: px for cameras, a length for lateration"),
+        Field(ge=0, description="at least 0: px for cameras, a length for lateration and clouds"),
     ] = None
     """Width (standard deviation) that features have already in grey values
     (`method = "intensity"`) and in range profiles, in px or in `unit`; with `method = "log"` that

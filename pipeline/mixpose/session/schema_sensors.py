@@ -117,9 +117,9 @@ class SensorTable(Table):
         str | tuple[str, ...], PlainValidator(read_source), Field(description=SOURCE_ALLOWED)
     ] = ()
     """The recording, relative to the session file: images, a video, a table of detections
-    (`frame` or `time_s`, then `u,v` or `range`, and optionally `weight`), or range profiles
-    (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the address of
-    a stream, a named pipe.
+    (`frame` or `time_s`, then `u,v`, `range` or `x,y,z`, and optionally `weight`), or range
+    profiles (`.npy` or `.csv`, a row per frame); or what is live: the number of a camera, the
+    address of a stream, a named pipe.
 
     Example: `source = "left*.png"`
     """
@@ -279,6 +279,26 @@ class LaterationTable(SensorTable):
     """
 
 
+class CloudTable(SensorTable, Placement):
+    """Points in space that nobody has labelled, from a system that triangulates by itself. The
+    source is a table with columns `x,y,z`, in `unit`.
+    """
+
+    model: Annotated[Literal["cloud"], Field(description='"cloud"')]
+    """Points in space.
+
+    Example: `model = "cloud"`
+    """
+    T_sensor_world: Annotated[
+        Floats | None, ArrayOf((4, 4), "a 4x4 matrix, four rows of four numbers")
+    ] = None
+    """Maps coordinates of the world to the axes that the points are in; in place of a rotation with
+    `translation`. Left out: the points are in the world's axes.
+
+    Example: `T_sensor_world = [[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 900], [0, 0, 0, 1]]`
+    """
+
+
 AnySensorTable: TypeAlias = Annotated[
-    CameraTable | ParallelTable | LaterationTable, Field(discriminator="model")
+    CameraTable | ParallelTable | LaterationTable | CloudTable, Field(discriminator="model")
 ]

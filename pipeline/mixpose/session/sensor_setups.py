@@ -15,6 +15,7 @@ from mixpose.records import Floats
 from mixpose.rigid import from_parts
 from mixpose.sensors import (
     CalibrationError,
+    CloudSensor,
     FisheyeCamera,
     ParallelBeam,
     PinholeCamera,
@@ -30,6 +31,7 @@ from mixpose.session.schema_sensors import (
     AnySensorTable,
     CalibrationTable,
     CameraTable,
+    CloudTable,
     LaterationTable,
     ParallelTable,
     PlacedTable,
@@ -135,12 +137,18 @@ def _build_sensor(
             _check_profile(table)
             # the far end of a profile is known only when its bins are counted
             sensor = RangeSensor(table.position, table.range_bias)
+        case CloudTable():
+            if table.delay == "estimate":
+                raise BadKeyError(
+                    'found "estimate" with model = "cloud"; allowed: seconds', "delay"
+                )
+            sensor = CloudSensor(_T_sensor_world(table))
     if getattr(table, "readout", 0.0) and resolution is None:
         raise BadKeyError("stands without resolution; allowed: with [width, height]", "readout")
     with under("extract"):
         extract = merge_extract(defaults, table.extract)
         _check_widths(extract, table)
-        if not isinstance(table, LaterationTable):
+        if not isinstance(table, LaterationTable | CloudTable):
             _check_extraction(extract)
     return SensorSetup(
         name=table.name,
@@ -164,6 +172,8 @@ def _calibration_error(table: AnySensorTable) -> CalibrationError | None:
     """What may be off, of things that such a sensor has."""
     if table.calibration_error is None:
         return None
+    if isinstance(table, CloudTable):
+        raise BadKeyError('stands with model = "cloud"; allowed: with others', "calibration_error")
     error = CalibrationError(**table.calibration_error.model_dump())
     is_range = isinstance(table, LaterationTable)
     for key in ("focal", "principal_point", "rotation_deg") if is_range else ("range_bias",):
@@ -226,6 +236,8 @@ def _calibrated(table: CameraTable, folder: Path) -> CalibratedCamera:
 
 def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
     """A density is as wide as its widths: without limits it would outgrow all memory."""
+    if isinstance(table, CloudTable):
+        return
     if not isinstance(table, LaterationTable):
         most, text = float(_WIDEST_PX), f"at most {_WIDEST_PX} px"
     elif table.bin_size is not None:
@@ -244,7 +256,7 @@ def _check_widths(extract: ExtractOptions, table: AnySensorTable) -> None:
             raise BadKeyError(f"found {getattr(extract, key):g}; allowed: {text}", key)
 
 
-def _T_sensor_world(table: PlacedTable) -> Floats:
+def _T_sensor_world(table: PlacedTable | CloudTable) -> Floats:
     T = read_motion(table, "T_sensor_world")
     return np.eye(4) if T is None else T
 

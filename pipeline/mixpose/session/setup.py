@@ -76,7 +76,7 @@ class SensorSetup:
     ----------
     name : str
         Unique in the session.
-    model : {"pinhole", "fisheye", "parallel", "lateration"}
+    model : {"pinhole", "fisheye", "parallel", "lateration", "cloud"}
     sensor : Sensor
         The calibrated geometry.
     source : str or tuple of str

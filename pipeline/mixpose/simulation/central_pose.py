@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from mixpose.body import Body
 from mixpose.errors import SessionError
 from mixpose.records import Floats
-from mixpose.rigid import from_parts
-from mixpose.sensors import FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
+from mixpose.rigid import from_parts, inverse
+from mixpose.sensors import CloudSensor, FisheyeCamera, ParallelBeam, PinholeCamera, RangeSensor
 from mixpose.session import SensorSetup, Session
 from mixpose.simulation.draws import Purpose, generator
 from mixpose.simulation.visible_spots import facing
@@ -83,7 +83,8 @@ def places(session: Session) -> list[Floats]:
     all_rays = [_ray(setup, radius) for setup in session.sensors]
     rays = [ray for ray in all_rays if ray is not None]
     if not rays:
-        return [_beside_ranges(session)]
+        clouds = [s.sensor for s in session.sensors if isinstance(s.sensor, CloudSensor)]
+        return [inverse(clouds[0].T_sensor_world)[:3, 3]] if clouds else [_beside_ranges(session)]
     origin = np.mean([ray.origin for ray in rays], axis=0)
     direction = np.mean([ray.direction for ray in rays], axis=0)
     ahead = origin + direction * float(np.mean([ray.distance or 0.0 for ray in rays]))

@@ -30,6 +30,7 @@ from mixpose.simulation.writers import (
 )
 
 _LINE_SPACING = 0.7  # of a spot's standard deviation: a line of spots looks even
+_CLOUD_NOISE = 0.2  # of sigma, which is a tolerance
 _TABLE_SPACING_PX = 2.0
 _SPOT_SIGMA_PX = 1.6
 _OPTICS_PX = 0.7  # standard deviation by which optics blur markers that have a size themselves
@@ -120,6 +121,9 @@ def plan_channel(
     shutter = shutter_of(setup, options, step_s)
     if setup.sensor.dimension == 1:
         channel = _range_channel(setup, files, body, motion, options, index)
+        return replace(channel, view=replace(channel.view, shutter=shutter), step_s=step_s)
+    if setup.sensor.dimension == 3:
+        channel = _cloud_channel(setup, files, body, motion, options)
         return replace(channel, view=replace(channel.view, shutter=shutter), step_s=step_s)
     assert setup.resolution is not None, "check_setup refuses this"
     channel = _camera_channel(setup, files, body, options, setup.resolution, fps, index)
@@ -221,15 +225,39 @@ def _range_channel(
     return Channel(files, view, options, lambda folder: ProfileWriter(files, folder, options, form))
 
 
+def _cloud_channel(
+    setup: SensorSetup, files: SourceFiles, body: Body, motion: Motion, options: SimulationOptions
+) -> Channel:
+    nearest, farthest = _around(setup, body, motion, options)
+    noise = options.range_noise
+    if noise is None:
+        noise = _CLOUD_NOISE * setup.extract.sigma
+    view = View(setup.sensor, nearest, farthest, np.ones(len(body)), setup.extract.sigma)
+    return Channel(
+        files,
+        view,
+        replace(options, brightness_spread=0.0),
+        lambda folder: DetectionWriter(files, folder, noise=noise, coordinates=("x", "y", "z")),
+    )
+
+
 def _ranges(
     setup: SensorSetup, body: Body, motion: Motion, options: SimulationOptions
 ) -> tuple[Floats, Floats]:
     """Bounds (1,), (1,) of the ranges that the moving body can have."""
+    nearest, farthest = _around(setup, body, motion, options)
+    return np.maximum(nearest, 0.0), farthest
+
+
+def _around(
+    setup: SensorSetup, body: Body, motion: Motion, options: SimulationOptions
+) -> tuple[Floats, Floats]:
+    """Bounds (m,), (m,) of lengths along the axes of a sensor that the moving body can have."""
     pivot_world = motion.T_world_object[:3, :3] @ motion.pivot + motion.T_world_object[:3, 3]
     middle, _ = setup.sensor.project(pivot_world)
     reach = motion.reach + np.linalg.norm(body.nodes.points - motion.pivot, axis=1).max()
     reach += 4 * body.spread if options.deform else 0.0
-    return np.maximum(middle - reach, 0.0), middle + reach
+    return middle - reach, middle + reach
 
 
 def _levels(count: int, options: SimulationOptions, index: int) -> Floats:

@@ -177,6 +177,13 @@ def _source_files(
         )
     if setup.sensor.dimension == 1:
         return _range_files(setup, source)
+    if setup.sensor.dimension == 3:
+        path = _filled(source) if isinstance(source, str) else ""
+        if PurePosixPath(path).suffix.casefold() != ".csv":
+            raise SessionError(
+                f"{_where(setup.name)}: found {source!r}; allowed for clouds: a .csv table"
+            )
+        return SourceFiles(setup.name, "detections", path)
     files = _camera_files(setup.name, source, numbers)
     if files.path.casefold().endswith(".mp4") and any(n % 2 for n in setup.resolution or ()):
         raise SessionError(

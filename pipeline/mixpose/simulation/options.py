@@ -101,8 +101,8 @@ class SimulationOptions:
     pixel_noise : float
         Standard deviation of detections in a camera's table, px.
     range_noise : float or None
-        Standard deviation of detections in a range sensor's table, length units; None is
-        `sigma` of its ``[extract]``.
+        Standard deviation of detections in tables of ranges and clouds, length units; None is
+        `sigma` of its ``[extract]``, of clouds a fifth of it.
     range_width : float or None
         Standard deviation of a feature's peak in a range profile, length units; None is
         `spot_sigma` of the sensor's ``[extract]`` where that is given, else one and a half bins.

@@ -19,7 +19,7 @@ from mixpose.body import Body, SegmentFeature
 from mixpose.body.features import Feature, offsets
 from mixpose.records import Floats, Mask
 from mixpose.rigid import transform
-from mixpose.sensors import Sensor
+from mixpose.sensors import CloudSensor, Sensor
 from mixpose.simulation.options import SimulationOptions
 from mixpose.simulation.outlines import centroid, outline
 from mixpose.simulation.scenery import PoseAt, Scenery
@@ -181,6 +181,8 @@ def hidden_behind(
 ) -> Mask:
     """Which points (n, 3) the core of a body stands before."""
     hidden = np.zeros(len(points), dtype=np.bool_)
+    if isinstance(sensor, CloudSensor):  # seen from several sides
+        return hidden
     towards = sensor.towards(points)
     lengths = np.linalg.norm(towards, axis=1)
     units = towards / lengths[:, None]
@@ -246,7 +248,7 @@ def facing(
     sensor: Sensor, body: Body, T_world_object: Floats, mirror: Floats | None = None
 ) -> Mask:
     """Which features (N,) turn their front to a sensor; all of a body without normals."""
-    if body.normals is None:
+    if body.normals is None or isinstance(sensor, CloudSensor):
         return np.ones(len(body), dtype=np.bool_)
     M = T_world_object if mirror is None else mirror @ T_world_object
     R = M[:3, :3]

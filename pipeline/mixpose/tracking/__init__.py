@@ -1,5 +1,10 @@
 """Tracking: propose, fit, judge, decide, follow, from frame to frame."""
 
+from mixpose.tracking.clouds import (
+    plane_names as plane_names,
+    plane_views as plane_views,
+    with_clouds as with_clouds,
+)
 from mixpose.tracking.labels import labelled as labelled
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import (

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.objective import View
+from mixpose.density import Observation
 from mixpose.records import Estimate, Floats, Label, MeasuredPoint, Offsets
 from mixpose.rigid import transform
 
@@ -30,7 +30,10 @@ class LabelRules:
 
 
 def labelled(
-    estimate: Estimate, views: Sequence[View], body: Body, rules: LabelRules = LabelRules()
+    estimate: Estimate,
+    seen: Mapping[str, Observation],
+    body: Body,
+    rules: LabelRules = LabelRules(),
 ) -> Estimate:
     """An estimate with the labels of its detections, and the points in space that they measure.
 
@@ -38,7 +41,7 @@ def labelled(
     ----------
     estimate : Estimate
         Of a frame, as a tracker gives it.
-    views : sequence of View
+    seen : mapping of str to Observation
         All that the sensors saw in that frame.
     body : Body
         Of one point per feature; of others nothing is labelled.
@@ -53,14 +56,13 @@ def labelled(
     offsets, T = estimate.offsets, estimate.T_world_object
     if T is None or not offsets:
         return estimate
-    seen = {view.name: view for view in views}
     reports = {
         name: replace(report, labels=_labels(offsets[name], seen[name], body))
         if name in offsets
         else report
         for name, report in estimate.sensors.items()
     }
-    sigmas = {name: view.observation.sigma for name, view in seen.items()}
+    sigmas = {name: one.sigma for name, one in seen.items()}
     places = transform(T, body.means)
     points = {}
     for i, (label, place) in enumerate(zip(body.labels, places, strict=True)):
@@ -70,9 +72,9 @@ def labelled(
     return replace(estimate, sensors=reports, points=points)
 
 
-def _labels(own: Offsets, view: View, body: Body) -> dict[str, Label]:
+def _labels(own: Offsets, seen: Observation, body: Body) -> dict[str, Label]:
     """What one sensor met each feature by, exactly as it detected it."""
-    detections, labels = view.observation.points, {}
+    detections, labels = seen.points, {}
     for i, at in zip(own.features[own.met].tolist(), own.observed[own.met], strict=True):
         if detections is None:
             labels[body.labels[i]] = Label(at)
