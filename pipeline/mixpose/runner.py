@@ -212,6 +212,7 @@ def _estimates(
     remember: Remember | None,
 ) -> Generator[Estimate, None, None]:
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
+    tips = {one.body.name: one.body.tip for one in session.objects}
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -226,7 +227,8 @@ def _estimates(
             latency_ms = 1e3 * (time.perf_counter() - began)
             for k, one in enumerate(estimates):
                 estimate = _with_silent_sensors(one, session.sensors)
-                estimate = replace(estimate, latency_ms=latency_ms)
+                tip = tips[estimate.object]
+                estimate = replace(estimate, latency_ms=latency_ms, tip_object=tip)
                 if watch is not None:
                     watch(frame_set, views, estimate)
                 if remember is not None and k == 0:

@@ -29,6 +29,10 @@ class PoseLine:
         Where it stands in the file, from 1.
     score : float or None
         None where the line has none.
+    tip : (3,) float64 or None
+        Where the body's tip is in the world.
+    filled : bool
+        Whether nothing was measured in this frame.
     """
 
     line: int
@@ -44,6 +48,8 @@ class PoseLine:
     latency_ms: float | None
     instance: int | None = None
     confidence: float | None = None
+    tip: Floats | None = None
+    filled: bool = False
 
     @property
     def label(self) -> str:
@@ -87,6 +93,8 @@ class _Pose(_Line):
     hypotheses: list[_Hypothesis] = []
     latency_ms: float | None = None
     confidence: Annotated[float, Field(ge=0, le=1)] | None = None
+    tip: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    filled: bool = False
 
 
 class _Header(_Line):
@@ -146,6 +154,8 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
         latency_ms=pose.latency_ms,
         instance=pose.instance,
         confidence=pose.confidence,
+        tip=None if pose.tip is None else np.array(pose.tip, dtype=np.float64),
+        filled=pose.filled,
     )
 
 
