@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mixpose.cli.words import PosesFile
+from mixpose.cli.words import PosesFile, SessionFile
 
 
 class Motion(StrEnum):
@@ -18,6 +18,14 @@ class Motion(StrEnum):
     jerk = "jerk"
     snap = "snap"
     crackle = "crackle"
+
+
+class Up(StrEnum):
+    """Axes of a frame."""
+
+    x = "x"
+    y = "y"
+    z = "z"
 
 
 def smooth(
@@ -41,3 +49,49 @@ def smooth(
     from mixpose.cli.smooth import smooth_poses  # noqa: PLC0415
 
     smooth_poses(poses, output, fill_s=fill, motion=None if motion is None else motion.value)
+
+
+def pivot(
+    poses: PosesFile,
+    object: Annotated[
+        str | None, typer.Option(metavar="OBJECT", help="The tool, where there are several bodies.")
+    ] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OBJECT", help="The tip stays at a point of this body; else of the world."
+        ),
+    ] = None,
+    into: Annotated[
+        Path | None,
+        typer.Option(metavar="SESSION.toml", help="Write the tip into this session."),
+    ] = None,
+) -> None:
+    """The tip of a tool, from poses while it turns about its tip."""
+    from mixpose.cli.pivot import PivotRequest, pivot_poses  # noqa: PLC0415
+
+    pivot_poses(poses, PivotRequest(object, reference, into))
+
+
+def align(
+    session: SessionFile,
+    floor: Annotated[
+        list[str],
+        typer.Option(
+            metavar="POSES.jsonl|OBJECT@FRAME",
+            help="What lies on the floor: poses, or a body in a frame of the recording. Repeatable.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="ALIGNED.toml", help="The aligned session.")
+    ],
+    up: Annotated[Up, typer.Option(help="The axis that points up.")] = Up.z,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PATH", help="Recording of a sensor in place of the session's."),
+    ] = None,
+) -> None:
+    """A session in the frame of the floor: bodies, points or a plane that lie on it."""
+    from mixpose.cli.align import AlignRequest, align_session  # noqa: PLC0415
+
+    align_session(session, AlignRequest(tuple(floor), output, up.value, tuple(source or ())))

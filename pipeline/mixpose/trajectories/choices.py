@@ -85,8 +85,8 @@ def _followed(
         begun(_with_pose(track, pose), 0, model.order, white, track.moved) for pose in first.poses
     ]
     states = _joined(at_first)
-    paths = [(k,) for k in range(len(first.poses))]
-    logs = np.log(first.weights)
+    paths: list[tuple[int, ...]] = [(k,) for k in range(len(first.poses))]
+    logs: Floats = np.log(first.weights)
     for k, elapsed in enumerate(np.diff(track.times).tolist(), 1):
         ahead, _ = foretold(states, elapsed, np.repeat(noise, len(logs), axis=0))
         S = ahead.covariances[:, :6, :6] + white_part(track, k, white)

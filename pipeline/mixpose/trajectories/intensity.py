@@ -37,7 +37,8 @@ class SmoothingRules:
     )
     tail: float = constant(
         1.0,
-        "degree of freedom of the noise of motion: at corners of a path errors are then 1.2 times what covariances say, squared; with one intensity throughout 4",
+        "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 times "
+        "what covariances say, 4 times with one intensity throughout",
     )
     passes: int = constant(4, "over which sudden motion is told from steady: changes by 10 % then")
     foreign: float = constant(

@@ -1,8 +1,8 @@
 """How a body moves between frames: white noise in the highest derivative of its pose.
 
-A state is a pose and its first derivatives, velocity first; a turn has its angular velocity in world
-axes and the derivatives of that.  With white noise of the intensity q in the derivative of order p,
-over a time τ (Y. Bar-Shalom, *Estimation with Applications to Tracking and Navigation*, 6.2),
+A state is a pose and its first derivatives, velocity first; a turn has its angular velocity in
+world axes and the derivatives of that.  With white noise of the intensity q in the derivative of
+order p, over a time τ (Y. Bar-Shalom, *Estimation with Applications to Tracking and Navigation*, 6.2),
 
     F_ij = τ^(j-i) / (j-i)!,      Q_ij = q τ^(2p-1-i-j) / ((2p-1-i-j) (p-1-i)! (p-1-j)!)
 
@@ -10,8 +10,8 @@ Of a turn, ω(s) = Σ_j ω_j s^j / j!, the rotation over τ is exp(Ω), by W. Ma
 
     Ω = ∫ ω ds + ½ ∫ ω(s) × ∫_0^s ω dr ds + O(τ⁵)
 
-Errors of a state are twists as in `mixpose.rigid`, then errors of the derivatives.  All functions take
-many states at once, along the leading axes.
+Errors of a state are twists as in `mixpose.rigid`, then errors of the derivatives.  All functions
+take many states at once, along the leading axes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class States:
     @property
     def order(self) -> int:
         """p, of the derivative that takes white noise."""
-        return self.rates.shape[1] + 1
+        return int(self.rates.shape[1]) + 1
 
     def minus(self, other: States) -> Floats:
         """The errors (G, 6 p) that lead from other states to these."""
@@ -146,8 +146,8 @@ class Passage:
     Attributes
     ----------
     squared, degrees : (2,) float64
-        bᵀQb and tr NQ, of lengths and of turns: how large the noise was, in standard deviations, and
-        how many numbers of it are known.  In the mean they are equal.
+        bᵀQb and tr NQ, of lengths and of turns: how large the noise was, in standard deviations,
+        and how many numbers of it are known.  In the mean they are equal.
     """
 
     squared: Floats

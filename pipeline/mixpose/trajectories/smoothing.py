@@ -1,8 +1,8 @@
 """Poses of a body, each with what all frames say: fixed-interval smoothing.
 
 What is assumed of the covariances of a file: errors of different frames are independent, as far as
-the poses scatter about a smooth path as they say.  Where they scatter surely less, the share that is
-not seen is taken for an error that lasts, of a calibration or a marker, which no smoothing makes
+the poses scatter about a smooth path as they say.  Where they scatter surely less, the share that
+is not seen is taken for an error that lasts, of a calibration or a marker, which no smoothing makes
 smaller: it stays in the covariance as it was.  Where they scatter more, covariances are enlarged.
 """
 
@@ -121,15 +121,17 @@ def smooth_body(
     model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
     segments = _segments(ordered, at, posed, fill_s, rules)
     done: dict[int, Estimate] = {line.frame: estimate_of(line) for line in ordered}
-    counts = np.zeros(3, int)
+    counts = [0, 0, 0]
     refused: list[int] = []
     for segment in segments:
         found, own, foreign = _smoothed(segment, model, rules)
         done.update(found)
-        counts += own
+        counts = [a + b for a, b in zip(counts, own, strict=True)]
         refused += foreign
     estimates = tuple(done[frame] for frame in sorted(done))
-    return SmoothedBody(estimates, model, *counts.tolist(), tuple(refused), times is not None)
+    return SmoothedBody(
+        estimates, model, counts[0], counts[1], counts[2], tuple(refused), times is not None
+    )
 
 
 def _times(lines: Sequence[PoseLine]) -> Floats | None:
@@ -210,12 +212,12 @@ def _smoothed(
     chosen = _chosen(segment, model, rules)
     poses = segment.track.poses.copy()
     measured = segment.track.measured.copy()
-    for k, choice in chosen.items():
+    for k, made in chosen.items():
         line = segment.lines[k]
         assert line is not None
-        measured[k] = choice.which != NONE
+        measured[k] = made.which != NONE
         if measured[k]:
-            poses[k] = _alternatives(line).poses[choice.which]
+            poses[k] = _alternatives(line).poses[made.which]
     track = replace(segment.track, poses=poses, measured=measured)
     inside = np.flatnonzero(measured)
     if len(inside) < 2:
@@ -300,7 +302,7 @@ def _without_foreign(
 def _off(track: Track, result: SmoothedTrack, model: MotionModel) -> Floats:
     """Squared distance (N,) of each pose from what all others say: rᵀ(R − P)⁻¹r."""
     free = np.flatnonzero(track.free)
-    inner = np.ix_(range(len(track)), free, free)
+    inner = np.ix_(np.arange(len(track)), free, free)
     rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]
     own = (model.white * track.covariances - result.covariances)[inner]
     scale = np.sqrt(np.diagonal(track.covariances[inner], axis1=1, axis2=2))
