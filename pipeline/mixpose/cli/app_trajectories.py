@@ -79,7 +79,7 @@ def align(
         list[str],
         typer.Option(
             metavar="POSES.jsonl|OBJECT@FRAME",
-            help="What lies on the floor: poses, or a body in a frame of the recording. Repeatable.",
+            help="What lies on the floor: poses, or a body in a frame. Repeatable.",
         ),
     ],
     output: Annotated[

@@ -18,7 +18,7 @@ ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation
 
 
 def document_of(session: Session, target: Path) -> Any:
-    """The TOML document of a session, with paths as they are from the file it will be written to."""
+    """The TOML document of a session, with paths as they are from where it will be written."""
     document = tomlkit.parse(session.path.read_text(encoding="utf-8-sig"))
     _lead_back(document, session.folder, target.parent)
     return document

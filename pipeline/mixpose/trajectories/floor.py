@@ -1,4 +1,4 @@
-"""The frame of the world by what lies on the floor: a body, three points or a plane through many."""
+"""The frame of the world by what lies on the floor: a body, three points or a plane."""
 
 from __future__ import annotations
 

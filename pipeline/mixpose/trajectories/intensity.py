@@ -37,13 +37,15 @@ class SmoothingRules:
     )
     tail: float = constant(
         1.0,
-        "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 times "
-        "what covariances say, 4 times with one intensity throughout",
+        "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
+        "times what covariances say, 4 times with one intensity throughout",
     )
     passes: int = constant(4, "over which sudden motion is told from steady: changes by 10 % then")
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
     )
+    wrong: float = constant(1e-3, "of poses that are ok are wrong: confidence is 0.999")
+    reach: float = constant(3.0, "times the usual step, where a wrong pose is found")
     restarts: float = constant(20.0, "intervals without a pose, after which a track begins anew")
     paths: int = constant(16, "choices among hypotheses that are followed side by side")
     none: float = constant(
@@ -68,18 +70,20 @@ def fitted_model(track: Track, rules: SmoothingRules, motion: str | None = None)
     for name, order in ORDERS.items():
         x[2] = 0.0
         for width, points, along in _COARSE:
-            x, log_likelihood = _along(blocks, order, x, width, points, along)
+            x, log_likelihood = _along(blocks, order, x, width, points, along, rules)
         if name == motion or (motion is None and log_likelihood > best[0]):
             best = (log_likelihood, order, x)
         elif motion is None:
+            break
+        if name == motion:
             break
         # a derivative more takes e³ times less noise, about, in units of the poses'
         x = x - [3.0, 3.0, 0.0]
     order, shared = best[1:]
     x = shared * [1.0, 1.0, 0.0]
     for width, points in _FINE:
-        x, likely = _along(blocks, order, x, width, points, (0, 1))
-        shared, likelier = _along(blocks, order, shared, width, points, (2, 0, 1))
+        x, likely = _along(blocks, order, x, width, points, _EACH, rules)
+        shared, likelier = _along(blocks, order, shared, width, points, (*_SHARE, *_EACH), rules)
     if 2 * (likelier - likely) > rules.surely:
         x = shared
     return MotionModel(order, _intensities(track, order, x[None, :2])[0], float(np.exp(x[2])))
@@ -119,35 +123,59 @@ def _intensities(track: Track, order: int, x: Floats) -> Floats:
     return np.asarray(kinds / track.interval ** (2 * order - 1) * np.exp(x))
 
 
-# half-widths of a search, points in it, and along what: logarithms of intensities, and of the share
-_COARSE = ((10.0, 9, (0, 1)), (3.0, 7, (0, 1)), (2.0, 9, (2,)), (1.0, 5, (0, 1, 2)))
-_FINE = ((1.0, 5), (0.4, 5), (0.15, 5))
+# what is searched along, one after the other: logarithms of intensities, and of the share
+_BOTH, _EACH, _SHARE = ((0, 1),), ((0,), (1,)), ((2,),)
+# half-widths of a search in logarithms, and points in it; both kinds of motion at first, as with one
+# of them far off all poses look wrong
+_COARSE = (
+    (10.0, 9, _BOTH),
+    (5.0, 5, _EACH),
+    (2.0, 5, _EACH),
+    (2.0, 9, _SHARE),
+    (0.8, 5, (*_EACH, *_SHARE)),
+)
+_FINE = ((0.5, 5), (0.15, 3))
 
 
 def _along(
-    blocks: list[Track], order: int, x: Floats, width: float, points: int, along: tuple[int, ...]
+    blocks: list[Track],
+    order: int,
+    x: Floats,
+    width: float,
+    points: int,
+    along: tuple[tuple[int, ...], ...],
+    rules: SmoothingRules,
 ) -> tuple[Floats, float]:
     """The likeliest of points along each direction in turn."""
     best = -np.inf
-    for i in along:
+    for directions in along:
         tried = np.repeat(x[None], points, axis=0)
-        tried[:, i] += np.linspace(-width, width, points)
-        logs = sum(_log_likelihoods(block, order, tried) for block in blocks)
+        tried[:, directions] += np.linspace(-width, width, points)[:, None]
+        logs = sum(_log_likelihoods(block, order, tried, rules) for block in blocks)
         k = int(np.argmax(logs))
         x, best = tried[k], float(np.asarray(logs)[k])
     return x, best
 
 
-def _log_likelihoods(track: Track, order: int, x: Floats) -> Floats:
-    """Of the poses of a track after the first few, which tell the rates of all orders; (G,)."""
+def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules) -> Floats:
+    """Of the poses of a track after the first few, which tell the rates of all orders; (G,).
+
+    Now and then a pose that is ok is a wrong one: it may be anywhere where the body gets in a step.
+    """
     white = np.exp(x[:, 2])
     noise = noise_of(track, _intensities(track, order, x[:, :2]))
-    states = begun(track, 0, order, white, track.moved)
+    moved = track.moved
+    states = begun(track, 0, order, white, moved)
     steps = np.diff(track.times).tolist()
     total = np.zeros(len(x))
     for k, elapsed in enumerate(steps, 1):
         ahead, _ = foretold(states, elapsed, noise)
-        states, _, log = updated(ahead, track.poses[k], white_part(track, k, white))
+        R = white_part(track, k, white)
+        seen, _, log = updated(ahead, track.poses[k], R)
+        anywhere = np.diagonal(R, axis1=1, axis2=2) + (rules.reach * moved) ** 2
+        log_wrong = np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=1)
+        is_wrong = (log < log_wrong) & (k >= max(ORDERS.values()))
+        states = seen.mixed(ahead, is_wrong)
         if k >= max(ORDERS.values()):
-            total += log
+            total += np.logaddexp(log, log_wrong)
     return total

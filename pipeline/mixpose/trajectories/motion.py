@@ -2,7 +2,8 @@
 
 A state is a pose and its first derivatives, velocity first; a turn has its angular velocity in
 world axes and the derivatives of that.  With white noise of the intensity q in the derivative of
-order p, over a time τ (Y. Bar-Shalom, *Estimation with Applications to Tracking and Navigation*, 6.2),
+order p, over a time τ (Y. Bar-Shalom, *Estimation with Applications to Tracking and Navigation*,
+6.2),
 
     F_ij = τ^(j-i) / (j-i)!,      Q_ij = q τ^(2p-1-i-j) / ((2p-1-i-j) (p-1-i)! (p-1-j)!)
 
@@ -17,17 +18,26 @@ take many states at once, along the leading axes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import factorial
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from mixpose import rigid
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 
 ORDERS = {"acceleration": 2, "jerk": 3, "snap": 4, "crackle": 5}
 """What takes white noise, and the order of that derivative."""
 
+# [ω] of x -> ω × x is ω of these, row by row
+_ACROSS = np.array(
+    [
+        [0.0, 0, 0, 0, 0, -1, 0, 1, 0],
+        [0.0, 0, 1, 0, 0, 0, -1, 0, 0],
+        [0.0, -1, 0, 1, 0, 0, 0, 0, 0],
+    ]
+)
 _JITTER = 1e-13  # of correlations: rounding must not make them indefinite
 
 
@@ -63,6 +73,15 @@ class States:
         """These states moved by errors (G, 6 p), with other covariances."""
         poses = rigid.perturb(self.poses, errors[:, :6])
         return States(poses, self.rates + errors[:, 6:].reshape(self.rates.shape), covariances)
+
+    def mixed(self, others: States, is_other: Mask) -> States:
+        """These states, and others where (G,) says so."""
+        pairs = zip(
+            (self.poses, self.rates, self.covariances),
+            (others.poses, others.rates, others.covariances),
+            strict=True,
+        )
+        return States(*[np.where(is_other[:, None, None], b, a) for a, b in pairs])
 
     def of(self, which: Indices | list[int]) -> States:
         """Some of the states."""
@@ -197,31 +216,49 @@ def _turned(rates: Floats, elapsed: float) -> Floats:
     )
     angles = np.asarray(angles)
     if rates.shape[1] > 1:
-        angles = angles + np.cross(rates[:, 1], rates[:, 0]) * (elapsed**3 / 12)
-    if rates.shape[1] > 2:
-        angles = angles + np.cross(rates[:, 2], rates[:, 0]) * (elapsed**4 / 24)
+        changing = rates[:, 1] * (elapsed**3 / 12)
+        if rates.shape[1] > 2:
+            changing = changing + rates[:, 2] * (elapsed**4 / 24)
+        across = (changing @ _ACROSS).reshape(-1, 3, 3)
+        angles = angles + (across @ rates[:, 0, :, None])[..., 0]
     return angles
 
 
 def _transition(turned: Floats, powers: Floats) -> Floats:
-    """F (G, 6 p, 6 p); what a turn does to errors of turns is told to first order in it."""
+    """F (G, 6 p, 6 p); what a turn does to errors of rates is told to first order in it."""
     p = len(powers) - 1
-    F = np.zeros((len(turned), p, 6, p, 6))
-    for i in range(p):
-        for j in range(i, p):
-            F[:, i, range(6), j, range(6)] = powers[j - i]
-    across = np.cross(np.eye(3), turned[:, None])  # [Ω] x = Ω × x, rows
+    single = _upper(tuple(powers[:p].tolist()))
+    F = np.empty((len(turned), p, 6, p, 6))
+    F[...] = np.multiply.outer(single, np.eye(6)).swapaxes(1, 2)
     F[:, 0, 3:, 0, 3:] = rigid.rotation_matrix(turned)
-    for j in range(1, p):
-        F[:, 0, 3:, j, 3:] += across * (powers[j] / (j + 1))
+    # [Ω] of x -> Ω × x
+    across = (turned @ _ACROSS).reshape(-1, 3, 1, 3)
+    by_rate = powers[1:p] / np.arange(2, p + 1)
+    F[:, 0, 3:, 1:, 3:] += across * by_rate[:, None]
     return F.reshape(len(turned), 6 * p, 6 * p)
+
+
+@lru_cache(maxsize=64)
+def _upper(powers: tuple[float, ...]) -> Floats:
+    """Taylor's coefficients (p, p) of a step."""
+    p = len(powers)
+    i, j = np.indices((p, p))
+    return np.where(j >= i, np.array(powers)[np.maximum(j - i, 0)], 0.0)
 
 
 def _process_noise(elapsed: float, p: int, noise: Floats) -> Floats:
     """Q (G, 6 p, 6 p)."""
+    single = _noise_of_step(elapsed, p)
+    Q = np.zeros((len(noise), p, 6, p, 6))
+    of_each = range(6)
+    Q[:, :, of_each, :, of_each] = single * noise.T[:, :, None, None]
+    return Q.reshape(len(noise), 6 * p, 6 * p)
+
+
+@lru_cache(maxsize=64)
+def _noise_of_step(elapsed: float, p: int) -> Floats:
+    """Q (p, p) of one coordinate for the intensity 1."""
     i, j = np.indices((p, p))
     ahead = 2 * p - 1 - i - j
     down = np.array([factorial(p - 1 - k) for k in range(p)])
-    single = elapsed**ahead / (ahead * down[i] * down[j])
-    Q = np.einsum("ij,gk,kl->gikjl", single, noise, np.eye(6))
-    return np.asarray(Q.reshape(len(noise), 6 * p, 6 * p))
+    return np.asarray(elapsed**ahead / (ahead * down[i] * down[j]))

@@ -32,7 +32,7 @@ from mixpose.trajectories.track import (
 )
 from mixpose.trajectories.unfolding import unfolded
 
-_ONE_REFUSED = 3  # rounds in which poses are left out: one wrong pose may hide another
+_ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
 
 
 @dataclass(frozen=True)
@@ -284,32 +284,40 @@ def _without_foreign(
 ) -> tuple[Track, SmoothedTrack]:
     """A track without poses that lie where those around them forbid, and the track smoothed."""
     limit = float(chdtri(int(track.free.sum()), rules.foreign))
-    for _ in range(_ONE_REFUSED):
-        result = smooth_track(track, model, local_scales(track, model, rules))
-        off = _off(track, result, model)
-        # the farthest of neighbours pulls the others off
-        padded = np.pad(off, 1)
+    for _ in range(_ROUNDS):
+        # among motion that is steady a corner of the path looks foreign, too
+        off = _off(track, smooth_track(track, model), model, -1)
+        padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
         bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
         bad[[0, -1]] = False
+        if bad.any():
+            # but at a corner the others tell of sudden motion as well
+            rest = without(track, bad)
+            among = smooth_track(rest, model, local_scales(rest, model, rules))
+            bad &= _off(track, among, model, 1) > limit
         if not bad.any():
             break
         track = without(track, bad)
-    else:
-        result = smooth_track(track, model, local_scales(track, model, rules))
-    return track, result
+    return track, smooth_track(track, model, local_scales(track, model, rules))
 
 
-def _off(track: Track, result: SmoothedTrack, model: MotionModel) -> Floats:
-    """Squared distance (N,) of each pose from what all others say: rᵀ(R − P)⁻¹r."""
+def _off(track: Track, result: SmoothedTrack, model: MotionModel, sign: int) -> Floats:
+    """Squared distance (N,) of each pose from what all others say.
+
+    rᵀ(R − P)⁻¹r where the pose took part in the result, with the sign −1, and rᵀ(R + P)⁻¹r where
+    it did not.
+    """
     free = np.flatnonzero(track.free)
     inner = np.ix_(np.arange(len(track)), free, free)
     rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]
-    own = (model.white * track.covariances - result.covariances)[inner]
+    own = (model.white * track.covariances + sign * result.covariances)[inner]
     scale = np.sqrt(np.diagonal(track.covariances[inner], axis1=1, axis2=2))
-    own = own / scale[:, :, None] / scale[:, None] + 1e-9 * np.eye(len(free))
+    own = own / scale[:, :, None] / scale[:, None]
     values, vectors = np.linalg.eigh(own)
     along = np.einsum("kij,ki->kj", vectors, rest / scale)
-    squared = (along**2 / np.maximum(values, 1e-9)).sum(axis=1)
+    # where nothing but the pose itself tells of it, it is off by nothing
+    told = values > 1e-6 * model.white
+    squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
     return np.where(track.measured, squared, 0.0)
 
 
