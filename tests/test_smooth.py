@@ -47,13 +47,13 @@ def test_positions_are_those_of_least_squares_over_the_whole_recording() -> None
     # probability are the solution of one sparse system of equations, written out here
     n, step, q = 12, 0.1, 50.0
     rng = np.random.default_rng(3)
-    poses = rigid.from_parts(np.eye(3), np.cumsum(rng.normal(size=(n, 3)), axis=0))
+    poses = rigid.from_parts(np.eye(3), rng.normal(size=(n, 3)).cumsum(axis=0))
     covariance = covariance_of(0.5, 0.01)
     covariance[:3, 3:] = covariance[3:, :3] = 0
     track = track_of(
-        np.arange(n) * step,
+        np.linspace(0, (n - 1) * step, n),
         poses,
-        np.repeat(covariance[None], n, 0).astype(np.float64),
+        np.repeat(covariance[None], n, axis=0),
         np.ones(n, bool),
     )
     found = smooth_track(track, MotionModel(2, np.array([q, 1e-9])))

@@ -44,6 +44,9 @@ class SmoothingRules:
     foreign: float = constant(
         1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
     )
+    believed: float = constant(
+        0.5, "logarithm of the factor by which covariances are off: 0.6 to 1.6 times, as a rule"
+    )
     wrong: float = constant(1e-3, "of poses that are ok are wrong: confidence is 0.999")
     reach: float = constant(3.0, "times the usual step, where a wrong pose is found")
     restarts: float = constant(20.0, "intervals without a pose, after which a track begins anew")
@@ -125,8 +128,8 @@ def _intensities(track: Track, order: int, x: Floats) -> Floats:
 
 # what is searched along, one after the other: logarithms of intensities, and of the share
 _BOTH, _EACH, _SHARE = ((0, 1),), ((0,), (1,)), ((2,),)
-# half-widths of a search in logarithms, and points in it; both kinds of motion at first, as with one
-# of them far off all poses look wrong
+# half-widths of a search in logarithms, and points in it; both kinds of motion at first, as with
+# one of them far off all poses look wrong
 _COARSE = (
     (10.0, 9, _BOTH),
     (5.0, 5, _EACH),
@@ -152,6 +155,7 @@ def _along(
         tried = np.repeat(x[None], points, axis=0)
         tried[:, directions] += np.linspace(-width, width, points)[:, None]
         logs = sum(_log_likelihoods(block, order, tried, rules) for block in blocks)
+        logs = logs - 0.5 * (tried[:, 2] / rules.believed) ** 2
         k = int(np.argmax(logs))
         x, best = tried[k], float(np.asarray(logs)[k])
     return x, best
@@ -178,4 +182,4 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
         states = seen.mixed(ahead, is_wrong)
         if k >= max(ORDERS.values()):
             total += np.logaddexp(log, log_wrong)
-    return total
+    return np.asarray(total)
