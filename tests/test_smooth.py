@@ -35,7 +35,7 @@ from mixpose.trajectories.smoothing import smooth_body
 from mixpose.trajectories.track import MotionModel, smooth_track, track_of
 
 ROOT = Path(__file__).parents[1]
-QUICK = SmoothingRules(frames=60, block=60)  # enough to tell how the bodies of these tests move
+QUICK = SmoothingRules(frames=40, block=40)  # enough to tell how the bodies of these tests move
 
 
 def poses_of(estimates: tuple[Estimate, ...]) -> Floats:
@@ -128,7 +128,7 @@ def test_what_lasts_stays_in_the_covariance_and_what_scatters_more_enlarges_it(
     poses = measured(moved, covariance, seed=2, scale=scale)
     smooth = smooth_body(lines_of(poses, covariance), rules=QUICK)
     assert smooth.model is not None
-    # of the variances a quarter, or 2.9 times as much, scatters; known to 15 % from 60 frames
+    # of the variances a quarter, or 2.9 times as much, scatters; known to 15 % from 40 frames
     assert smooth.model.white == pytest.approx(scale**2, rel=0.45)
     # what lasts is three quarters of a variance, in one draw for the whole recording
     assert 0.5 < squared_errors(truth, smooth.estimates).mean() < 1.25
@@ -151,7 +151,7 @@ def test_corners_of_a_path_are_not_overshot() -> None:
     worst, squared = [], []
     for seed in range(2):
         poses = measured(truth, covariance, seed)
-        smooth = smooth_body(lines_of(poses, covariance), rules=QUICK)
+        smooth = smooth_body(lines_of(poses, covariance), motion="acceleration", rules=QUICK)
         for turn in turns:
             for frame in (turn - 1, turn, turn + 1):
                 T, C = (
@@ -182,7 +182,7 @@ def test_the_track_tells_which_hypothesis_of_ambiguous_frames_is_right() -> None
     doubted = [0, *range(20, 28), 40]
     for k in doubted:
         lines[k] = with_rival(lines[k], poses[k], poses[k] @ tilt)
-    smooth = smooth_body(lines)
+    smooth = smooth_body(lines, rules=QUICK)
     assert smooth.decided == len(doubted)
     for k in doubted:
         one = smooth.estimates[k]
@@ -196,7 +196,7 @@ def test_a_frame_that_shows_something_else_stays_as_it_was() -> None:
     lines = lines_of(measured(truth, covariance), covariance)
     away = [truth[15] @ rigid.from_rotation_vector([0, 1.0, 0], [x, 0, 0]) for x in (60.0, -80.0)]
     lines[15] = with_rival(lines[15], away[0], away[1])
-    one = smooth_body(lines).estimates[15]
+    one = smooth_body(lines, rules=QUICK).estimates[15]
     assert one.status == "ambiguous"
     np.testing.assert_array_equal(one.T_world_object, away[1])
 
@@ -210,7 +210,7 @@ def test_two_tracks_that_are_equally_smooth_stay_ambiguous() -> None:
         with_rival(line, T, shift @ T, 0.5)
         for line, T in zip(lines_of(poses, covariance), poses, strict=True)
     ]
-    smooth = smooth_body(lines)
+    smooth = smooth_body(lines, rules=QUICK)
     assert {one.status for one in smooth.estimates} == {"ambiguous"}
     assert smooth.decided == 0
     assert smooth.estimates[20].hypotheses[0].weight < 0.999
@@ -220,7 +220,7 @@ def test_one_wrong_pose_that_was_ok_does_not_bend_the_path() -> None:
     truth, covariance = swinging(60), covariance_of(0.1, 0.001)
     poses = measured(truth, covariance)
     poses[30] = rigid.perturb(poses[30], np.array([0, 12.0, 0, 0.3, 0, 0]))
-    smooth = smooth_body(lines_of(poses, covariance))
+    smooth = smooth_body(lines_of(poses, covariance), rules=QUICK)
     assert smooth.refused == (30,)
     assert smooth.estimates[30].status == "ambiguous"
     near = np.r_[26:30, 31:35]
@@ -233,10 +233,10 @@ def test_gaps_are_filled_on_request_marked_and_covered_by_their_covariance() -> 
     for k in (12, 13):
         lines[k] = pose_line(k, None, None)  # lost
     lines[30:50] = []  # no line at all
-    plain = smooth_body(lines)
+    plain = smooth_body(lines, rules=QUICK)
     assert [one.frame for one in plain.estimates] == [line.frame for line in lines]
     assert [one.status for one in plain.estimates[12:14]] == ["lost", "lost"]
-    filled = smooth_body(lines, fill_s=0.2)  # the gap of 20 frames is 0.84 s
+    filled = smooth_body(lines, rules=QUICK, fill_s=0.2)  # the gap of 20 frames is 0.84 s
     marked = [one for one in filled.estimates if one.filled]
     assert [one.frame for one in marked] == [12, 13]
     assert {one.status for one in marked} == {"ambiguous"}
@@ -244,7 +244,7 @@ def test_gaps_are_filled_on_request_marked_and_covered_by_their_covariance() -> 
     assert squared_errors(truth[12:14], marked).max() < 3
     variance = [np.trace(one.covariance[:3, :3]) for one in filled.estimates[11:14]]  # type: ignore[index]
     assert variance[1] > variance[0]
-    whole = smooth_body(lines, fill_s=1.0)
+    whole = smooth_body(lines, rules=QUICK, fill_s=1.0)
     assert [one.frame for one in whole.estimates] == list(range(60))
 
 
@@ -255,7 +255,7 @@ def test_directions_that_are_held_stay_where_they_are() -> None:
     )
     covariance = np.diag([0.04, 0.09, 0, 0, 0, 1e-4])
     errors = np.random.default_rng(0).normal(size=(60, 6)) * np.sqrt(covariance.diagonal())
-    smooth = smooth_body(lines_of(rigid.perturb(truth, errors), covariance))
+    smooth = smooth_body(lines_of(rigid.perturb(truth, errors), covariance), rules=QUICK)
     poses = poses_of(smooth.estimates)
     np.testing.assert_allclose(poses[:, 2, 3], 5.0, atol=1e-9)
     np.testing.assert_allclose(poses[:, 2, :3], [[0, 0, 1]] * 60, atol=1e-9)
@@ -275,7 +275,7 @@ def test_a_symmetric_body_that_is_called_turned_is_followed() -> None:
         pose_line(k, T @ half if there[k] else T, C[k] if there[k] else covariance)
         for k, T in enumerate(poses)
     ]
-    smooth = smooth_body(lines, np.stack([np.eye(4), half]))
+    smooth = smooth_body(lines, np.stack([np.eye(4), half]), rules=QUICK)
     assert rms_errors(truth, poses_of(smooth.estimates))[0] < 0.08
     assert squared_errors(truth, smooth.estimates).mean() < 1.6
 
