@@ -171,15 +171,17 @@ def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules)
     moved = track.moved
     states = begun(track, 0, order, white, moved)
     steps = np.diff(track.times).tolist()
-    total = np.zeros(len(x))
+    total, was_wrong = np.zeros(len(x)), np.zeros(len(x), bool)
     for k, elapsed in enumerate(steps, 1):
         ahead, _ = foretold(states, elapsed, noise)
         R = white_part(track, k, white)
         seen, _, log = updated(ahead, track.poses[k], R)
         anywhere = np.diagonal(R, axis1=1, axis2=2) + (rules.reach * moved) ** 2
         log_wrong = np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=1)
-        is_wrong = (log < log_wrong) & (k >= max(ORDERS.values()))
-        states = seen.mixed(ahead, is_wrong)
+        # two that follow each other are no accident: the body went another way
+        may_be_wrong = ~was_wrong & (k >= max(ORDERS.values()))
+        was_wrong = may_be_wrong & (log < log_wrong)
+        states = seen.mixed(ahead, was_wrong)
         if k >= max(ORDERS.values()):
-            total += np.logaddexp(log, log_wrong)
+            total += np.where(may_be_wrong, np.logaddexp(log, log_wrong), log)
     return np.asarray(total)
