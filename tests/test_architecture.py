@@ -72,6 +72,7 @@ MAY_IMPORT["design"] = GROUND | {
     "simulation",
     "runner",
 }
+MAY_IMPORT["trajectories"] = GROUND | {"poses"}
 MAY_IMPORT["rerun_file"] = GROUND | {
     "sensors",
     "body",

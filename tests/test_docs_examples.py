@@ -138,7 +138,13 @@ def test_the_page_about_markers_can_be_followed_from_a_checkout(
 
 @pytest.mark.parametrize(
     ("page", "written"),
-    [("importing", "poses.jsonl"), ("design", "design.png"), ("clouds", "markers.trc")],
+    [
+        ("importing", "poses.jsonl"),
+        ("design", "design.png"),
+        ("clouds", "markers.trc"),
+        ("smoothing", "smooth.jsonl"),
+        ("tips-and-floors", "aligned.toml"),
+    ],
 )
 def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(
     page: str,

@@ -53,7 +53,16 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert np.array_equal(back.symmetries["tracker"], symmetries["tracker"])
     (line,) = back.poses
     assert line.line == 2
-    apart = ("hypotheses", "proposer", "blurs", "doubt", "measured", "guesses", "delays")
+    apart = (
+        "hypotheses",
+        "proposer",
+        "blurs",
+        "doubt",
+        "measured",
+        "guesses",
+        "delays",
+        "tip_object",
+    )
     for name, value in asdict(estimate).items():
         if name not in apart:
             assert np.array_equal(np.asarray(asdict(line)[name]), np.asarray(value)), name

@@ -325,6 +325,10 @@ class Estimate:
     points : mapping of str to MeasuredPoint
         Features that sensors together put in space without the pose, where `mixpose.run` was asked
         for labels.
+    tip_object : (3,) float64 or None
+        The tip of the body in its own coordinates; None where it has none.
+    filled : bool
+        Whether nothing was measured in this frame: its pose is what frames around it say.
     """
 
     frame: int
@@ -346,11 +350,31 @@ class Estimate:
     doubt: str = field(default="", compare=False)
     measured: Callable[[], Mapping[str, Offsets]] = field(default=dict, compare=False, repr=False)
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
+    tip_object: Floats | None = field(default=None, compare=False)
+    filled: bool = False
 
     @property
     def offsets(self) -> Mapping[str, Offsets]:
         """By how much each sensor met the features of the best pose."""
         return self.measured()
+
+    @property
+    def tip(self) -> Floats | None:
+        """Where the tip is in the world, (3,); None without a tip or a pose."""
+        T = self.T_world_object
+        return (
+            None if T is None or self.tip_object is None else T[:3, :3] @ self.tip_object + T[:3, 3]
+        )
+
+    @property
+    def tip_covariance(self) -> Floats | None:
+        """Of the tip, (3, 3), as far as the pose errs; None without a tip or a covariance."""
+        tip, C, T = self.tip, self.covariance, self.T_world_object
+        if tip is None or C is None or T is None:
+            return None
+        J = np.eye(3, 6)
+        J[:, 3:] = np.cross(np.eye(3), tip - T[:3, 3]).T  # a turn w moves it by w × arm
+        return np.asarray(J @ C @ J.T)
 
     @property
     def label(self) -> str:

@@ -135,6 +135,22 @@ def twist_between(T_from: Floats, T_to: Floats) -> Floats:
     return np.concatenate([shift, vectors.reshape(shift.shape)], axis=-1)
 
 
+def covariance_at(covariance: Floats, arm: Floats) -> Floats:
+    """The covariance of a pose whose origin is another point of the body.
+
+    Parameters
+    ----------
+    covariance : (..., 6, 6) array
+    arm : (..., 3) array
+        From the body's origin to that point, in world axes.
+    """
+    J = np.zeros((*np.shape(arm)[:-1], 6, 6))
+    J[..., range(6), range(6)] = 1.0
+    # a turn w moves the point by w × arm
+    J[..., :3, 3:] = np.cross(np.eye(3), np.asarray(arm)[..., None, :]).swapaxes(-1, -2)
+    return np.asarray(J @ covariance @ J.swapaxes(-1, -2))
+
+
 def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
     """Angle in degrees (...,) of the rotation that leads from one pose to the other."""
     angle = np.linalg.norm(twist_between(T_a, T_b)[..., 3:], axis=-1)

@@ -234,6 +234,7 @@ def _estimates(
     windowed, tracks = WindowedScene(scene, _windowed(session)), memory.tracks
     bodies = {one.body.name: one.body for one in session.objects}
     clouds = clouds_of(session)
+    tips = {one.body.name: one.body.tip for one in session.objects}
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
@@ -253,7 +254,8 @@ def _estimates(
                 if labels:
                     estimate = labelled(estimate, seen, bodies[one.object])
                 estimate = _with_silent_sensors(estimate, session.sensors)
-                estimate = replace(estimate, latency_ms=latency_ms)
+                tip = tips[estimate.object]
+                estimate = replace(estimate, latency_ms=latency_ms, tip_object=tip)
                 if watch is not None:
                     watch(frame_set, views, estimate)
                 if remember is not None and k == 0:

@@ -87,6 +87,8 @@ class Body:
         Of spheres or disks, length units; 0 for a point.
     names : tuple of str
         What people call the features, those of them that have a name; they come first.
+    tip : (3,) float64 or None
+        A point of the body that is told with each pose; it is no feature.
     """
 
     name: str
@@ -96,6 +98,7 @@ class Body:
     shape: Shape = "point"
     radii: Floats | None = None
     names: tuple[str, ...] = ()
+    tip: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.features)

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomlkit
 
 from mixpose.calibration.result import Calibration
 from mixpose.calibration.rig import Block, Kind
-from mixpose.records import Floats
 from mixpose.session import Session
+from mixpose.session.rewriting import ROTATIONS, document_of, plain, put, text_of
 
 MARK = "# Calibrated by mixpose"
-_ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation")
-_DIGITS = 10
 
 
 def calibrated_text(session: Session, found: Calibration, target: Path, version: str) -> str:
@@ -34,15 +30,14 @@ def calibrated_text(session: Session, found: Calibration, target: Path, version:
     version : str
         Of mixpose.
     """
-    document = tomlkit.parse(session.path.read_text(encoding="utf-8-sig"))
-    _lead_back(document, session.folder, target.parent)
+    document = document_of(session, target)
     for index, table in enumerate(document["sensor"]):
         kinds = [block.kind for block in found.blocks if block.sensor == index]
         _put_sensor(table, found, index, kinds)
     if any(block.kind == "body" for block in found.blocks):
         _put_body(document["object"], found, session)
-    text = str(tomlkit.dumps(document))
-    return f"{MARK} {version} from {session.path.name}, {len(found.used)} frames.\n{text}"
+    origin = f"{session.path.name}, {len(found.used)} frames"
+    return f"{MARK} {version} from {origin}.\n{text_of(document)}"
 
 
 def _put_sensor(table: Any, found: Calibration, index: int, kinds: Sequence[Kind]) -> None:
@@ -52,31 +47,28 @@ def _put_sensor(table: Any, found: Calibration, index: int, kinds: Sequence[Kind
     if hasattr(sensor, "T_sensor_world") and not np.array_equal(
         sensor.T_sensor_world, before.T_sensor_world
     ):
-        for key in _ROTATIONS:
+        for key in ROTATIONS:
             table.pop(key, None)
-        _put(table, "T_sensor_world", _plain(sensor.T_sensor_world), said.get("pose"))
+        _put(table, "T_sensor_world", plain(sensor.T_sensor_world), said.get("pose"))
     if {"focal", "principal_point", "distortion"} & set(kinds) and hasattr(sensor, "camera_matrix"):
         if table.pop("calibration", None) is not None and sensor.resolution is not None:
             table["resolution"] = list(sensor.resolution)
         lens = [said[k] for k in ("focal", "principal_point") if k in said]
-        _put(table, "camera_matrix", _plain(sensor.camera_matrix), ", ".join(lens) or None)
+        _put(table, "camera_matrix", plain(sensor.camera_matrix), ", ".join(lens) or None)
         if len(sensor.distortion):
-            _put(table, "distortion", _plain(sensor.distortion), said.get("distortion"))
+            _put(table, "distortion", plain(sensor.distortion), said.get("distortion"))
     elif "principal_point" in kinds:
-        _put(table, "principal_point", _plain(sensor.principal_point), said["principal_point"])
+        _put(table, "principal_point", plain(sensor.principal_point), said["principal_point"])
     if hasattr(sensor, "position") and not np.array_equal(sensor.position, before.position):
-        _put(table, "position", _plain(sensor.position), said.get("position"))
+        _put(table, "position", plain(sensor.position), said.get("position"))
     if "range_bias" in kinds:
-        _put(table, "range_bias", _rounded(sensor.range_bias), said["range_bias"])
+        _put(table, "range_bias", plain(sensor.range_bias), said["range_bias"])
     if "delay" in kinds:
-        _put(table, "delay", _rounded(found.after.delays[index]), said["delay"])
+        _put(table, "delay", plain(found.after.delays[index]), said["delay"])
 
 
 def _put(table: Any, key: str, value: Any, said: str | None) -> None:
-    item = tomlkit.item(value)
-    if said:
-        item.comment(f"one standard deviation: {said}")
-    table[key] = item
+    put(table, key, value, f"one standard deviation: {said}" if said else None)
 
 
 def _said(found: Calibration, block: Block) -> str:
@@ -94,45 +86,7 @@ def _put_body(table: Any, found: Calibration, session: Session) -> None:
     """Features as points, which replace a file of them."""
     if table.pop("file", None) is not None:
         if session.body.normals is not None:
-            table["normals"] = _plain(session.body.normals)
+            table["normals"] = plain(session.body.normals)
         if session.body.covariances.any():
-            table["sigma"] = [_plain(covariance) for covariance in session.body.covariances]
-    table["points"] = _plain(found.after.points)
-
-
-def _lead_back(document: Any, old: Path, new: Path) -> None:
-    """Let relative paths lead from a new folder to where they led from the old one."""
-    if old.resolve() == new.resolve():
-        return
-
-    def path(value: str) -> str:
-        if Path(value).is_absolute() or "://" in value or value.startswith("camera:"):
-            return value
-        return Path(os.path.relpath(old.resolve() / value, new.resolve())).as_posix()
-
-    def put(table: Any, key: str) -> None:
-        value = table.get(key)
-        if isinstance(value, str):
-            table[key] = path(value)
-        elif isinstance(value, list):
-            table[key] = [path(each) for each in value]
-
-    put(document["object"], "file")
-    for table in document["sensor"]:
-        put(table, "source")
-        put(table, "times")
-        put(table, "calibration")
-        if isinstance(table.get("calibration"), dict):
-            put(table["calibration"], "file")
-
-
-def _rounded(value: float) -> float:
-    return float(f"{float(value):.{_DIGITS}g}") + 0.0
-
-
-def _plain(values: Floats) -> Any:
-    """Nested lists with ten digits."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0:
-        return _rounded(float(array))
-    return [_plain(each) for each in array]
+            table["sigma"] = [plain(covariance) for covariance in session.body.covariances]
+    table["points"] = plain(found.after.points)

@@ -10,6 +10,7 @@ import typer
 from mixpose.cli.app_calibrate import calibrate
 from mixpose.cli.app_design import design
 from mixpose.cli.app_simulate import simulate
+from mixpose.cli.app_trajectories import align, pivot, smooth
 from mixpose.cli.words import (
     AllowCode,
     ConvertFormat,
@@ -320,3 +321,6 @@ def report(
 
 app.command()(calibrate)
 app.command()(design)
+app.command()(pivot)
+app.command()(align)
+app.command()(smooth)

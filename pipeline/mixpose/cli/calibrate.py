@@ -25,6 +25,7 @@ from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.cli.run import named_sources
+from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
 from mixpose.poses.jsonl import read_poses
@@ -32,7 +33,6 @@ from mixpose.records import Floats
 from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
-from mixpose.whole_files import appearing_whole
 
 _TIMED = 4  # frames by which it is told how long the search takes
 _FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
@@ -92,10 +92,10 @@ def calibrate_session(path: Path, request: CalibrateRequest) -> None:
             refuse_to_overwrite_but(written, inputs, mark, option)
     with _calibrated(session, request, inputs) as found:
         if output is not None:
-            _write(output, calibrated_text(session, found, output, __version__), "-o")
+            write_text(output, calibrated_text(session, found, output, __version__), "-o")
         if request.report is not None:
             page = render_calibration(found, path.name, session.unit, __version__)
-            _write(request.report, page, "--report")
+            write_text(request.report, page, "--report")
     told = (check_lines if output is None else lines_of)(found, session.unit)
     sys.stdout.write("\n".join(told) + "\n")
     _warn(found, session.unit)
@@ -134,14 +134,6 @@ def _kept(path: Path, key: str) -> Iterator[Saved]:
         finished = True
     finally:
         saved.close(finished=finished)
-
-
-def _write(path: Path, text: str, option: str) -> None:
-    try:
-        with appearing_whole(path) as part:
-            part.write_text(text, encoding="utf-8", newline="\n")
-    except OSError as error:
-        raise SessionError(f"{option} {path}: cannot be written: {error.strerror}") from error
 
 
 def task_of(

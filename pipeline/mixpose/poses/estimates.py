@@ -26,6 +26,7 @@ def header_of(poses: PoseFile, unit: str, version: str) -> Header:
         symmetries=poses.symmetries,
         sensors=tuple(names),
         objects=objects_of(poses.poses),
+        smoothed=found.get("smoothed", {}),
     )
 
 
@@ -45,7 +46,17 @@ def estimate_of(line: PoseLine) -> Estimate:
         instance=line.instance,
         confidence=line.confidence,
         points=line.points,
+        tip_object=tip_in_object(line),
+        filled=line.filled,
     )
+
+
+def tip_in_object(line: PoseLine) -> Floats | None:
+    """The tip of a line's body in the coordinates of the body, (3,); None where it tells none."""
+    T = line.T_world_object
+    if T is None or line.tip is None:
+        return None
+    return np.asarray(T[:3, :3].T @ (line.tip - T[:3, 3]))
 
 
 def objects_of(lines: Iterable[PoseLine]) -> dict[str, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from mixpose.records import Floats, label_of
 
@@ -41,6 +42,8 @@ class Header:
     sensors : tuple of str
         Names of all sensors of the session, in its order.  Only the CSV table needs them, for
         its columns; they are not written into JSON lines.
+    smoothed : mapping of str to mapping
+        By which model the poses of each body were smoothed; empty where they were not.
     """
 
     unit: str
@@ -52,6 +55,7 @@ class Header:
     sources: Mapping[str, str] = field(default_factory=dict)
     sensors: tuple[str, ...] = ()
     objects: Mapping[str, int] = field(default_factory=dict)
+    smoothed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -79,6 +79,8 @@ def _header_line(header: Header) -> dict[str, Any]:
         line["objects"] = dict(header.objects)
     if header.sources:
         line["sources"] = dict(header.sources)
+    if header.smoothed:
+        line["smoothed"] = dict(header.smoothed)
     return line
 
 
@@ -118,7 +120,18 @@ def _pose_line(estimate: Estimate) -> dict[str, Any]:
             for rival in estimate.hypotheses
         ],
         "latency_ms": plain(estimate.latency_ms),
+        **_tip_of(estimate),
+        **({"filled": True} if estimate.filled else {}),
     }
+
+
+def _tip_of(estimate: Estimate) -> dict[str, Any]:
+    """Where the tip is, of a body that has one."""
+    if estimate.tip_object is None:
+        return {}
+    is_lost = estimate.status == "lost"
+    tip, covariance = (None, None) if is_lost else (estimate.tip, estimate.tip_covariance)
+    return {"tip": plain_or_none(tip), "tip_covariance": plain_or_none(covariance)}
 
 
 def _rounded(residuals: Mapping[str, float | None]) -> dict[str, float | None]:

@@ -37,6 +37,10 @@ class PoseLine:
         Where it stands in the file, from 1.
     score : float or None
         None where the line has none.
+    tip : (3,) float64 or None
+        Where the body's tip is in the world.
+    filled : bool
+        Whether nothing was measured in this frame.
     """
 
     line: int
@@ -53,6 +57,8 @@ class PoseLine:
     instance: int | None = None
     confidence: float | None = None
     points: Mapping[str, MeasuredPoint] = field(default_factory=dict)
+    tip: Floats | None = None
+    filled: bool = False
 
     @property
     def label(self) -> str:
@@ -108,6 +114,8 @@ class _Pose(_Line):
     latency_ms: float | None = None
     confidence: Annotated[float, Field(ge=0, le=1)] | None = None
     points: dict[str, _Point] = {}
+    tip: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    filled: bool = False
 
 
 class _Header(_Line):
@@ -166,6 +174,8 @@ def parse_pose(values: Mapping[str, Any], where: str, line: int) -> PoseLine:
             name: MeasuredPoint(np.array(point.at), point.residual)
             for name, point in pose.points.items()
         },
+        tip=None if pose.tip is None else np.array(pose.tip, dtype=np.float64),
+        filled=pose.filled,
     )
 
 

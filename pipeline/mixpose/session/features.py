@@ -82,7 +82,7 @@ def build_body(table: ObjectTable, folder: Path, unit: Unit) -> Body:
     _refuse_repeated(points, spreads, normals, "file" if table.file is not None else "points")
     radii = _radii(table, normals, len(points), count)
     gravity, names = _gravity(table), _names(markers)
-    return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names)
+    return Body(table.name, tuple(features), normals, gravity, table.shape, radii, names, table.tip)
 
 
 def _refuse_repeated(points: Floats, spreads: Floats, normals: Floats | None, key: str) -> None:

@@ -149,6 +149,12 @@ class ObjectTable(Table):
 
     Example: `spread = "uniform"`
     """
+    tip: Annotated[Floats | None, ArrayOf((3,), "a point [x, y, z] of the body")] = None
+    """A point of the body that each pose line tells in the world, as `tip`, with its covariance:
+    the tip of a tool. It need not be a feature; `mixpose pivot` finds it.
+
+    Example: `tip = [0.2, -1.4, -148.6]`
+    """
     gravity: Annotated[
         GravityTable | None, Field(description="a table with direction and sigma")
     ] = None

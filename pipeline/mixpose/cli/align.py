@@ -1,0 +1,144 @@
+"""``mixpose align``: a session in another frame of the world, by what lies on the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose import __version__, rigid
+from mixpose.cli.notices import say, warn
+from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.run import named_sources
+from mixpose.cli.written import write_text
+from mixpose.errors import RecordingError, SessionError
+from mixpose.poses.estimates import estimate_of
+from mixpose.poses.jsonl import read_poses
+from mixpose.records import Estimate, Floats
+from mixpose.runner import run
+from mixpose.selection import Selection
+from mixpose.session import Session, load_session
+from mixpose.session.rewriting import document_of, objects_of, plain, put, put_motion, text_of
+from mixpose.trajectories.floor import Axis, Floor, floor_of
+
+MARK = "# Aligned by mixpose"
+_ALL = 17  # digits: the frame is as exact as float64
+
+
+@dataclass(frozen=True)
+class AlignRequest:
+    """The options of ``mixpose align``.
+
+    Attributes
+    ----------
+    floor : tuple of str
+        Files of poses, or bodies in frames of the recording, ``OBJECT@FRAME``.
+    output : Path
+    up : {"x", "y", "z"}
+    sources : tuple of str
+        ``NAME=PATH``.
+    """
+
+    floor: tuple[str, ...]
+    output: Path
+    up: Axis
+    sources: tuple[str, ...]
+
+
+def align_session(path: Path, request: AlignRequest) -> None:
+    """Write the session in the frame of the floor.
+
+    Raises
+    ------
+    SessionError
+        If the session or the options are wrong, or directions of the world are held in it.
+    RecordingError
+        If the poses tell no floor.
+    """
+    session = load_session(path)
+    if len(session.estimator.free) < len(rigid.TWIST_NAMES):
+        raise SessionError(
+            f"{path}: estimator.free: found {', '.join(session.estimator.free)}, directions of the "
+            "world as it is; allowed: all six, in a session that is aligned"
+        )
+    files = [Path(each) for each in request.floor if "@" not in each or Path(each).is_file()]
+    refuse_to_overwrite_but(request.output, [path, *files], MARK)
+    estimates = [one for each in request.floor for one in _told(each, session, request.sources)]
+    floor = floor_of(estimates, request.up, _places(session))
+    write_text(request.output, _aligned_text(session, floor, request.output), "-o")
+    _tell(session, floor, request.up)
+    say(f"{session.path.name} in the frame of {floor.by} -> {request.output}")
+
+
+def _told(words: str, session: Session, sources: Sequence[str]) -> list[Estimate]:
+    """Poses that are ok, of a file or of a body in a frame of the recording."""
+    if Path(words).is_file():
+        poses = read_poses(words)
+        if poses.unit not in (None, session.unit):
+            raise RecordingError(
+                f"--floor {words}: lengths in {poses.unit}; allowed: those of the session, "
+                f"{session.unit}"
+            )
+        lines = [line for line in poses.poses if line.status == "ok"]
+        if not lines:
+            raise RecordingError(f"--floor {words}: found no pose that is ok")
+        return [estimate_of(line) for line in lines]
+    label, at, frame = words.rpartition("@")
+    if not at or label not in session.labels or not frame.isdecimal():
+        raise SessionError(
+            f"--floor {words}: no such file; allowed: a file of poses, or OBJECT@FRAME with one of "
+            f"{', '.join(session.labels)}"
+        )
+    number = int(frame)
+    replaced = named_sources(sources)
+    with closing(run(session, sources=replaced, selection=Selection(number, number + 1))) as found:
+        ok = [one for one in found if one.label == label and one.status == "ok"]
+    if not ok:
+        raise RecordingError(f"--floor {words}: {label} is not ok in this frame; name another one")
+    return ok
+
+
+def _places(session: Session) -> Floats:
+    """Where sensors are; parallel beams, which come from everywhere, as their frames."""
+    places = []
+    for setup in session.sensors:
+        sensor: Any = setup.sensor
+        is_range = hasattr(sensor, "position")
+        places.append(sensor.position if is_range else rigid.inverse(sensor.T_sensor_world)[:3, 3])
+    return np.stack(places)
+
+
+def _aligned_text(session: Session, floor: Floor, target: Path) -> str:
+    document = document_of(session, target)
+    T_old_new, T_new_old = floor.T_old_new, rigid.inverse(floor.T_old_new)
+    for table, setup in zip(document["sensor"], session.sensors, strict=True):
+        sensor: Any = setup.sensor
+        if hasattr(sensor, "position"):
+            place = rigid.transform(T_new_old, sensor.position[None])[0]
+            put(table, "position", plain(place, _ALL))
+        else:
+            put_motion(table, "T_sensor_world", sensor.T_sensor_world @ T_old_new, digits=_ALL)
+    for table, one in zip(objects_of(document), session.objects, strict=True):
+        start = document if "start" in document else table
+        if one.start is not None and "start" in start:
+            T = T_new_old @ one.start.T_world_object
+            put_motion(start["start"], "T_world_object", T, digits=_ALL)
+        if one.body.gravity is not None:
+            direction = T_new_old[:3, :3] @ np.array(table["gravity"]["direction"], float)
+            put(table["gravity"], "direction", plain(direction, _ALL))
+    return f"{MARK} {__version__} from {session.path.name}, {floor.by}.\n{text_of(document)}"
+
+
+def _tell(session: Session, floor: Floor, up: Axis) -> None:
+    if floor.off is not None:
+        say(f"the points are {floor.off:.3g} {session.unit} RMS off the floor")
+    heights = rigid.transform(rigid.inverse(floor.T_old_new), _places(session))
+    if heights[:, "xyz".index(up)].mean() < 0:
+        warn(
+            f"sensors are below the floor: {up} of the body points down; if it lies as it should, "
+            "name its axis that points up with --up"
+        )

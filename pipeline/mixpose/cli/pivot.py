@@ -1,0 +1,170 @@
+"""``mixpose pivot``: the tip of a tool, told and written into a session."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mixpose.cli.notices import say, warn
+from mixpose.cli.written import write_text
+from mixpose.errors import RecordingError, SessionError
+from mixpose.poses.jsonl import PoseFile, read_poses
+from mixpose.poses.poseline import PoseLine
+from mixpose.session import load_session
+from mixpose.session.rewriting import document_of, objects_of, plain, put, text_of
+from mixpose.trajectories.pivot import (
+    Pivoting,
+    PivotRules,
+    Tip,
+    find_tip,
+    fixed_in,
+    fixed_in_world,
+)
+
+_DIGITS = 8
+_SLIPPED = 2.0  # times the deviations: a tip that stays where it is gives 1 within a few percent
+
+
+@dataclass(frozen=True)
+class PivotRequest:
+    """The options of ``mixpose pivot``.
+
+    Attributes
+    ----------
+    object, reference : str or None
+        Bodies by their names: the tool, and what its tip stays at a point of.
+    into : Path or None
+        The session that gets the tip.
+    """
+
+    object: str | None
+    reference: str | None
+    into: Path | None
+
+
+def pivot_poses(path: Path, request: PivotRequest) -> None:
+    """Find the tip of a tool, tell it, and write it into a session.
+
+    Raises
+    ------
+    SessionError
+        If an option names what is not there.
+    RecordingError
+        If the poses cannot be read, or do not tell the tip.
+    """
+    poses = read_poses(path)
+    tool = _tool(poses, request)
+    pivoting = _pivoting(poses, tool, request.reference)
+    try:
+        tip = find_tip(pivoting)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {tool}: {error}") from error
+    unit = poses.unit or "units"
+    sys.stdout.write("\n".join(_lines(tool, request.reference, tip, unit)) + "\n")
+    _warn(tip)
+    if request.into is not None:
+        _put_into(request.into, tool, poses, tip)
+        say(f"tip of {tool!r} -> {request.into}")
+
+
+def _tool(poses: PoseFile, request: PivotRequest) -> str:
+    labels = list(dict.fromkeys(line.label for line in poses.poses))
+    for option, name in (("--object", request.object), ("--reference", request.reference)):
+        if name is not None and name not in labels:
+            raise SessionError(f"{option} {name}: {poses.path} has {', '.join(labels)}")
+    others = [label for label in labels if label != request.reference]
+    if request.object is None and len(others) != 1:
+        raise SessionError(
+            f"--object: found none, and {poses.path} has {', '.join(labels) or 'no poses'}; "
+            "allowed: the name of the tool"
+        )
+    tool = request.object or others[0]
+    if tool == request.reference:
+        raise SessionError(f"--reference {tool}: is the tool; allowed: another body")
+    return tool
+
+
+def _pivoting(poses: PoseFile, tool: str, reference: str | None) -> Pivoting:
+    """Poses of the tool that are ok, with those of the reference in the same frames."""
+    own = _known(poses, tool)
+    other = own if reference is None else _known(poses, reference)
+    frames = [frame for frame in own if frame in other]
+
+    def stacked(lines: Mapping[int, PoseLine]) -> list[np.ndarray]:
+        return [
+            np.array([getattr(lines[frame], name) for frame in frames], float).reshape(-1, n, n)
+            for name, n in (("T_world_object", 4), ("covariance", 6))
+        ]
+
+    pivoting = fixed_in_world(*stacked(own))
+    return pivoting if reference is None else fixed_in(pivoting, *stacked(other))
+
+
+def _known(poses: PoseFile, label: str) -> dict[int, PoseLine]:
+    lines = [line for line in poses.poses if line.label == label and line.status == "ok"]
+    for line in lines:
+        if line.covariance is None:
+            raise RecordingError(
+                f"{poses.path}:{line.line}: the pose has no covariance; allowed: poses as mixpose "
+                "run writes them"
+            )
+    return {line.frame: line for line in lines}
+
+
+def _lines(tool: str, reference: str | None, tip: Tip, unit: str) -> list[str]:
+    deviations = np.sqrt(tip.covariance.diagonal())
+    turns = ", ".join(f"{value:.3g}" for value in tip.turns_deg[::-1])
+    where = "world" if reference is None else reference
+    return [
+        f"tip of {tool}: ({_numbers(tip.place, deviations)}) {unit}",
+        f"one standard deviation: ({', '.join(f'{d:.2g}' for d in deviations)}) {unit}",
+        f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in the {where}"
+        if reference is None
+        else f"it stays at ({_numbers(tip.pivot, deviations)}) {unit} in {where}",
+        f"from it: {tip.residual:.3g} {unit} RMS, {tip.held_out:.3g} in frames held out; "
+        f"{tip.expected:.3g} by the covariances of the poses",
+        f"{tip.frames} frames, {tip.left_out} left out; directions of the body swing by {turns} "
+        "deg RMS",
+    ]
+
+
+def _numbers(values: np.ndarray, deviations: np.ndarray) -> str:
+    """With two digits of what they err by."""
+    places = max(0, 1 - int(np.floor(np.log10(max(float(deviations.min()), 1e-9)))))
+    return ", ".join(f"{value:.{places}f}" for value in values)
+
+
+def _warn(tip: Tip) -> None:
+    if tip.scale > _SLIPPED**2:
+        warn(
+            f"the tip is {np.sqrt(tip.scale):.2g} times as far off the point as poses err: it "
+            "slipped, or the body bends; the deviations are as much larger"
+        )
+    values, vectors = np.linalg.eigh(tip.covariance)
+    if values[-1] > PivotRules().uneven ** 2 * values[0]:
+        axis = ", ".join(f"{value:.2f}" for value in vectors[:, -1])
+        warn(
+            f"least known is the tip along ({axis}) of the body, to {np.sqrt(values[-1]):.2g}: "
+            "turns that swing this direction are missing"
+        )
+
+
+def _put_into(path: Path, tool: str, poses: PoseFile, tip: Tip) -> None:
+    session = load_session(path)
+    if poses.unit not in (None, session.unit):
+        raise SessionError(
+            f"--into {path}: lengths in {session.unit}, but {poses.path} has {poses.unit}"
+        )
+    document = document_of(session, path)
+    names = [one.body.name for one in session.objects]
+    name = next(line.object for line in poses.poses if line.label == tool)
+    if name not in names:
+        raise SessionError(f"--into {path}: has {', '.join(names)}, and the poses are of {name}")
+    table = list(objects_of(document))[names.index(name)]
+    deviations = ", ".join(f"{d:.2g}" for d in np.sqrt(tip.covariance.diagonal()))
+    put(table, "tip", plain(tip.place, _DIGITS), f"one standard deviation: {deviations}")
+    write_text(path, text_of(document), "--into")

@@ -1,0 +1,129 @@
+"""``mixpose smooth``: pose lines, each with what all frames say."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mixpose import __version__
+from mixpose.cli.notices import say, warn
+from mixpose.cli.output import Output, refuse_to_overwrite
+from mixpose.errors import RecordingError
+from mixpose.poses.estimates import header_of
+from mixpose.poses.jsonl import PoseFile, read_poses
+from mixpose.records import Estimate
+from mixpose.trajectories.motion import ORDERS
+from mixpose.trajectories.smoothing import SmoothedBody, smooth_body
+from mixpose.whole_files import appearing_whole
+
+
+def smooth_poses(path: Path, output: Path | None, *, fill_s: float, motion: str | None) -> None:
+    """Smooth the poses of a file and write them.
+
+    Raises
+    ------
+    SessionError
+        If the output would overwrite something else.
+    RecordingError
+        If the poses cannot be read, were smoothed before, or say too little.
+    """
+    poses = read_poses(path)
+    if poses.header.get("smoothed"):
+        raise RecordingError(
+            f"{path}: was smoothed before, its frames are no longer independent; allowed: poses "
+            "as mixpose run writes them"
+        )
+    if poses.unit is None:
+        raise RecordingError(
+            f"{path}: no header says the unit of its lengths; allowed: poses as mixpose run writes "
+            "them"
+        )
+    if output is not None:
+        refuse_to_overwrite(output, [path])
+    bodies = {}
+    for label in dict.fromkeys(line.label for line in poses.poses):
+        own = [line for line in poses.poses if line.label == label]
+        symmetries = poses.symmetries.get(own[0].object)
+        try:
+            bodies[label] = smooth_body(own, symmetries, fill_s=fill_s, motion=motion)
+        except RecordingError as error:
+            raise RecordingError(f"{path}: {error}") from error
+    _write(poses, bodies, output)
+    for label, body in bodies.items():
+        _tell(label, body, poses.unit)
+    if output is not None:
+        count = sum(body.smoothed for body in bodies.values())
+        say(f"{count} pose{'s' * (count != 1)} smoothed -> {output}")
+
+
+def _write(poses: PoseFile, bodies: dict[str, SmoothedBody], path: Path | None) -> None:
+    header = replace(
+        header_of(poses, str(poses.unit), __version__),
+        smoothed={label: _model(body) for label, body in bodies.items()},
+    )
+    order = {label: k for k, label in enumerate(bodies)}
+    lines = [each for body in bodies.values() for each in body.estimates]
+
+    def place(one: Estimate) -> tuple[int, int]:
+        return one.frame, order[one.label]
+
+    with ExitStack() as stack:
+        part = None if path is None else stack.enter_context(appearing_whole(path))
+        with Output(part, "jsonl", header, called=path) as writer:
+            for each in sorted(lines, key=place):
+                writer.write(each)
+
+
+def _model(body: SmoothedBody) -> dict[str, Any]:
+    """How a body was taken to move, for the header."""
+    if body.model is None:
+        return {}
+    of_lengths, of_turns = np.sqrt(body.model.intensities).tolist()
+    return {
+        "motion": _name(body),
+        "intensity": [of_lengths, of_turns],
+        "time": "s" if body.timed else "frame",
+        "white": body.model.white,
+    }
+
+
+def _name(body: SmoothedBody) -> str:
+    return next(name for name, order in ORDERS.items() if body.model and order == body.model.order)
+
+
+def _tell(label: str, body: SmoothedBody, unit: str) -> None:
+    model = body.model
+    if model is None:
+        warn(f"{label}: too few poses that are ok to tell how it moves; none is smoothed")
+        return
+    time = "s" if body.timed else "frame"
+    lengths, turns = np.sqrt(model.intensities) * [1.0, 180 / np.pi]
+    power = f"{time}^{model.order - 0.5:g}"
+    say(
+        f"{label}: white noise in the {_name(body)}, {lengths:.3g} {unit}/{power} and "
+        f"{turns:.3g} deg/{power}"
+    )
+    if model.white < 1:
+        say(
+            f"{label}: poses scatter less about a smooth path than their covariances say: "
+            f"{100 * (1 - model.white):.0f} % of these is taken for errors that last, and stays"
+        )
+    if model.white > 1:
+        warn(
+            f"{label}: poses scatter more than their covariances say, which are taken "
+            f"{model.white:.2g} times as large"
+        )
+    told = [
+        (body.decided, "ambiguous frame", "ok by the track"),
+        (body.filled, "frame", "filled in, ambiguous and marked"),
+    ]
+    for count, what, done in told:
+        if count:
+            say(f"{label}: {count} {what}{'s' * (count != 1)} {done}")
+    if body.refused:
+        numbers = ", ".join(map(str, body.refused[:8])) + (", ..." if len(body.refused) > 8 else "")
+        warn(f"{label}: ok, but far off the poses around them, now ambiguous: frames {numbers}")

@@ -1,0 +1,85 @@
+"""A session file with other values: comments, and keys that are not changed, stay as they are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+
+from mixpose.records import Floats
+from mixpose.session.setup import Session
+
+ROTATIONS = ("rotation_vector", "quaternion_xyzw", "euler_xyz_deg", "translation")
+"""Keys of a rigid motion, which its matrix replaces."""
+
+
+def document_of(session: Session, target: Path) -> Any:
+    """The TOML document of a session, with paths as they are from where it will be written."""
+    document = tomlkit.parse(session.path.read_text(encoding="utf-8-sig"))
+    _lead_back(document, session.folder, target.parent)
+    return document
+
+
+def text_of(document: Any) -> str:
+    """The text of a TOML document."""
+    return str(tomlkit.dumps(document))
+
+
+def objects_of(document: Any) -> Iterator[Any]:
+    """The table of each body."""
+    objects = document["object"]
+    yield from objects if isinstance(objects, list) else [objects]
+
+
+def put(table: Any, key: str, value: Any, said: str | None = None) -> None:
+    """Set a key of a table, with a comment behind it."""
+    item = tomlkit.item(value)
+    if said:
+        item.comment(said)
+    table[key] = item
+
+
+def put_motion(table: Any, key: str, T: Floats, said: str | None = None, digits: int = 10) -> None:
+    """Set a rigid motion (4, 4), in place of what says it otherwise."""
+    for other in ROTATIONS:
+        table.pop(other, None)
+    put(table, key, plain(T, digits), said)
+
+
+def plain(values: Floats | float, digits: int = 10) -> Any:
+    """Nested lists of numbers with so many digits; 17 are all that there are."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0:
+        return float(f"{float(array):.{digits}g}") + 0.0
+    return [plain(each, digits) for each in array]
+
+
+def _lead_back(document: Any, old: Path, new: Path) -> None:
+    """Let relative paths lead from a new folder to where they led from the old one."""
+    if old.resolve() == new.resolve():
+        return
+
+    def path(value: str) -> str:
+        if Path(value).is_absolute() or "://" in value or value.startswith("camera:"):
+            return value
+        return Path(os.path.relpath(old.resolve() / value, new.resolve())).as_posix()
+
+    def lead(table: Any, key: str) -> None:
+        value = table.get(key)
+        if isinstance(value, str):
+            table[key] = path(value)
+        elif isinstance(value, list):
+            table[key] = [path(each) for each in value]
+
+    for table in objects_of(document):
+        lead(table, "file")
+    for table in document["sensor"]:
+        lead(table, "source")
+        lead(table, "times")
+        lead(table, "calibration")
+        if isinstance(table.get("calibration"), dict):
+            lead(table["calibration"], "file")

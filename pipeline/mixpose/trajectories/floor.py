@@ -1,0 +1,151 @@
+"""The frame of the world by what lies on the floor: a body, three points or a plane."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.records import Estimate, Floats
+
+Axis: TypeAlias = Literal["x", "y", "z"]
+
+_RESTS = 5.0  # times its deviation: a body that is nowhere farther off its mean rests
+_FLAT = 1e-6  # of the largest distance: points on a line span no plane
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A frame for the world.
+
+    Attributes
+    ----------
+    T_old_new : (4, 4) float64
+        Maps coordinates of the new world to those of the old one.
+    by : str
+        What it was found by.
+    off : float or None
+        Root mean square distance of the points from the floor; None where any would fit.
+    """
+
+    T_old_new: Floats
+    by: str
+    off: float | None = None
+
+
+def floor_of(estimates: Sequence[Estimate], up: Axis, sensors: Floats) -> Floor:
+    """The frame that bodies on the floor tell.
+
+    One body that rests is the frame of the world.  Three that rest, or three poses, are three
+    points: the origin, where the first axis leads to, and any other of the floor.  More are a
+    plane, in which the origin and the first axis are as near to where they were as can be.  Of a
+    body with a tip the tip is the point, of others the origin.
+
+    Parameters
+    ----------
+    estimates : sequence of Estimate
+        That have a pose.
+    up : {"x", "y", "z"}
+        The axis of the world that points up; of a body, its own.
+    sensors : (n, 3) array
+        Where sensors are in the old world: up is where they are.
+
+    Raises
+    ------
+    RecordingError
+        If the poses tell no floor.
+    """
+    bodies = {label: [e for e in estimates if e.label == label] for label in _labels(estimates)}
+    rests = [_rests(each) for each in bodies.values()]
+    if len(bodies) == 1 and (len(estimates) == 1 or (rests[0] and len(estimates) != 3)):
+        return Floor(_mean_pose(estimates), f"the body {estimates[0].label!r}")
+    if all(rests):
+        points = np.stack([np.mean([_point(e) for e in each], axis=0) for each in bodies.values()])
+    if not all(rests) or len(points) < 3:
+        points = np.stack([_point(each) for each in estimates])
+    if len(points) == 3:
+        return Floor(_frame(points, up, sensors), "three points")
+    if len(points) < 3:
+        raise RecordingError(
+            f"found {len(points)} points; allowed: one body, three points, or more in a plane"
+        )
+    T, off = _plane(points, up, sensors)
+    return Floor(T, f"a plane through {len(points)} points", off)
+
+
+def _labels(estimates: Sequence[Estimate]) -> list[str]:
+    return list(dict.fromkeys(each.label for each in estimates))
+
+
+def _point(one: Estimate) -> Floats:
+    assert one.T_world_object is not None
+    return one.T_world_object[:3, 3] if one.tip is None else one.tip
+
+
+def _rests(estimates: Sequence[Estimate]) -> bool:
+    points = np.stack([_point(each) for each in estimates])
+    away = np.linalg.norm(points - points.mean(axis=0), axis=1).max()
+    variances = [
+        np.trace(C[:3, :3])
+        for each in estimates
+        if (C := each.covariance if each.tip is None else each.tip_covariance) is not None
+    ]
+    return bool(away <= _RESTS * np.sqrt(np.mean(variances)) if variances else away == 0)
+
+
+def _mean_pose(estimates: Sequence[Estimate]) -> Floats:
+    poses = np.stack([e.T_world_object for e in estimates if e.T_world_object is not None])
+    if len(poses) == 1:
+        return np.asarray(poses[0])
+    R = Rotation.from_matrix(poses[:, :3, :3]).mean().as_matrix()
+    return rigid.from_parts(R, poses[:, :3, 3].mean(axis=0))
+
+
+def _frame(points: Floats, up: Axis, sensors: Floats) -> Floats:
+    """Of an origin, a point along the first axis, and any other (3, 3)."""
+    along, other = points[1] - points[0], points[2] - points[0]
+    normal = np.cross(along, other)
+    size = np.linalg.norm(along) * np.linalg.norm(other)
+    if not np.linalg.norm(normal) > _FLAT * size:
+        raise RecordingError("the three points lie on a line; allowed: the corners of a triangle")
+    return _axes(points[0], along, _upwards(normal, points[0], sensors), up)
+
+
+def _plane(points: Floats, up: Axis, sensors: Floats) -> tuple[Floats, float]:
+    """The plane with the least squares of distances (n, 3), and their root mean square."""
+    middle = points.mean(axis=0)
+    _, sizes, directions = np.linalg.svd(points - middle)
+    if not sizes[1] > max(_FLAT * sizes[0], 3 * sizes[2]):
+        raise RecordingError(
+            f"the points are no plane: they spread by {sizes[0]:.3g}, {sizes[1]:.3g} and "
+            f"{sizes[2]:.3g}; allowed: points all over the floor, and nothing but these"
+        )
+    normal = _upwards(directions[2], middle, sensors)
+    origin = normal * (normal @ middle)  # the old origin, moved onto the plane
+    first = np.eye(3)[0 if up != "x" else 1]
+    if abs(normal @ first) > 0.99:  # it stands on the floor
+        first = np.eye(3)["xyz".index(up)]
+    return _axes(origin, first, normal, up), float(sizes[2] / np.sqrt(len(points)))
+
+
+def _upwards(normal: Floats, point: Floats, sensors: Floats) -> Floats:
+    """A normal of the floor that points to the side where the sensors are."""
+    normal = normal / np.linalg.norm(normal)
+    return np.asarray(-normal if (sensors.mean(axis=0) - point) @ normal < 0 else normal)
+
+
+def _axes(origin: Floats, along: Floats, normal: Floats, up: Axis) -> Floats:
+    """A frame whose axis `up` is the normal, and whose first other one leads along a direction."""
+    k = "xyz".index(up)
+    first = 0 if k else 1
+    R = np.empty((3, 3))
+    along = along - normal * (normal @ along)
+    R[:, k], R[:, first] = normal, along / np.linalg.norm(along)
+    last = 3 - k - first
+    R[:, last] = np.cross(R[:, (last + 1) % 3], R[:, (last + 2) % 3])
+    return rigid.from_parts(R, origin)

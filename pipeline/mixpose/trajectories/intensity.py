@@ -1,0 +1,187 @@
+"""How a body moves, by maximum likelihood from a recording of it.
+
+The likelihood of a model is that of the innovations of a Kalman filter (F. Schweppe, 1965), as many
+models at once as are compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mixpose.constants import constant
+from mixpose.records import Floats
+from mixpose.trajectories.motion import ORDERS, foretold, updated
+from mixpose.trajectories.track import (
+    MotionModel,
+    Track,
+    begun,
+    noise_of,
+    smooth_track,
+    white_part,
+)
+
+
+@dataclass(frozen=True)
+class SmoothingRules:
+    """What a smoother goes by."""
+
+    frames: int = constant(
+        300, "poses that tell how a body moves, from the whole recording: intensity to 10 %"
+    )
+    block: int = constant(100, "of them that follow each other: the first few tell rates")
+    fewest: int = constant(8, "poses that tell a motion; of fewer none is smoothed")
+    surely: float = constant(
+        10.83, "twice the log likelihood, χ² of 99.9 %, by which a covariance is not all white"
+    )
+    tail: float = constant(
+        1.0,
+        "degree of freedom of the noise of motion: at corners of a path squared errors are 1.2 "
+        "times what covariances say, 4 times with one intensity throughout",
+    )
+    passes: int = constant(4, "over which sudden motion is told from steady: changes by 10 % then")
+    foreign: float = constant(
+        1e-9, "chance of a pose as far off those around it: it is taken for a wrong one"
+    )
+    believed: float = constant(
+        0.5, "logarithm of the factor by which covariances are off: 0.6 to 1.6 times, as a rule"
+    )
+    wrong: float = constant(1e-3, "of poses that are ok are wrong: confidence is 0.999")
+    reach: float = constant(3.0, "times the usual step, where a wrong pose is found")
+    restarts: float = constant(20.0, "intervals without a pose, after which a track begins anew")
+    paths: int = constant(16, "choices among hypotheses that are followed side by side")
+    none: float = constant(
+        22.5, "χ² of 6 at 99.9 %: a hypothesis farther off the track is none of the body"
+    )
+    sure: float = constant(0.999, "probability of a hypothesis from which its frame is ok")
+
+
+def fitted_model(track: Track, rules: SmoothingRules, motion: str | None = None) -> MotionModel:
+    """The model of which a track is likeliest.
+
+    Parameters
+    ----------
+    track : Track
+        Times without a pose are left out.
+    rules : SmoothingRules
+    motion : str or None
+        Of `ORDERS`; else the likeliest.
+    """
+    blocks = _blocks(track, rules)
+    x, best = np.zeros(3), (-np.inf, 0, np.zeros(3))
+    for name, order in ORDERS.items():
+        x[2] = 0.0
+        for width, points, along in _COARSE:
+            x, log_likelihood = _along(blocks, order, x, width, points, along, rules)
+        if name == motion or (motion is None and log_likelihood > best[0]):
+            best = (log_likelihood, order, x)
+        elif motion is None:
+            break
+        if name == motion:
+            break
+        # a derivative more takes e³ times less noise, about, in units of the poses'
+        x = x - [3.0, 3.0, 0.0]
+    order, shared = best[1:]
+    x = shared * [1.0, 1.0, 0.0]
+    for width, points in _FINE:
+        x, likely = _along(blocks, order, x, width, points, _EACH, rules)
+        shared, likelier = _along(blocks, order, shared, width, points, (*_SHARE, *_EACH), rules)
+    if 2 * (likelier - likely) > rules.surely:
+        x = shared
+    return MotionModel(order, _intensities(track, order, x[None, :2])[0], float(np.exp(x[2])))
+
+
+def local_scales(track: Track, model: MotionModel, rules: SmoothingRules) -> Floats:
+    """By how much more noise there was between each two times than elsewhere, (N - 1, 2).
+
+    Noise of each passage has an inverse gamma variance, so that all in all it has the t
+    distribution.  d log p / d log λ = (bᵀQb − tr NQ) / 2 + ν (1/λ − 1) / 2 = 0 gives the fixed
+    point λ = (λ bᵀQb + ν) / (tr NQ + ν).
+    """
+    scales = np.ones((len(track) - 1, 2))
+    for _ in range(rules.passes):
+        passages = smooth_track(track, model, scales).passages
+        squared = np.stack([each.squared for each in passages])
+        degrees = np.stack([each.degrees for each in passages])
+        scales = (scales * squared + rules.tail) / (np.maximum(degrees, 0.0) + rules.tail)
+    return scales
+
+
+def _blocks(track: Track, rules: SmoothingRules) -> list[Track]:
+    """Parts of a track, evenly over it, that tell how the body moves."""
+    track = track.part(track.measured)
+    if len(track) <= rules.frames:
+        return [track]
+    count = rules.frames // rules.block
+    starts = np.linspace(0, len(track) - rules.block, count).astype(int)
+    return [track.part(slice(k, k + rules.block)) for k in starts.tolist()]
+
+
+def _intensities(track: Track, order: int, x: Floats) -> Floats:
+    """Intensities (G, 2) of their logarithms (G, 2) in units of variances of poses."""
+    variances = np.median(np.diagonal(track.covariances, axis1=1, axis2=2), axis=0)
+    own = [variances[k : k + 3][track.free[k : k + 3]] for k in (0, 3)]
+    kinds = np.array([each.mean() if len(each) else 1.0 for each in own])
+    return np.asarray(kinds / track.interval ** (2 * order - 1) * np.exp(x))
+
+
+# what is searched along, one after the other: logarithms of intensities, and of the share
+_BOTH, _EACH, _SHARE = ((0, 1),), ((0,), (1,)), ((2,),)
+# half-widths of a search in logarithms, and points in it; both kinds of motion at first, as with
+# one of them far off all poses look wrong
+_COARSE = (
+    (10.0, 9, _BOTH),
+    (5.0, 5, _EACH),
+    (2.0, 5, _EACH),
+    (2.0, 9, _SHARE),
+    (0.8, 5, (*_EACH, *_SHARE)),
+)
+_FINE = ((0.5, 5), (0.15, 3))
+
+
+def _along(
+    blocks: list[Track],
+    order: int,
+    x: Floats,
+    width: float,
+    points: int,
+    along: tuple[tuple[int, ...], ...],
+    rules: SmoothingRules,
+) -> tuple[Floats, float]:
+    """The likeliest of points along each direction in turn."""
+    best = -np.inf
+    for directions in along:
+        tried = np.repeat(x[None], points, axis=0)
+        tried[:, directions] += np.linspace(-width, width, points)[:, None]
+        logs = sum(_log_likelihoods(block, order, tried, rules) for block in blocks)
+        logs = logs - 0.5 * (tried[:, 2] / rules.believed) ** 2
+        k = int(np.argmax(logs))
+        x, best = tried[k], float(np.asarray(logs)[k])
+    return x, best
+
+
+def _log_likelihoods(track: Track, order: int, x: Floats, rules: SmoothingRules) -> Floats:
+    """Of the poses of a track after the first few, which tell the rates of all orders; (G,).
+
+    Now and then a pose that is ok is a wrong one: it may be anywhere where the body gets in a step.
+    """
+    white = np.exp(x[:, 2])
+    noise = noise_of(track, _intensities(track, order, x[:, :2]))
+    moved = track.moved
+    states = begun(track, 0, order, white, moved)
+    steps = np.diff(track.times).tolist()
+    total, was_wrong = np.zeros(len(x)), np.zeros(len(x), bool)
+    for k, elapsed in enumerate(steps, 1):
+        ahead, _ = foretold(states, elapsed, noise)
+        R = white_part(track, k, white)
+        seen, _, log = updated(ahead, track.poses[k], R)
+        anywhere = np.diagonal(R, axis1=1, axis2=2) + (rules.reach * moved) ** 2
+        log_wrong = np.log(rules.wrong) - 0.5 * np.log(anywhere).sum(axis=1)
+        # two that follow each other are no accident: the body went another way
+        may_be_wrong = ~was_wrong & (k >= max(ORDERS.values()))
+        was_wrong = may_be_wrong & (log < log_wrong)
+        states = seen.mixed(ahead, was_wrong)
+        if k >= max(ORDERS.values()):
+            total += np.where(may_be_wrong, np.logaddexp(log, log_wrong), log)
+    return np.asarray(total)

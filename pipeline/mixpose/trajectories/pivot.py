@@ -1,0 +1,241 @@
+"""The tip of a tool, from poses while the tip stays at one point.
+
+At each time the tip p in the body and the point c in the reference are at one place,
+
+    t_k + R_k p = t'_k + R'_k c
+
+with R', t' the pose of a reference body, or the identity where c is fixed in the world.  This is
+linear in p and c (Z. Yaniv, *Which Pivot Calibration?*, SPIE Medical Imaging 2015); then each
+equation is weighed by the covariance of its poses at the tip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from mixpose import rigid
+from mixpose.constants import constant
+from mixpose.errors import RecordingError
+from mixpose.records import Floats, Mask
+
+
+@dataclass(frozen=True)
+class PivotRules:
+    """What a tip goes by."""
+
+    fewest: int = constant(10, "poses: six numbers are sought, three equations come of each")
+    turned: float = constant(
+        5.0, "times the noise of turns: of less, noise passes for turning, by 4 % (1/5²)"
+    )
+    steps: int = constant(20, "of weighing: weights change with the place of the tip; 4 are enough")
+    foreign: float = constant(1e-6, "chance of a pose as far off: it is left out")
+    parts: int = constant(5, "of the recording that are held out in turn")
+    uneven: float = constant(
+        3.0, "ratio of deviations from which a direction is said to lack turns"
+    )
+
+
+@dataclass(frozen=True)
+class Pivoting:
+    """Poses of a body whose tip stays where it is.
+
+    Attributes
+    ----------
+    poses, covariances : (N, 4, 4) and (N, 6, 6) float64
+        Of the body.
+    references, reference_covariances : (N, 4, 4) and (N, 6, 6) float64
+        Of the body that the point is fixed in; identity and zero: of the world.
+    """
+
+    poses: Floats
+    covariances: Floats
+    references: Floats
+    reference_covariances: Floats
+
+    def part(self, some: Mask) -> Pivoting:
+        """Some of the poses."""
+        return Pivoting(
+            self.poses[some],
+            self.covariances[some],
+            self.references[some],
+            self.reference_covariances[some],
+        )
+
+
+@dataclass(frozen=True)
+class Tip:
+    """A tip.
+
+    Attributes
+    ----------
+    place : (3,) float64
+        In the coordinates of the body.
+    covariance : (3, 3) float64
+    pivot : (3,) float64
+        The point that it stays at, in the world or in the reference body.
+    residual, expected, held_out : float
+        Root mean square distances of tip and point: of these poses, by their covariances, and of
+        poses that were held out.
+    scale : float
+        Squared residuals by their covariances; what is above 1 is in the covariance of the tip.
+    frames, left_out : int
+        Poses that count, and that lie too far off.
+    turns_deg : (3,) float64
+        Root mean square turns across the three directions, least first.
+    directions : (3, 3) float64
+        Of the body, a row each.
+    """
+
+    place: Floats
+    covariance: Floats
+    pivot: Floats
+    residual: float
+    expected: float
+    held_out: float
+    scale: float
+    frames: int
+    left_out: int
+    turns_deg: Floats
+    directions: Floats
+
+
+def find_tip(pivoting: Pivoting, rules: PivotRules | None = None) -> Tip:
+    """Find the tip of a body that turns about it.
+
+    Raises
+    ------
+    RecordingError
+        If there are too few poses, or turns are missing; it says which.
+    """
+    rules = rules or PivotRules()
+    if len(pivoting.poses) < rules.fewest:
+        raise RecordingError(
+            f"found {len(pivoting.poses)} poses that are ok; allowed: at least {rules.fewest}, in "
+            "which the tool turns about its tip"
+        )
+    turns, directions = turns_seen(pivoting)
+    _require_turns(pivoting, turns, directions, rules)
+    kept = np.ones(len(pivoting.poses), bool)
+    for _ in range(3):
+        some = pivoting.part(kept)
+        x, covariance, squared = _solved(some, pivoting, rules)
+        # of three numbers, the median of χ² is 2.37; a slipping tip makes all of them larger
+        usual = max(1.0, float(np.median(squared[kept])) / 2.366)
+        now = squared <= usual * chdtri(3, rules.foreign)
+        if (now == kept).all() or now.sum() < rules.fewest:
+            break
+        kept = now
+    some = pivoting.part(kept)
+    rest = _residuals(some, x)
+    expected = _covariances(some, x)
+    scale = float(squared[kept].sum() / (3 * len(rest) - 6))
+    return Tip(
+        place=x[:3],
+        covariance=covariance[:3, :3] * max(1.0, scale),
+        pivot=x[3:],
+        residual=_rms(rest),
+        expected=float(np.sqrt(np.trace(expected, axis1=1, axis2=2).mean())),
+        held_out=_held_out(some, rules),
+        scale=scale,
+        frames=int(kept.sum()),
+        left_out=int((~kept).sum()),
+        turns_deg=np.degrees(turns),
+        directions=directions,
+    )
+
+
+def turns_seen(pivoting: Pivoting) -> tuple[Floats, Floats]:
+    """By how much directions of the body swing, RMS in radians (3,), least first, and these (3, 3).
+
+    The tip along a direction that does not swing may be anywhere.
+    """
+    R = pivoting.references[:, :3, :3].swapaxes(1, 2) @ pivoting.poses[:, :3, :3]
+    away = R - R.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.einsum("kij,kil->jl", away, away) / len(R))
+    return np.sqrt(np.maximum(values, 0.0)), vectors.T
+
+
+def _require_turns(
+    pivoting: Pivoting, turns: Floats, directions: Floats, rules: PivotRules
+) -> None:
+    both = pivoting.covariances + pivoting.reference_covariances
+    noise = np.sqrt(2 * np.diagonal(both, axis1=1, axis2=2)[:, 3:].mean())
+    if turns[0] > rules.turned * noise:
+        return
+    least = np.degrees(rules.turned * noise)
+    found = np.degrees(turns)
+    if turns[1] <= rules.turned * noise:
+        raise RecordingError(
+            f"the body hardly turns: found {found[2]:.3g} deg RMS; allowed: turns of 20 deg and "
+            "more about two axes, while the tip stays where it is"
+        )
+    axis = ", ".join(f"{value:.2f}" for value in directions[0])
+    raise RecordingError(
+        f"the tip is not determined along the direction ({axis}) of the body: all turns are about "
+        f"it, it swings by {found[0]:.2g} deg RMS; allowed: at least {least:.2g}: tilt the tool, "
+        "too, so that this direction swings by 20 deg and more"
+    )
+
+
+def _solved(some: Pivoting, of_all: Pivoting, rules: PivotRules) -> tuple[Floats, Floats, Floats]:
+    """Tip and point (6,), their covariance, and squared residuals of all poses."""
+    A = np.concatenate([some.poses[:, :3, :3], -some.references[:, :3, :3]], axis=2)
+    b = some.references[:, :3, 3] - some.poses[:, :3, 3]
+    x = np.linalg.lstsq(A.reshape(-1, 6), b.ravel(), rcond=None)[0]
+    information = np.eye(6)
+    for _ in range(rules.steps):
+        W = np.linalg.inv(_covariances(some, x))
+        weighed = A.swapaxes(1, 2) @ W
+        information = (weighed @ A).sum(axis=0)
+        before, x = x, np.linalg.solve(information, np.einsum("kij,kj->i", weighed, b))
+        if np.linalg.norm(x - before) <= 1e-12 * np.linalg.norm(x):
+            break
+    rest = _residuals(of_all, x)
+    solved = np.linalg.solve(_covariances(of_all, x), rest[..., None])[..., 0]
+    squared = np.einsum("ki,ki->k", rest, solved)
+    return x, np.asarray(np.linalg.inv(information)), np.asarray(squared)
+
+
+def _residuals(some: Pivoting, x: Floats) -> Floats:
+    """From the point to the tip, (N, 3)."""
+    tips = rigid.transform(some.poses, x[None, :3]) - rigid.transform(some.references, x[None, 3:])
+    return np.asarray(tips[:, 0])
+
+
+def _covariances(some: Pivoting, x: Floats) -> Floats:
+    """Of the residuals, (N, 3, 3)."""
+    tips = rigid.covariance_at(some.covariances, some.poses[:, :3, :3] @ x[:3])
+    points = rigid.covariance_at(some.reference_covariances, some.references[:, :3, :3] @ x[3:])
+    both = (tips + points)[:, :3, :3]
+    # directions that are held err by nothing, and nothing can be weighed by that
+    least = 1e-9 * np.trace(both, axis1=1, axis2=2).mean() + 1e-300
+    return np.asarray(both + least * np.eye(3))
+
+
+def _held_out(some: Pivoting, rules: PivotRules) -> float:
+    """RMS residual of parts of the recording, each by a tip that was found without it."""
+    rest = []
+    for part in np.array_split(np.arange(len(some.poses)), rules.parts):
+        others = np.ones(len(some.poses), bool)
+        others[part] = False
+        x, *_ = _solved(some.part(others), some, rules)
+        rest.append(_residuals(some, x)[part])
+    return _rms(np.concatenate(rest))
+
+
+def _rms(rest: Floats) -> float:
+    return float(np.sqrt((rest**2).sum(axis=1).mean()))
+
+
+def fixed_in_world(poses: Floats, covariances: Floats) -> Pivoting:
+    """Poses of a body whose tip stays at a point of the world."""
+    references = np.broadcast_to(np.eye(4), poses.shape)
+    return Pivoting(poses, covariances, references, np.zeros_like(covariances))
+
+
+def fixed_in(pivoting: Pivoting, references: Floats, covariances: Floats) -> Pivoting:
+    """The same, of which the point is fixed in another body with these poses."""
+    return replace(pivoting, references=references, reference_covariances=covariances)

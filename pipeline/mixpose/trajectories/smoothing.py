@@ -1,0 +1,372 @@
+"""Poses of a body, each with what all frames say: fixed-interval smoothing.
+
+What is assumed of the covariances of a file: errors of different frames are independent, as far as
+the poses scatter about a smooth path as they say.  Where they scatter surely less, the share that
+is not seen is taken for an error that lasts, of a calibration or a marker, which no smoothing makes
+smaller: it stays in the covariance as it was.  Where they scatter more, covariances are enlarged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import chdtri
+
+from mixpose import rigid
+from mixpose.errors import RecordingError
+from mixpose.poses.estimates import estimate_of
+from mixpose.poses.poseline import PoseLine
+from mixpose.records import Estimate, Floats, Hypothesis
+from mixpose.trajectories.choices import NONE, Alternatives, Choice, choices
+from mixpose.trajectories.intensity import SmoothingRules, fitted_model, local_scales
+from mixpose.trajectories.track import (
+    MotionModel,
+    SmoothedTrack,
+    Track,
+    smooth_track,
+    track_of,
+    without,
+)
+from mixpose.trajectories.unfolding import unfolded
+
+_ROUNDS = 3  # rounds in which poses are left out: one wrong pose may hide another
+
+
+@dataclass(frozen=True)
+class SmoothedBody:
+    """The poses of a body, smoothed.
+
+    Attributes
+    ----------
+    estimates : tuple of Estimate
+        One per line, and one per frame that was filled, by frame number.
+    model : MotionModel or None
+        None where there were too few poses.
+    smoothed, filled : int
+        How many poses there are that were smoothed and filled in.
+    decided : int
+        Ambiguous frames that are ok now.
+    refused : tuple of int
+        Frames whose poses were ok and lie far off those around them.
+    timed : bool
+        Whether the model goes by seconds; else by numbers of frames.
+    """
+
+    estimates: tuple[Estimate, ...]
+    model: MotionModel | None
+    smoothed: int
+    filled: int
+    decided: int
+    refused: tuple[int, ...]
+    timed: bool
+
+
+@dataclass(frozen=True)
+class _Segment:
+    """Lines without a long gap, those that are filled in being None, and their times."""
+
+    lines: tuple[PoseLine | None, ...]
+    frames: tuple[int, ...]
+    track: Track
+
+
+def smooth_body(
+    lines: Sequence[PoseLine],
+    symmetries: Floats | None = None,
+    *,
+    fill_s: float = 0.0,
+    motion: str | None = None,
+    rules: SmoothingRules | None = None,
+) -> SmoothedBody:
+    """Smooth the poses of one body.
+
+    Parameters
+    ----------
+    lines : sequence of PoseLine
+        Of one body, a line per frame.
+    symmetries : (n, 4, 4) array or None
+        Of the body: poses that look the same are one.
+    fill_s : float
+        Gaps of at most so many seconds from pose to pose are filled.
+    motion : str or None
+        What takes white noise, of `mixpose.trajectories.motion.ORDERS`; else the likeliest.
+    rules : SmoothingRules or None
+
+    Raises
+    ------
+    RecordingError
+        If a frame stands twice, a pose has no covariance, or gaps are to be filled and there are
+        no times.
+    """
+    rules = rules or SmoothingRules()
+    ordered = sorted(lines, key=lambda line: line.frame)
+    times = _times(ordered)
+    if fill_s and times is None:
+        raise RecordingError(
+            "--fill: found poses without times, or whose times do not ascend; allowed: poses of a "
+            "recording with times: add fps or times to the sensors of its session"
+        )
+    at = np.array([line.frame for line in ordered], float) if times is None else times
+    ordered = unfolded(ordered, symmetries)
+    posed = [k for k, line in enumerate(ordered) if line.T_world_object is not None]
+    _require_covariances([ordered[k] for k in posed])
+    sure = [k for k in posed if ordered[k].status == "ok"]
+    told = sure if len(sure) >= rules.fewest else posed
+    if len(told) < rules.fewest:
+        whole = tuple(estimate_of(line) for line in ordered)
+        return SmoothedBody(whole, None, 0, 0, 0, (), times is not None)
+    model = fitted_model(_track([ordered[k] for k in told], at[told]), rules, motion)
+    segments = _segments(ordered, at, posed, fill_s, rules)
+    done: dict[int, Estimate] = {line.frame: estimate_of(line) for line in ordered}
+    counts = [0, 0, 0]
+    refused: list[int] = []
+    for segment in segments:
+        found, own, foreign = _smoothed(segment, model, rules)
+        done.update(found)
+        counts = [a + b for a, b in zip(counts, own, strict=True)]
+        refused += foreign
+    estimates = tuple(done[frame] for frame in sorted(done))
+    return SmoothedBody(
+        estimates, model, counts[0], counts[1], counts[2], tuple(refused), times is not None
+    )
+
+
+def _times(lines: Sequence[PoseLine]) -> Floats | None:
+    """Of all lines; None where one has none, or they do not ascend."""
+    frames = [line.frame for line in lines]
+    for before, frame in pairwise(frames):
+        if before == frame:
+            raise RecordingError(
+                f"frame {frame} of {lines[0].label!r} stands twice; allowed: a line per frame"
+            )
+    found = [line.time_s for line in lines if line.time_s is not None]
+    times = np.array(found, dtype=np.float64)
+    return times if len(found) == len(lines) and (np.diff(times) > 0).all() else None
+
+
+def _require_covariances(lines: Sequence[PoseLine]) -> None:
+    for line in lines:
+        if line.covariance is None or not line.covariance.any():
+            raise RecordingError(
+                f"line {line.line}: the pose of {line.label!r} in frame {line.frame} has no "
+                "covariance; allowed: poses as mixpose run writes them"
+            )
+
+
+def _track(lines: Sequence[PoseLine], times: Floats) -> Track:
+    poses = np.stack([line.T_world_object for line in lines if line.T_world_object is not None])
+    covariances = np.stack([line.covariance for line in lines if line.covariance is not None])
+    return track_of(times, poses, covariances, np.ones(len(lines), bool))
+
+
+def _segments(
+    lines: Sequence[PoseLine],
+    times: Floats,
+    posed: Sequence[int],
+    fill_s: float,
+    rules: SmoothingRules,
+) -> list[_Segment]:
+    """Lines with poses, cut at long gaps, with the frames between that are to be filled."""
+    at = times[posed]
+    usual, step = np.median(np.diff(at)), int(np.median(np.diff([lines[k].frame for k in posed])))
+    cuts = np.flatnonzero(np.diff(at) > max(rules.restarts * usual, fill_s)) + 1
+    segments = []
+    for part in np.split(np.array(posed), cuts):
+        own: list[PoseLine | None] = []
+        frames: list[int] = []
+        moments: list[float] = []
+        for k in part.tolist():
+            line = lines[k]
+            if frames and times[k] - moments[-1] <= fill_s:
+                between = range(frames[-1] + step, line.frame, max(step, 1))
+                share = (np.array(between, float) - frames[-1]) / (line.frame - frames[-1])
+                own += [None] * len(between)
+                moments += (moments[-1] + share * (times[k] - moments[-1])).tolist()
+                frames += between
+            own.append(line)
+            frames.append(line.frame)
+            moments.append(float(times[k]))
+        segments.append(_Segment(tuple(own), tuple(frames), _sparse(own, np.array(moments))))
+    return segments
+
+
+def _sparse(lines: Sequence[PoseLine | None], times: Floats) -> Track:
+    """A track of lines, with the pose before in place of those that are not there."""
+    last = next(line for line in lines if line is not None)
+    known = []
+    for line in lines:
+        last = last if line is None else line
+        known.append(last)
+    whole = _track(known, times)
+    measured = np.array([line is not None for line in lines])
+    return replace(whole, measured=measured)
+
+
+def _smoothed(
+    segment: _Segment, model: MotionModel, rules: SmoothingRules
+) -> tuple[dict[int, Estimate], tuple[int, int, int], list[int]]:
+    """Estimates by frame; how many are smoothed, filled and decided; frames that were refused."""
+    chosen = _chosen(segment, model, rules)
+    poses = segment.track.poses.copy()
+    measured = segment.track.measured.copy()
+    for k, made in chosen.items():
+        line = segment.lines[k]
+        assert line is not None
+        measured[k] = made.which != NONE
+        if measured[k]:
+            poses[k] = _alternatives(line).poses[made.which]
+    track = replace(segment.track, poses=poses, measured=measured)
+    inside = np.flatnonzero(measured)
+    if len(inside) < 2:
+        return {}, (0, 0, 0), []
+    first, last = int(inside[0]), int(inside[-1]) + 1
+    lines, frames = segment.lines[first:last], segment.frames[first:last]
+    track = track.part(slice(first, last))
+    track, result = _without_foreign(track, model, rules)
+    spare = max(0.0, 1.0 - model.white) * _held_out(track)
+    found, counts, refused = {}, np.zeros(3, int), []
+    for k, (line, frame) in enumerate(zip(lines, frames, strict=True)):
+        T, covariance = result.poses[k], result.covariances[k] + spare[k]
+        choice = chosen.get(first + k)
+        if line is None:
+            found[frame] = _filled(frame, float(track.times[k]), lines, T, covariance)
+            counts[1] += 1
+        elif choice is None or choice.which != NONE:
+            found[frame] = one = _estimate(
+                line, T, covariance, choice, bool(track.measured[k]), rules
+            )
+            counts += [1, 0, one.status == "ok" != line.status]
+            if line.status == "ok" and one.status != "ok":
+                refused.append(frame)
+    return found, (int(counts[0]), int(counts[1]), int(counts[2])), refused
+
+
+def _held_out(track: Track) -> Floats:
+    covariances = track.covariances.copy()
+    covariances[:, ~track.free] = 0.0
+    covariances[:, :, ~track.free] = 0.0
+    return covariances
+
+
+def _alternatives(line: PoseLine) -> Alternatives:
+    """What a frame may show: of an ambiguous one its hypotheses."""
+    T = line.T_world_object
+    assert T is not None
+    if line.status == "ok":
+        return Alternatives(T[None], np.ones(1), may_be_none=False)
+    if not line.hypotheses:
+        return Alternatives(T[None], np.ones(1), may_be_none=True)
+    weights = np.array([max(rival.weight, 1e-6) for rival in line.hypotheses])
+    poses = np.stack([rival.T_world_object for rival in line.hypotheses])
+    return Alternatives(poses, weights / max(weights.sum(), 1.0), may_be_none=True)
+
+
+def _chosen(segment: _Segment, model: MotionModel, rules: SmoothingRules) -> dict[int, Choice]:
+    """What each ambiguous frame of a segment shows, by its place."""
+    there = [k for k, line in enumerate(segment.lines) if line is not None]
+    lines = [line for line in segment.lines if line is not None]
+    if all(line.status == "ok" for line in lines):
+        return {}
+    track = segment.track.part(segment.track.measured)
+    found = choices(track, [_alternatives(line) for line in lines], model, rules)
+    return {
+        k: choice
+        for k, line, choice in zip(there, lines, found, strict=True)
+        if line.status != "ok"
+    }
+
+
+def _without_foreign(
+    track: Track, model: MotionModel, rules: SmoothingRules
+) -> tuple[Track, SmoothedTrack]:
+    """A track without poses that lie where those around them forbid, and the track smoothed."""
+    limit = float(chdtri(int(track.free.sum()), rules.foreign))
+    for _ in range(_ROUNDS):
+        # among motion that is steady a corner of the path looks foreign, too
+        off = _off(track, smooth_track(track, model), model, -1)
+        padded = np.pad(off, 1)  # the farthest of neighbours pulls the others off
+        bad = (off > limit) & (off >= padded[:-2]) & (off >= padded[2:])
+        bad[[0, -1]] = False
+        if bad.any():
+            # but at a corner the others tell of sudden motion as well
+            rest = without(track, bad)
+            among = smooth_track(rest, model, local_scales(rest, model, rules))
+            bad &= _off(track, among, model, 1) > limit
+        if not bad.any():
+            break
+        track = without(track, bad)
+    return track, smooth_track(track, model, local_scales(track, model, rules))
+
+
+def _off(track: Track, result: SmoothedTrack, model: MotionModel, sign: int) -> Floats:
+    """Squared distance (N,) of each pose from what all others say.
+
+    rᵀ(R − P)⁻¹r where the pose took part in the result, with the sign −1, and rᵀ(R + P)⁻¹r where
+    it did not.
+    """
+    free = np.flatnonzero(track.free)
+    inner = np.ix_(np.arange(len(track)), free, free)
+    rest = rigid.twist_between(result.poses, track.poses).reshape(-1, 6)[:, free]
+    own = (model.white * track.covariances + sign * result.covariances)[inner]
+    scale = np.sqrt(np.diagonal(track.covariances[inner], axis1=1, axis2=2))
+    own = own / scale[:, :, None] / scale[:, None]
+    values, vectors = np.linalg.eigh(own)
+    along = np.einsum("kij,ki->kj", vectors, rest / scale)
+    # where nothing but the pose itself tells of it, it is off by nothing
+    told = values > 1e-6 * model.white
+    squared = np.where(told, along**2 / np.where(told, values, 1.0), 0.0).sum(axis=1)
+    return np.where(track.measured, squared, 0.0)
+
+
+def _estimate(
+    line: PoseLine,
+    T: Floats,
+    covariance: Floats,
+    choice: Choice | None,
+    is_met: bool,
+    rules: SmoothingRules,
+) -> Estimate:
+    """The estimate of a line at its smoothed pose."""
+    one = replace(estimate_of(line), T_world_object=T, covariance=covariance)
+    if choice is None:
+        if is_met:
+            return one
+        assert line.T_world_object is not None
+        rivals = (Hypothesis(T, 0.5), Hypothesis(line.T_world_object, 0.5))
+        return replace(one, status="ambiguous", confidence=0.0, hypotheses=rivals)
+    if not line.hypotheses or not is_met:
+        return one
+    shares = choice.probabilities
+    sure = float(shares[choice.which])
+    if sure >= rules.sure:
+        return replace(one, status="ok", confidence=sure, hypotheses=())
+    order = np.argsort(-shares, kind="stable").tolist()
+    order.remove(choice.which)
+    others = [
+        Hypothesis(line.hypotheses[k].T_world_object, float(shares[k]))
+        for k in order
+        if shares[k] > 0
+    ]
+    return replace(one, confidence=sure, hypotheses=(Hypothesis(T, sure), *others))
+
+
+def _filled(
+    frame: int, time_s: float, lines: Sequence[PoseLine | None], T: Floats, covariance: Floats
+) -> Estimate:
+    """A frame in which nothing was measured."""
+    like = next(line for line in lines if line is not None)
+    return Estimate(
+        frame=frame,
+        time_s=time_s,
+        object=like.object,
+        status="ambiguous",
+        T_world_object=T,
+        covariance=covariance,
+        score=0.0,
+        sensors={},
+        instance=like.instance,
+        filled=True,
+    )

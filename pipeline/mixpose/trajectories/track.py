@@ -1,0 +1,205 @@
+"""Poses of one body over time, filtered forwards and smoothed backwards."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose import rigid
+from mixpose.records import Floats, Mask
+from mixpose.trajectories.motion import Passage, States, foretold, smoothed, updated
+
+_DIFFUSE = 10.0  # times the motion from frame to frame: nothing is known of rates at first
+_FLOOR = 1e-9  # of the largest variance: what float64 can tell apart
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses of one body at ascending times.
+
+    Attributes
+    ----------
+    times : (N,) float64
+        s, or numbers of frames.
+    poses : (N, 4, 4) float64
+    covariances : (N, 6, 6) float64
+        As `mixpose.rigid` has them; of directions that are held, any.
+    measured : (N,) bool
+        Whether there is a pose at that time; what stands in `poses` does not count where not.
+    free : (6,) bool
+        Directions of the world in which the body is estimated.
+    """
+
+    times: Floats
+    poses: Floats
+    covariances: Floats
+    measured: Mask
+    free: Mask
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def part(self, some: slice | Mask) -> Track:
+        """A part of the track."""
+        return Track(
+            self.times[some],
+            self.poses[some],
+            self.covariances[some],
+            self.measured[some],
+            self.free,
+        )
+
+    @property
+    def interval(self) -> float:
+        """Median time from one pose to the next."""
+        steps = np.diff(self.times[self.measured])
+        return float(np.median(steps)) if len(steps) else 1.0
+
+    @property
+    def moved(self) -> Floats:
+        """Root mean square motion (6,) from pose to pose, one number for lengths, one for turns."""
+        poses = self.poses[self.measured]
+        twists = rigid.twist_between(poses[:-1], poses[1:]).reshape(-1, 2, 3)
+        return np.asarray(np.sqrt((twists**2).mean(axis=(0, 2))).repeat(3))
+
+
+def track_of(times: Floats, poses: Floats, covariances: Floats, measured: Mask) -> Track:
+    """A track whose covariances can be inverted; directions without variance are held.
+
+    A held direction gets the mean variance of the others of its kind: its poses agree, so that any
+    will do.
+    """
+    seen = covariances[measured]
+    variances = np.diagonal(seen, axis1=1, axis2=2).max(axis=0)
+    kinds = variances.reshape(2, 3).max(axis=1).repeat(3)
+    free = variances > 1e-12 * np.where(kinds > 0, kinds, np.inf)
+    covariances = covariances.copy()
+    covariances[:, ~free] = 0.0
+    covariances[:, :, ~free] = 0.0
+    typical = np.diagonal(seen, axis1=1, axis2=2).mean(axis=0)
+    for kind in (slice(0, 3), slice(3, 6)):
+        own = free[kind]
+        mean = typical[kind][own].mean() if own.any() else 1.0
+        floor = np.where(own, _FLOOR * mean, mean)
+        covariances[:, range(kind.start, kind.stop), range(kind.start, kind.stop)] += floor
+    return Track(times, poses, covariances, measured, free)
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """How a body moves, and how far its poses are off.
+
+    Attributes
+    ----------
+    order : int
+        p, of the derivative that takes white noise.
+    intensities : (2,) float64
+        q, of lengths and of turns.
+    white : float
+        Share of the covariances that is independent from frame to frame; above 1 where poses
+        scatter more than their covariances say.
+    """
+
+    order: int
+    intensities: Floats
+    white: float = 1.0
+
+
+def noise_of(track: Track, intensities: Floats) -> Floats:
+    """Intensities (G, 6) of each coordinate, from those (G, 2) of lengths and turns."""
+    held = _held_intensity(track, 2)
+    return np.where(track.free, intensities.repeat(3, axis=1), held)
+
+
+def white_part(track: Track, k: int, white: Floats) -> Floats:
+    """Covariances (G, 6, 6) of a pose without what it has in common with others."""
+    scale = np.where(track.free, np.sqrt(white)[:, None], 1.0)
+    return np.asarray(track.covariances[k] * scale[:, :, None] * scale[:, None])
+
+
+def _held_intensity(track: Track, order: int) -> Floats:
+    return np.asarray(
+        np.diagonal(track.covariances[0]) / max(track.interval, 1e-9) ** (2 * order - 1)
+    )
+
+
+def begun(track: Track, first: int, order: int, white: Floats, moved: Floats) -> States:
+    """G states at the first pose, of whose rates nothing is known."""
+    covariances = white_part(track, first, white)
+    deviation = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    widths = _DIFFUSE * (moved + deviation)
+    rates = [widths / track.interval**j for j in range(1, order)]
+    G = len(white)
+    P = np.zeros((G, 6 * order, 6 * order))
+    P[:, range(6 * order), range(6 * order)] = np.concatenate([deviation, *rates], axis=1) ** 2
+    P[:, :6, :6] = covariances
+    poses = np.broadcast_to(track.poses[first], (G, 4, 4))
+    return States(poses, np.zeros((G, order - 1, 6)), P)
+
+
+@dataclass(frozen=True)
+class SmoothedTrack:
+    """A track with all that all its poses say.
+
+    Attributes
+    ----------
+    poses : (N, 4, 4) float64
+    covariances : (N, 6, 6) float64
+    passages : tuple of Passage
+        What happened between each two times.
+    """
+
+    poses: Floats
+    covariances: Floats
+    passages: tuple[Passage, ...]
+
+
+def smooth_track(track: Track, model: MotionModel, scales: Floats | None = None) -> SmoothedTrack:
+    """Smooth a track whose first time has a pose.
+
+    Parameters
+    ----------
+    track : Track
+    model : MotionModel
+    scales : (N - 1, 2) array or None
+        By how much more noise there is between each two times than the model says.
+    """
+    white = np.array([model.white])
+    scales = np.ones((len(track) - 1, 2)) if scales is None else scales
+    steps = np.diff(track.times)
+    noises = [noise_of(track, (model.intensities * scale)[None]) for scale in scales]
+    states = [begun(track, 0, model.order, white, track.moved)]
+    ahead: list[tuple[States, Floats]] = []
+    for k, (elapsed, noise) in enumerate(zip(steps.tolist(), noises, strict=True), 1):
+        ahead.append(foretold(states[-1], elapsed, noise))
+        state = ahead[-1][0]
+        if track.measured[k]:
+            state, *_ = updated(state, track.poses[k], white_part(track, k, white))
+        states.append(state)
+    passages: list[Passage] = []
+    for k in range(len(steps) - 1, -1, -1):
+        states[k], passage = smoothed(
+            states[k], *_after(ahead[k], states[k + 1]), steps[k], noises[k]
+        )
+        passages.append(passage)
+    return _without_held(track, states, tuple(reversed(passages)))
+
+
+def _after(ahead: tuple[States, Floats], later: States) -> tuple[States, States, Floats]:
+    return ahead[0], later, ahead[1]
+
+
+def _without_held(
+    track: Track, states: Sequence[States], passages: tuple[Passage, ...]
+) -> SmoothedTrack:
+    covariances = np.stack([one.covariances[0][:6, :6] for one in states])
+    covariances[:, ~track.free] = 0.0
+    covariances[:, :, ~track.free] = 0.0
+    return SmoothedTrack(np.concatenate([one.poses for one in states]), covariances, passages)
+
+
+def without(track: Track, bad: Mask) -> Track:
+    """A track in which some poses (N,) do not count."""
+    return replace(track, measured=track.measured & ~bad)
