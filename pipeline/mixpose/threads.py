@@ -1,8 +1,8 @@
 """Threads while a frame is computed, and as before afterwards.
 
-Linear algebra has one: the matrices of a frame are small.  Threads of a BLAS library that share their
-work wait for each other far longer than they compute, above all where other programs keep the
-processor busy.  Those that decode the next frames are let in soon.
+Linear algebra has one: the matrices of a frame are small.  Threads of a BLAS library that share
+their work wait for each other far longer than they compute, above all where other programs keep
+the processor busy.  Those that decode the next frames are let in soon.
 """
 
 from __future__ import annotations

@@ -31,6 +31,7 @@ from mixpose.session import Session, load_session
 from mixpose.threads import prompt_switching
 from mixpose.tracking.proposers import predicted
 
+
 def run_session(path: Path, request: RunRequest) -> None:
     """Estimate every frame of a session's recording and write the poses.
 

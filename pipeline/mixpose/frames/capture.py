@@ -170,7 +170,7 @@ def retrieve(
     RecordingError
         If it cannot be decoded or has not the expected width and height.
     """
-    found, image = capture.retrieve(room and room.image)
+    found, image = capture.retrieve() if room is None else capture.retrieve(room.image)
     if not found or image is None:
         raise RecordingError(f"{name_of(address)}: frame {number} cannot be decoded")
     if image.ndim == 3 and image.shape[2] == 1:
