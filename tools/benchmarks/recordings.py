@@ -26,7 +26,8 @@ MARKERS = [
 DISTANCE = 1000.0
 EYES = (
     [0.0, -DISTANCE, 0.0], [DISTANCE, 0.0, 0.0],
-    [-0.6 * DISTANCE, -0.5 * DISTANCE, 0.6 * DISTANCE], [0.5 * DISTANCE, -0.6 * DISTANCE, 0.6 * DISTANCE],
+    [-0.6 * DISTANCE, -0.5 * DISTANCE, 0.6 * DISTANCE],
+    [0.5 * DISTANCE, -0.6 * DISTANCE, 0.6 * DISTANCE],
 )  # fmt: skip
 NAMES = ("left", "right", "above", "beside")
 
@@ -44,7 +45,8 @@ def session_text(
     """A session of one camera to four, the body's first pose given."""
     turn = Rotation.from_euler("xyz", [0.2, -0.3, 0.4]).as_rotvec().tolist()
     lines = [
-        'unit = "mm"', "[object]", 'name = "body"', f"points = {list(points or MARKERS)[:markers]}", shape,
+        'unit = "mm"', "[object]", 'name = "body"', shape,
+        f"points = {list(points or MARKERS)[:markers]}",
         "[start]", f"rotation_vector = {turn}", "translation = [0, 0, 0]",
         "rotation_deg = 10", "distance = 20",
     ]  # fmt: skip
