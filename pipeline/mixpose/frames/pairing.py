@@ -29,8 +29,8 @@ def pair(
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
     A number that some sources lack yields a set without them.  Of each source only a few frames
-    are in memory, decoded ahead in a thread of its own where that pays; the threads end with
-    this generator.
+    are in memory, more of small ones, decoded ahead in a thread of its own where that pays; the
+    threads end with this generator.
 
     Parameters
     ----------
