@@ -12,14 +12,16 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from benchmarks import objective_case, pose_case, search_rows
+from benchmarks import frames_case, objective_case, pose_case, search_rows
 from benchmarks.literal import LiteralObjective, samples_of
 from benchmarks.search_cases import Row, absent, rows_named, trial
 from benchmarks.search_rows import Outcome
 from benchmarks.timing import medians, slope
 from paper.systems import POINTS, pose
 
+import mixpose
 from mixpose.density import Observation
+from mixpose.frames import images
 from mixpose.objective import View
 from mixpose.objective.paper import PaperObjective
 from mixpose.rigid import transform
@@ -152,3 +154,28 @@ def test_the_squared_error_of_a_frame_counts_only_where_it_is_ok() -> None:
     # six degrees of freedom: one in a million is above 40
     assert 0 < found.squared < 40
     assert search_rows.outcome(absent(Row("2 pinhole", 6, 0, 0, 0.99), 1)).squared is None
+
+
+def test_a_frame_is_measured_beside_its_decoding(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(__file__).resolve().parents[1] / "data" / "synthetic" / "two_cameras"
+    session, decoded, in_run = mixpose.load_session(folder / "session.toml"), list[str](), False
+    read, by_frame = images.read_image, frames_case.by_frame
+
+    def noting(path: Path) -> Any:
+        decoded.append(path.name)
+        assert not in_run, "frames are decoded before anything is timed"
+        return read(path)
+
+    def running(*arguments: Any) -> Any:
+        nonlocal in_run
+        in_run = True
+        return by_frame(*arguments)
+
+    monkeypatch.setattr(images, "read_image", noting)
+    monkeypatch.setattr(frames_case, "by_frame", running)
+    figures = frames_case.measured(session, frames=3)
+    assert len(decoded) == 2 * 3
+    assert figures["share_ok"] == 1
+    assert 0 < figures["extract_ms"] < figures["slowest_tracked_ms"]
+    # rooms share what a tracked frame takes; those below three per cent are left out
+    assert 0.7 < sum(figures["rooms_ms"].values()) / figures["tracked_ms"] <= 1 + 1e-9

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Generator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from command_line import wait_until
 
 from mixpose.errors import RecordingError, SessionError
 from mixpose.frames import Source, SourceSpec, open_source, pair
 from mixpose.frames.source import SourceKind, selection
-from mixpose.records import PointPattern, RawFrame
+from mixpose.records import Image, PointPattern, RawFrame
 
 NOTHING = PointPattern(np.zeros((0, 2)), np.zeros(0))
 
@@ -24,9 +26,15 @@ class Recorded:
     kind: SourceKind = "detections"
 
     def __init__(
-        self, *numbers: int, fails: int | None = None, rate: float | None = None, ahead: int = 0
+        self,
+        *numbers: int,
+        fails: int | None = None,
+        rate: float | None = None,
+        ahead: int = 0,
+        data: PointPattern | Image = NOTHING,
     ) -> None:
         self.numbers, self.fails, self.rate, self.ahead = numbers, fails, rate, ahead
+        self.data = data
         self.read: list[int] = []
 
     @property
@@ -55,7 +63,7 @@ class Recorded:
                 if number == self.fails:
                     raise RecordingError(f"frame {number} is broken")
                 self.read.append(number)
-                yield RawFrame(number, number / self.rate if self.rate else None, NOTHING)
+                yield RawFrame(number, number / self.rate if self.rate else None, self.data)
 
 
 def joined(
@@ -131,6 +139,27 @@ def test_frames_are_read_as_they_are_wanted() -> None:
     next(sets)
     next(sets)
     assert source.read == [0, 1]
+    sets.close()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "read"),
+    [
+        (
+            64 * 64,
+            1 + 3 + 13 + 1,
+        ),  # taken, waiting as always, waiting as they are small, on its way
+        (2**22, 1 + 3 + 4 + 1),  # 4 MiB: four more in 16 MiB
+        (2**25, 1 + 3 + 0 + 1),
+    ],
+)
+def test_small_frames_are_read_further_ahead_in_bounded_memory(pixels: int, read: int) -> None:
+    source = Recorded(*range(50), ahead=3, data=np.zeros((1, pixels), np.uint8))
+    sets = pair({"a": source})
+    next(sets)
+    wait_until(lambda: len(source.read) == read)
+    time.sleep(0.02)
+    assert len(source.read) == read
     sets.close()
 
 

@@ -61,6 +61,25 @@ def test_no_more_than_the_depth_is_read_ahead() -> None:
     stream.close()
 
 
+def test_the_first_item_tells_how_many_more_are_read_ahead() -> None:
+    log: list[str] = []
+    stream = prefetch(counting(50, log), depth=3, more=lambda first: 4 + first)
+    assert next(stream) == 0
+    # one is taken, three and four more wait, one is on its way; later items tell nothing
+    wait_until(lambda: len(log) == 9)
+    time.sleep(0.02)
+    assert len(log) == 9
+    assert next(stream) == 1
+    wait_until(lambda: len(log) == 10)
+    stream.close()
+
+
+def test_error_in_what_the_first_item_tells_belongs_to_the_consumer() -> None:
+    stream = prefetch(iter([0]), more=lambda first: 1 // first)
+    with pytest.raises(ZeroDivisionError):
+        next(stream)
+
+
 def test_consumer_that_stops_early_ends_the_thread_and_closes_the_source() -> None:
     log: list[str] = []
     stream = prefetch(counting(10**9, log), depth=2)

@@ -1,8 +1,9 @@
-"""Linear algebra runs on one thread while a frame is computed, and as before afterwards."""
+"""One thread of linear algebra and prompt switching while a frame is computed, not afterwards."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 import mixpose
 from mixpose import runner
 from mixpose.executing import in_processes
-from mixpose.threads import one_blas_thread
+from mixpose.threads import SWITCH_S, one_blas_thread, prompt_switching
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -51,6 +52,45 @@ def test_a_frame_is_computed_on_one_thread_and_its_consumer_has_all(
     estimates.close()
     assert inside[:3] == [{1}] * 3
     assert watched == between == [{2}] * 3
+
+
+def test_threads_that_decode_are_let_in_soon_while_a_frame_is_computed_only(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before, inside = sys.getswitchinterval(), list[float]()
+    observe = runner.observe
+
+    def noting(*arguments: Any) -> Any:
+        inside.append(sys.getswitchinterval())
+        return observe(*arguments)
+
+    monkeypatch.setattr(runner, "observe", noting)
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    estimates = mixpose.run(session)
+    between = [sys.getswitchinterval() for _ in islice(estimates, 2)]
+    estimates.close()
+    # the interpreter keeps whole microseconds
+    assert inside[:2] == pytest.approx([SWITCH_S] * 2, abs=1e-6)
+    assert between == [before] * 2
+
+
+def test_prompt_switching_of_two_that_overlap_leaves_the_interval_as_it_was() -> None:
+    before = sys.getswitchinterval()
+    entered, left = Barrier(2), Barrier(2)
+
+    def later() -> None:
+        with prompt_switching():
+            entered.wait(10)
+            left.wait(10)
+
+    other = Thread(target=later)
+    with prompt_switching():
+        other.start()
+        entered.wait(10)
+    assert sys.getswitchinterval() == before
+    left.wait(10)
+    other.join()
+    assert sys.getswitchinterval() == before
 
 
 @pytest.mark.usefixtures("two_threads")

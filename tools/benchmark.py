@@ -23,6 +23,8 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from benchmarks import (  # noqa: E402
     calls_case,
+    frames_case,
+    growth_case,
     many_case,
     memory_case,
     objective_case,
@@ -35,6 +37,8 @@ from benchmarks import (  # noqa: E402
 )
 
 CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
+    "frames": frames_case.run,
+    "growth": growth_case.run,
     "objective": objective_case.run,
     "pose": pose_case.run,
     "calls": calls_case.run,
@@ -52,7 +56,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
     parser.add_argument("--trials", type=int, default=200, help="random frames per row")
-    parser.add_argument("--rows", nargs="*", default=[], help="search: only rows with these texts")
+    parser.add_argument(
+        "--rows", nargs="*", default=[], help="frames, search: only rows with these texts"
+    )
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     unknown = set(options.cases) - set(CASES)

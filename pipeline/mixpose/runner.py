@@ -30,7 +30,7 @@ from mixpose.records import (
 )
 from mixpose.selection import ALL_FRAMES, Selection
 from mixpose.sensors import CloudSensor, doubted
-from mixpose.threads import one_blas_thread
+from mixpose.threads import one_blas_thread, prompt_switching
 from mixpose.tracking import (
     DelayEvidence,
     Scene,
@@ -238,7 +238,7 @@ def _estimates(
     with closing(frames):
         for frame_set in frames:
             began = time.perf_counter()
-            with one_blas_thread():
+            with one_blas_thread(), prompt_switching():
                 tracks, estimates, views = windowed.advance(
                     tracks,
                     frame_set.number,

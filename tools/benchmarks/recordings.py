@@ -24,8 +24,12 @@ MARKERS = [
     [100.0, 55.0, 40.0], [-20.0, -95.0, 70.0], [60.0, -10.0, 100.0], [-90.0, -5.0, 95.0],
 ]  # fmt: skip
 DISTANCE = 1000.0
-EYES = ([0.0, -DISTANCE, 0.0], [DISTANCE, 0.0, 0.0])
-NAMES = ("left", "right")
+EYES = (
+    [0.0, -DISTANCE, 0.0], [DISTANCE, 0.0, 0.0],
+    [-0.6 * DISTANCE, -0.5 * DISTANCE, 0.6 * DISTANCE],
+    [0.5 * DISTANCE, -0.6 * DISTANCE, 0.6 * DISTANCE],
+)  # fmt: skip
+NAMES = ("left", "right", "above", "beside")
 
 
 def session_text(
@@ -34,12 +38,15 @@ def session_text(
     focal: float,
     *,
     fps: float = 50.0,
-    markers: int = len(MARKERS),
+    markers: int | None = None,
+    points: Sequence[Sequence[float]] | None = None,
+    shape: str = "",
 ) -> str:
-    """A session of one camera or two, the body's first pose given."""
+    """A session of one camera to four, the body's first pose given."""
     turn = Rotation.from_euler("xyz", [0.2, -0.3, 0.4]).as_rotvec().tolist()
     lines = [
-        'unit = "mm"', "[object]", 'name = "body"', f"points = {MARKERS[:markers]}",
+        'unit = "mm"', "[object]", 'name = "body"', shape,
+        f"points = {list(points or MARKERS)[:markers]}",
         "[start]", f"rotation_vector = {turn}", "translation = [0, 0, 0]",
         "rotation_deg = 10", "distance = 20",
     ]  # fmt: skip

@@ -13,13 +13,14 @@ from typing import Any
 from benchmarks.recordings import session_text, simulated, write_mjpeg, write_session
 from benchmarks.timing import medians, show
 from mixpose.cli.output import Output
-from mixpose.cli.run import header_of, prompt_switching
+from mixpose.cli.run import header_of
 from mixpose.frames import pair
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import begin, observe, open_sources
 from mixpose.runner import run as run_session
 from mixpose.session import Session
 from mixpose.simulation import SimulationOptions
+from mixpose.threads import prompt_switching
 
 FRAMES = 200
 RESOLUTION = (1280, 1024)

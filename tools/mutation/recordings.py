@@ -155,7 +155,7 @@ _VALUES = (
     Mutant(
         "frames-colour-is-its-blue",
         "frames/capture.py",
-        "cv2.cvtColor(image, code)",
+        "cv2.cvtColor(image, code, np.empty(image.shape[:2], image.dtype))",
         "image[:, :, 0].copy()",
         "a red feature of a colour video is black",
     ),

@@ -28,10 +28,8 @@ from mixpose.poses.jsonl import ResumePoint
 from mixpose.records import Estimate, FrameSet
 from mixpose.runner import Memory, Watch, open_sources, run
 from mixpose.session import Session, load_session
+from mixpose.threads import prompt_switching
 from mixpose.tracking.proposers import predicted
-
-SWITCH_S = 1e-4
-"""After so long a thread that has decoded a frame is let on; Python's own 5 ms is a whole frame."""
 
 
 def run_session(path: Path, request: RunRequest) -> None:
@@ -134,17 +132,6 @@ def _not_there(estimates: Iterable[Estimate], there: ResumePoint | None) -> Iter
             ):
                 continue
         yield estimate
-
-
-@contextmanager
-def prompt_switching() -> Iterator[None]:
-    """Let the threads that decode wait less for the one that estimates."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
 
 
 def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch | None:

@@ -9,6 +9,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -135,22 +136,50 @@ def grab(capture: cv2.VideoCapture, address: str | int) -> bool:
     return bool(found)
 
 
+@dataclass
+class ColourRoom:
+    """Where the coloured frames of a capture are put, one after the other.
+
+    To allocate an image, OpenCV has to wait for the interpreter, which another thread may hold.
+
+    Attributes
+    ----------
+    image : (H, W, 3 or 4) array or None
+        The last coloured frame; None before the first.
+    """
+
+    image: cv2.typing.MatLike | None = None
+
+
 def retrieve(
-    capture: cv2.VideoCapture, address: str | int, number: int, expected: tuple[int, int] | None
+    capture: cv2.VideoCapture,
+    address: str | int,
+    number: int,
+    expected: tuple[int, int] | None,
+    room: ColourRoom | None = None,
 ) -> Image:
     """Convert the grabbed frame to grey values, (H, W).
+
+    Parameters
+    ----------
+    room : ColourRoom or None
+        Kept from frame to frame of a capture; None: nothing is kept.
 
     Raises
     ------
     RecordingError
         If it cannot be decoded or has not the expected width and height.
     """
-    found, image = capture.retrieve()
+    found, image = capture.retrieve() if room is None else capture.retrieve(room.image)
     if not found or image is None:
         raise RecordingError(f"{name_of(address)}: frame {number} cannot be decoded")
-    if image.ndim == 3:
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    elif image.ndim == 3:
+        if room is not None:
+            room.image = image
         code = cv2.COLOR_BGRA2GRAY if image.shape[2] == 4 else cv2.COLOR_BGR2GRAY
-        image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image, code)
+        image = cv2.cvtColor(image, code, np.empty(image.shape[:2], image.dtype))
     height, width = image.shape
     if expected is not None and (width, height) != expected:
         raise RecordingError(

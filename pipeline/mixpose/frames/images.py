@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import stat
 import zlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -188,16 +189,7 @@ def read_image(path: Path) -> Image:
         If the file cannot be read, is cut short, damaged or no image, or holds NaN.
     """
     quieten_opencv()
-    try:
-        size = path.stat().st_size
-        data = path.read_bytes() if path.is_file() and size <= MOST_IMAGE_BYTES else None
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    if data is None:
-        found = f"{size} bytes" if path.is_file() else "no file"
-        raise RecordingError(
-            f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}"
-        )
+    data = _bytes_of(path)
     fault = _fault_of(data)
     if fault is not None:
         raise RecordingError(f"{path}: {fault}; record or copy it again, or leave it out")
@@ -223,6 +215,22 @@ def read_image(path: Path) -> Image:
     if image.dtype == np.float32 and not np.isfinite(image).all():
         raise RecordingError(f"{path}: found pixels that are not finite, allowed are numbers")
     return cast(Image, image)
+
+
+def _bytes_of(path: Path) -> bytes:
+    """All of a file, in few calls of the operating system: each gives the interpreter away."""
+    try:
+        status = path.stat()
+        is_file, size = stat.S_ISREG(status.st_mode), status.st_size
+        if is_file and size <= MOST_IMAGE_BYTES:
+            with path.open("rb", buffering=0) as file:
+                data = file.read(size)
+                # one call reads it all, but where it is interrupted or the file is cut meanwhile
+                return data if len(data) == size else data + file.read()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    found = f"{size} bytes" if is_file else "no file"
+    raise RecordingError(f"{path}: found {found}; allowed: a file of at most {MOST_IMAGE_BYTES}")
 
 
 def _fault_of(data: bytes) -> str | None:

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 
+import numpy as np
+
 from mixpose.errors import SessionError
 from mixpose.frames.live import LiveSource, join_live
 from mixpose.frames.prefetch import prefetch
 from mixpose.frames.source import Source, selection
 from mixpose.records import FrameSet, RawFrame
+
+READY_BYTES = 2**24
+"""Memory for further frames of a source that wait, decoded."""
+
+MOST_MORE = 13
+"""Of these at most so many: a pose may then take as long as sixteen others and delay no decoder."""
 
 
 def pair(
@@ -21,8 +29,8 @@ def pair(
     """Join the frames of all sources by number, ascending; of live ones the newest frames.
 
     A number that some sources lack yields a set without them.  Of each source only a few frames
-    are in memory, decoded ahead in a thread of its own where that pays; the threads end with
-    this generator.
+    are in memory, more of small ones, decoded ahead in a thread of its own where that pays; the
+    threads end with this generator.
 
     Parameters
     ----------
@@ -81,7 +89,13 @@ def _join(sources: Mapping[str, Source], wanted: range) -> Generator[FrameSet, N
 
 def _stream(source: Source, wanted: range) -> Generator[RawFrame, None, None]:
     frames = source.frames(wanted.start, wanted.stop, wanted.step)
-    return prefetch(frames, source.ahead) if source.ahead else frames
+    return prefetch(frames, source.ahead, _more_ahead) if source.ahead else frames
+
+
+def _more_ahead(frame: RawFrame) -> int:
+    """How many more frames like this one are worth keeping ready: small ones, for slow poses."""
+    size = frame.data.nbytes if isinstance(frame.data, np.ndarray) else READY_BYTES
+    return min(MOST_MORE, READY_BYTES // max(size, 1))
 
 
 def _time(frames: Mapping[str, RawFrame]) -> float | None:

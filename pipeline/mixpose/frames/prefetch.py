@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Generic, TypeVar
@@ -22,7 +22,9 @@ class _End:
     error: BaseException | None
 
 
-def prefetch(items: Iterator[T], depth: int = 3) -> Generator[T, None, None]:
+def prefetch(
+    items: Iterator[T], depth: int = 3, more: Callable[[T], int] | None = None
+) -> Generator[T, None, None]:
     """Yield `items` in order while a worker thread fetches the next ones.
 
     Pays where fetching releases the interpreter lock, as decoding images does.  The thread starts
@@ -35,6 +37,8 @@ def prefetch(items: Iterator[T], depth: int = 3) -> Generator[T, None, None]:
         What to read; an exception it raises comes out in its place, after the items before it.
     depth : int
         Most items that wait; one more may be on its way.
+    more : callable or None
+        Told the first item, how many more may wait.
     """
     waiting: SimpleQueue[_Item[T] | _End] = SimpleQueue()
     room: SimpleQueue[None] = SimpleQueue()
@@ -42,7 +46,7 @@ def prefetch(items: Iterator[T], depth: int = 3) -> Generator[T, None, None]:
         room.put(None)
     stop = threading.Event()
     worker = threading.Thread(
-        target=_fetch, args=(items, waiting, room, stop), name="mixpose-prefetch", daemon=True
+        target=_fetch, args=(items, waiting, room, stop, more), name="mixpose-prefetch", daemon=True
     )
     worker.start()
     try:
@@ -64,6 +68,7 @@ def _fetch(
     waiting: SimpleQueue[_Item[T] | _End],
     room: SimpleQueue[None],
     stop: threading.Event,
+    more: Callable[[T], int] | None,
 ) -> None:
     """Move items to the queue, one for each piece of room, until they end, fail or `stop` is set.
 
@@ -74,6 +79,9 @@ def _fetch(
         with contextlib.ExitStack() as closing:
             closing.callback(getattr(items, "close", lambda: None))
             for item in items:
+                for _ in range(more(item) if more else 0):
+                    room.put(None)
+                more = None
                 room.get()
                 if stop.is_set():
                     break

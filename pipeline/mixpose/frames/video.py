@@ -12,7 +12,7 @@ from typing import ClassVar
 import cv2
 
 from mixpose.errors import RecordingError
-from mixpose.frames.capture import NotOpenedError, grab, is_stream, opened, retrieve
+from mixpose.frames.capture import ColourRoom, NotOpenedError, grab, is_stream, opened, retrieve
 from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
@@ -104,6 +104,7 @@ class Video:
             number = 0
             time_s = None
             held: RawFrame | None = None
+            room = ColourRoom()
             while number < wanted.stop or held is not None:
                 if not grab(capture, self.address):
                     self._check_end(capture, number, time_s)
@@ -113,16 +114,18 @@ class Video:
                     held = None
                 time_s = _time(capture, number, time_s)
                 if number in wanted:
-                    frame = self._frame(capture, number, time_s)
+                    frame = self._frame(capture, number, time_s, room)
                     if self.missing:
                         held = frame
                     else:
                         yield frame
                 number += 1
 
-    def _frame(self, capture: cv2.VideoCapture, number: int, time_s: float | None) -> RawFrame:
+    def _frame(
+        self, capture: cv2.VideoCapture, number: int, time_s: float | None, room: ColourRoom
+    ) -> RawFrame:
         """Convert the grabbed frame."""
-        image = retrieve(capture, self.address, number, self.resolution or self.size)
+        image = retrieve(capture, self.address, number, self.resolution or self.size, room)
         if self.clock is not None:
             time_s = self.clock(number)
         return RawFrame(number, time_s, image)
