@@ -92,6 +92,21 @@ Scheduler = Annotated[
         "local for one on this machine.",
     ),
 ]
+Publish = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="URL",
+        help="Send each pose to another program too: udp://host:port, tcp://host:port, "
+        "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
+        "'?only=ok' none but those that are ok; repeatable.",
+    ),
+]
+Predict = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Publish where the body will be so much after each frame."
+    ),
+]
 
 
 @app.command()
@@ -108,11 +123,14 @@ def run(
     workers: Workers = 1,
     overlay: Overlay = None,
     scheduler: Scheduler = None,
+    publish: Publish = None,
+    predict: Predict = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
     from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
+    from mixpose.errors import SessionError  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
     selection = Selection(start, stop, step)
@@ -121,8 +139,23 @@ def run(
     named = None if format is None else format.value
     written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
     request = RunRequest(
-        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler
+        output,
+        written,
+        sources,
+        selection,
+        resume,
+        overlay,
+        debug,
+        allow_code,
+        scheduler,
+        tuple(publish or ()),
+        predict,
     )
+    if many and (publish or predict is not None):
+        raise SessionError(
+            "--publish: found several sessions; allowed is one, whose poses receivers take for one "
+            "recording"
+        )
     if many:
         raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415

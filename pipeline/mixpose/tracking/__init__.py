@@ -1,5 +1,6 @@
 """Tracking: propose, fit, judge, decide, follow, from frame to frame."""
 
+from mixpose.tracking.prediction import Foreseen as Foreseen
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import (
     Expectation as Expectation,

@@ -1,0 +1,42 @@
+"""Pose lines as a poses file, over a connection (RFC 9293)."""
+
+from __future__ import annotations
+
+import socket
+from contextlib import suppress
+
+from mixpose.poses.header import Header
+from mixpose.publishing.address import Address
+from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.message import Message, header_text
+
+
+class TcpSender:
+    """Connects to ``tcp://host:port``, where a receiver listens; the header comes first."""
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        self._place = address.place("tcp://127.0.0.1:9870")
+        self._header = f"{header_text(header)}\n".encode()
+        self._socket: socket.socket | None = None
+        self.dropped = 0
+
+    def connect(self) -> None:
+        """Connect, and send the header."""
+        self._socket = socket.create_connection(self._place, PublishingRules.connect_s)
+        self._socket.settimeout(None)  # whoever is slow is waited for: half a line helps nobody
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.sendall(self._header)
+
+    def send(self, message: Message) -> bool:
+        """Send a line."""
+        assert self._socket is not None
+        self._socket.sendall(f"{message.text}\n".encode())
+        return True
+
+    def close(self) -> None:
+        """Close the connection; what was sent still arrives."""
+        if self._socket is not None:
+            with suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()

@@ -1,0 +1,134 @@
+"""A WebSocket server (RFC 6455), for pages in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+from mixpose.poses.header import Header
+from mixpose.publishing.address import Address
+from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.message import Message, header_text
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+
+@dataclass(eq=False)
+class _Client:
+    """What waits for one browser."""
+
+    waiting: deque[str] = field(default_factory=deque)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+
+class WebSocketSender:
+    """Listens at ``ws://host:port/path``; who connects there gets the header and further lines.
+
+    Each gets what it is quick enough for.  Who asks for another path is refused, so that a path
+    that nobody guesses keeps others out.
+    """
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        address.needs("websockets", "ws")
+        host, port = address.place("ws://127.0.0.1:9871")
+        self._path = f"/{address.path}"
+        self._header = header_text(header)
+        try:
+            kind = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=kind)
+        except OSError as error:
+            raise address.error(
+                f"cannot be listened at: {error.strerror}; name a free port of this machine"
+            ) from error
+        self._clients = set[_Client]()
+        self._loop = asyncio.new_event_loop()
+        self._end = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="mixpose-ws", daemon=True)
+        self._thread.start()
+        self.dropped = 0
+
+    def connect(self) -> None:
+        """Nothing to do: receivers come by themselves."""
+
+    def send(self, message: Message) -> bool:
+        """Hand a line to all who are there."""
+        if not self._clients:
+            return False
+        self._loop.call_soon_threadsafe(self._hand_out, message.text)
+        return True
+
+    def close(self) -> None:
+        """Let what waits go out, and stop listening."""
+        with suppress(RuntimeError):  # closed already
+            self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join(2 * PublishingRules.farewell_s)
+
+    def _hand_out(self, text: str) -> None:
+        for client in self._clients:
+            if len(client.waiting) == PublishingRules.waiting:
+                client.waiting.popleft()
+                self.dropped += 1
+            client.waiting.append(text)
+            client.changed.set()
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(self._serve())
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve  # noqa: PLC0415 - an extra
+
+        async with serve(
+            self._serve_one,
+            sock=self._socket,
+            process_request=self._refuse_other_paths,
+            compression=None,  # takes longer than the way
+            close_timeout=PublishingRules.farewell_s,
+        ):
+            await self._end.wait()
+            deadline = self._loop.time() + PublishingRules.farewell_s
+            while any(c.waiting for c in self._clients) and self._loop.time() < deadline:
+                await asyncio.sleep(0.01)
+            self.dropped += sum(len(client.waiting) for client in self._clients)
+
+    def _refuse_other_paths(
+        self, connection: ServerConnection, request: Request
+    ) -> Response | None:
+        if request.path.rstrip("/") == self._path.rstrip("/"):
+            return None
+        return connection.respond(HTTPStatus.NOT_FOUND, "mixpose publishes at another path\n")
+
+    async def _serve_one(self, connection: ServerConnection) -> None:
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        client = _Client()
+        reading = asyncio.create_task(_discard(connection))
+        try:
+            await connection.send(self._header)
+            self._clients.add(client)
+            while True:
+                await client.changed.wait()
+                client.changed.clear()
+                while client.waiting:
+                    await connection.send(client.waiting[0])
+                    client.waiting.popleft()
+        except ConnectionClosed:
+            return
+        finally:
+            self._clients.discard(client)
+            reading.cancel()
+
+
+async def _discard(connection: ServerConnection) -> None:
+    """Read what a client says, so that its answers to pings are not held up behind it."""
+    async for _ in connection:
+        pass
