@@ -95,6 +95,7 @@ def osc(place: str) -> None:
 
 def lsl(place: str) -> None:
     import pylsl
+    from pylsl.util import LostError
 
     found: list[Any] = []
     while not found:
@@ -102,7 +103,7 @@ def lsl(place: str) -> None:
     inlet = pylsl.StreamInlet(found[0], recover=False)
     inlet.open_stream()
     print("ready", flush=True)
-    with suppress(pylsl.LostError):
+    with suppress(LostError):
         while True:
             sample, stamp = inlet.pull_sample()
             status = {0: "lost", 1: "ambiguous", 2: "ok"}[int(sample[7])]
