@@ -3,7 +3,8 @@
     python tests/receivers.py PROTOCOL PLACE
 
 says `ready` when it listens, and then a line of JSON for each pose: its frame, the status, the
-position, and when it arrived by the steady clock.  `stalled` accepts connections and never reads.
+position, and when it arrived by the steady clock.  Those that are `stalled_` say hello and never
+read.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def udp(place: str) -> None:
     receiving.bind(("127.0.0.1", int(place)))
     print("ready", flush=True)
     while True:
-        tell_line(receiving.recv(65536))
+        tell_line(bytes(receiving.recv(65536)))
 
 
 def listening(place: str) -> socket.socket:
@@ -59,11 +60,41 @@ def tcp(place: str) -> None:
                 tell_line(line)
 
 
-def stalled(place: str) -> None:
+def stalled_tcp(place: str) -> None:
+    stall(place, b"")
+
+
+def stalled_mqtt(place: str) -> None:
+    stall(place, bytes([0x20, 2, 0, 0]))  # CONNACK: welcome
+
+
+def stall(place: str, welcome: bytes) -> None:
     kept = []
     with listening(place) as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**14)
         while True:
-            kept.append(server.accept())
+            kept.append(server.accept()[0])
+            kept[-1].sendall(welcome)
+
+
+def stalled_ros2(place: str) -> None:
+    serve_sockets(lambda _: time.sleep(1e6), place)
+
+
+def serve_sockets(handler: Callable[[Any], None], place: str) -> None:
+    from websockets.sync.server import serve
+
+    with serve(handler, "127.0.0.1", int(place), max_queue=1) as server:
+        print("ready", flush=True)
+        server.serve_forever()
+
+
+def stalled_ws(place: str) -> None:
+    from websockets.sync.client import connect
+
+    with connect(f"ws://127.0.0.1:{place}/poses", max_queue=1):
+        print("ready", flush=True)
+        time.sleep(1e6)
 
 
 def ws(place: str) -> None:
@@ -121,7 +152,7 @@ def mqtt(place: str) -> None:
     client = Client(CallbackAPIVersion.VERSION2)
     client.on_connect = on_connect
     client.on_subscribe = lambda *_: print("ready", flush=True)
-    client.on_message = lambda _, __, message: tell_line(message.payload)
+    client.on_message = lambda _, __, message: tell_line(bytes(message.payload))
     client.connect("127.0.0.1", int(place))
     client.loop_forever()
 
@@ -141,9 +172,8 @@ def broker(place: str) -> None:
 
 def ros2(place: str) -> None:
     """A rosbridge: takes what was advertised, of types that ROS has, with all their fields."""
+    from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, get_typestore
-    from rosbags.typesys.base import Nodetype
-    from websockets.sync.server import serve
 
     store = get_typestore(Stores.ROS2_HUMBLE)
 
@@ -177,13 +207,25 @@ def ros2(place: str) -> None:
                 seconds = stamp["sec"] + 1e-9 * stamp["nanosec"]
                 status = {"frame": seconds, "position": [position[one] for one in "xyz"]}
 
-    with serve(take, "127.0.0.1", int(place)) as server:
-        print("ready", flush=True)
-        server.serve_forever()
+    serve_sockets(take, place)
 
 
 RECEIVERS: dict[str, Callable[[str], None]] = {
-    one.__name__: one for one in (udp, tcp, stalled, ws, osc, lsl, mqtt, broker, ros2)
+    one.__name__: one
+    for one in (
+        stalled_tcp,
+        stalled_mqtt,
+        stalled_ros2,
+        stalled_ws,
+        udp,
+        tcp,
+        ws,
+        osc,
+        lsl,
+        mqtt,
+        broker,
+        ros2,
+    )
 }
 
 if __name__ == "__main__":

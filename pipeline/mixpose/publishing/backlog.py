@@ -17,6 +17,7 @@ class PublishingRules:
     waiting: int = constant(
         100, "poses for one receiver: a second of a camera that gives 100 frames in it"
     )
+    buffer: int = constant(2**16, "bytes that the system holds of a connection: some 20 poses")
     retry_s: float = constant(
         0.5, "between attempts to reach a receiver: 50 frames at 100 a second"
     )

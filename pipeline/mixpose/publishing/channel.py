@@ -51,9 +51,12 @@ class Channel:
         if message.estimate.status == "ok" or self._address.options.get("only") != "ok":
             self._backlog.put(message)
 
-    def close(self) -> None:
-        """Send what still waits, but not for long, and say what became of all."""
+    def end(self) -> None:
+        """Nothing more is put."""
         self._backlog.end()
+
+    def close(self) -> None:
+        """After the end: send what still waits, but not for long, and say what became of all."""
         self._thread.join(self._rules.farewell_s)
         self._sender.close()
         self._thread.join(self._rules.farewell_s)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import socket
 import threading
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message, header_text, path_word
+from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -51,6 +53,9 @@ class MqttSender:
             answered.set()
 
         client.on_connect = on_connect
+        client.on_socket_open = lambda _, __, connection: keep_little(
+            cast(socket.socket, connection)
+        )
         client.connect(*self._place)
         client.loop_start()
         if not answered.wait(PublishingRules.connect_s):

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from mixpose import rigid
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.message import Message, path_word
-
-if TYPE_CHECKING:
-    from pythonosc.udp_client import UDPClient
+from mixpose.publishing.sockets import Datagrams
 
 
-class OscSender:
+class OscSender(Datagrams):
     """Sends to ``osc://host:port/prefix``, whether anybody listens there or not.
 
     A message ``/prefix/<body>`` has the frame number (i), the time of the frame in seconds (d;
@@ -24,20 +20,13 @@ class OscSender:
     def __init__(self, address: Address, header: Header) -> None:
         address.allow()
         address.needs("pythonosc", "osc")
-        self._place = address.place("osc://127.0.0.1:9000")
+        super().__init__(address.place("osc://127.0.0.1:9000"))
         self._prefix = f"/{address.path or 'mixpose'}"
-        self._client: UDPClient | None = None
         self.dropped = 0
-
-    def connect(self) -> None:
-        """Look up the host."""
-        from pythonosc.udp_client import UDPClient  # noqa: PLC0415 - an extra
-
-        self._client = UDPClient(*self._place)
 
     def send(self, message: Message) -> bool:
         """Send the message of one body."""
-        from pythonosc.osc_message_builder import OscMessageBuilder  # noqa: PLC0415
+        from pythonosc.osc_message_builder import OscMessageBuilder  # noqa: PLC0415 - an extra
 
         estimate = message.estimate
         built = OscMessageBuilder(f"{self._prefix}/{path_word(estimate.label)}")
@@ -49,10 +38,5 @@ class OscSender:
         if T is not None:
             for value in (*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()):
                 built.add_arg(value, "f")
-        assert self._client is not None
-        self._client.send(built.build())
+        self.put(built.build().dgram)
         return True
-
-    def close(self) -> None:
-        """Let go of the socket."""
-        self._client = None

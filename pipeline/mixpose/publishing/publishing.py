@@ -9,6 +9,7 @@ from types import TracebackType
 from mixpose.poses.header import Header
 from mixpose.poses.plain import require_finite
 from mixpose.publishing.address import parse
+from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.channel import Channel
 from mixpose.publishing.message import Message
 from mixpose.publishing.senders import SENDERS
@@ -32,6 +33,7 @@ class Publishing:
         By label of a body; where there is none, estimates are published as they are.
     ahead_s : float
         What these callables look ahead.
+    rules : PublishingRules
 
     Raises
     ------
@@ -46,11 +48,12 @@ class Publishing:
         tell: Callable[[str], None],
         foresee: Mapping[str, Foresee] | None = None,
         ahead_s: float = 0.0,
+        rules: PublishingRules = PublishingRules(),
     ) -> None:
         self._foresee, self._ahead_s = foresee or {}, ahead_s
         addresses = [parse(url, SENDERS) for url in urls]
         self._channels = [
-            Channel(each, SENDERS[each.scheme](each, header), tell) for each in addresses
+            Channel(each, SENDERS[each.scheme](each, header), tell, rules) for each in addresses
         ]
 
     def __enter__(self) -> Publishing:
@@ -64,6 +67,8 @@ class Publishing:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        for channel in self._channels:
+            channel.end()
         for channel in self._channels:
             channel.close()
 

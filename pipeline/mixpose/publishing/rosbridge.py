@@ -6,6 +6,7 @@ https://github.com/RobotWebTools/rosbridge_suite/blob/ros2/ROSBRIDGE_PROTOCOL.md
 from __future__ import annotations
 
 import json
+import socket
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from mixpose.publishing.address import Address
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message
 from mixpose.publishing.ros_messages import POSE, TRANSFORMS, ros_messages, topics
+from mixpose.publishing.sockets import connected
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -27,8 +29,13 @@ class RosbridgeSender:
     def __init__(self, address: Address, header: Header) -> None:
         address.needs("websockets", "ros2")
         self._bridge = address.options.get("bridge", DEFAULT_BRIDGE)
+        host, _, port = self._bridge.rpartition(":")
+        if not (host and port.isdigit() and 0 < int(port) < 2**16):
+            raise address.error(f"bridge: found {self._bridge}; allowed: host:port")
+        self._place = host.strip("[]"), int(port)
         self._topics = topics(address, header)
         self._connection: ClientConnection | None = None
+        self._is_sending = False
         self.dropped = 0
 
     def connect(self) -> None:
@@ -39,10 +46,10 @@ class RosbridgeSender:
         try:
             self._connection = connect(
                 f"ws://{self._bridge}",
+                sock=connected(self._place),
                 open_timeout=PublishingRules.connect_s,
                 close_timeout=PublishingRules.connect_s,
                 compression=None,
-                proxy=None,
             )
         except WebSocketException as error:
             raise ConnectionError(f"ws://{self._bridge}: {error}") from error
@@ -58,18 +65,26 @@ class RosbridgeSender:
         return True
 
     def close(self) -> None:
-        """Close the connection."""
-        if self._connection is not None:
+        """Close the connection; where a send waits, for which its lock is held, by force."""
+        if self._connection is None:
+            return
+        if self._is_sending:
+            with suppress(OSError):
+                self._connection.socket.shutdown(socket.SHUT_RDWR)
+        else:
             self._connection.close()
 
     def _say(self, what: dict[str, Any]) -> None:
         from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
         assert self._connection is not None
+        self._is_sending = True
         try:
             self._connection.send(json.dumps(what, allow_nan=False))
         except ConnectionClosed as error:
             raise ConnectionError("the rosbridge has gone") from error
+        finally:
+            self._is_sending = False
 
     def _heed(self) -> None:
         """Read what the bridge says; it says something only where it refuses."""

@@ -7,8 +7,8 @@ from contextlib import suppress
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
-from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message, header_text
+from mixpose.publishing.sockets import connected
 
 
 class TcpSender:
@@ -23,9 +23,7 @@ class TcpSender:
 
     def connect(self) -> None:
         """Connect, and send the header."""
-        self._socket = socket.create_connection(self._place, PublishingRules.connect_s)
-        self._socket.settimeout(None)  # whoever is slow is waited for: half a line helps nobody
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket = connected(self._place)
         self._socket.sendall(self._header)
 
     def send(self, message: Message) -> bool:

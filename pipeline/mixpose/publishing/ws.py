@@ -15,6 +15,7 @@ from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message, header_text
+from mixpose.publishing.sockets import keep_little
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -27,6 +28,7 @@ class _Client:
 
     waiting: deque[str] = field(default_factory=deque)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
+    has_gone: bool = False
 
 
 class WebSocketSender:
@@ -45,6 +47,7 @@ class WebSocketSender:
         try:
             kind = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._socket = socket.create_server((host, port), family=kind)
+            keep_little(self._socket)  # and so do the connections that it takes
         except OSError as error:
             raise address.error(
                 f"cannot be listened at: {error.strerror}; name a free port of this machine"
@@ -111,11 +114,11 @@ class WebSocketSender:
         from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
         client = _Client()
-        reading = asyncio.create_task(_discard(connection))
+        reading = asyncio.create_task(_heed(connection, client))
         try:
             await connection.send(self._header)
             self._clients.add(client)
-            while True:
+            while not client.has_gone:
                 await client.changed.wait()
                 client.changed.clear()
                 while client.waiting:
@@ -128,7 +131,9 @@ class WebSocketSender:
             reading.cancel()
 
 
-async def _discard(connection: ServerConnection) -> None:
-    """Read what a client says, so that its answers to pings are not held up behind it."""
+async def _heed(connection: ServerConnection, client: _Client) -> None:
+    """Read what a client says, so that answers to pings are not held up behind it, to its end."""
     async for _ in connection:
         pass
+    client.has_gone = True
+    client.changed.set()
