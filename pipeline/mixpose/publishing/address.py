@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -99,16 +100,16 @@ def parse(url: str, schemes: Collection[str]) -> Address:
         If it is none, or of a scheme that is not allowed.
     """
     allowed = ", ".join(f"{each}://" for each in schemes)
+    # a password is for the receiver, not for those who read what is said
+    text = re.sub(r"//[^/]*@", "//", url)
     try:
         parts = urlsplit(url)
         port = parts.port
     except ValueError as error:
-        raise SessionError(f"--publish {url}: is no address: {error}") from error
+        raise SessionError(f"--publish {text}: is no address: {error}") from error
     if parts.scheme not in schemes:
-        raise SessionError(f"--publish {url}: found no address that begins with {allowed}")
+        raise SessionError(f"--publish {text}: no address of a receiver; allowed: {allowed}")
     place = parts.netloc.rpartition("@")[2]
-    # a password is for the receiver, not for those who read what is said
-    text = parts._replace(netloc=place).geturl()
     return Address(
         text=text,
         scheme=parts.scheme,

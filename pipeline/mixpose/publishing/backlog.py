@@ -22,7 +22,10 @@ class PublishingRules:
         0.5, "between attempts to reach a receiver: 50 frames at 100 a second"
     )
     connect_s: float = constant(2.0, "to reach a receiver: a round trip by satellite takes 0.6 s")
-    farewell_s: float = constant(2.0, "for what still waits at the end of a run")
+    farewell_s: float = constant(2.0, "for what still waits at the end: as long as to connect")
+    stuck_s: float = constant(
+        0.25, "in one send: longer takes a receiver that does not read, which no end waits for"
+    )
 
 
 class Backlog:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -40,6 +41,7 @@ class Channel:
         self._stamped_by: str | None = None
         self._sent = self._unheard = 0
         self._is_away = False
+        self._began: float | None = None  # when the send began that goes on
         self._thread = threading.Thread(target=self._work, name="mixpose-publish", daemon=True)
 
     def start(self) -> None:
@@ -56,12 +58,13 @@ class Channel:
         self._backlog.end()
 
     def close(self) -> None:
-        """After the end: send what still waits, but not for long, and say what became of all."""
-        self._thread.join(self._rules.farewell_s)
+        """After the end: send what still waits, but not for long, and let go."""
+        began, rules = self._began, self._rules
+        is_stuck = began is not None and time.monotonic() - began > rules.stuck_s
+        self._thread.join(0.0 if is_stuck else rules.farewell_s)
         self._sender.close()
-        self._thread.join(self._rules.farewell_s)
+        self._thread.join(rules.farewell_s)
         self._backlog.give_up()
-        self._tell(self.text())
 
     def text(self) -> str:
         """One line: how many poses were sent, dropped, and how late they were."""
@@ -81,8 +84,11 @@ class Channel:
                 if not is_connected:
                     self._sender.connect()
                     is_connected = True
+                self._began = time.monotonic()
                 heard = self._sender.send(message)
+                self._began = None
             except OSError as error:
+                self._began = None
                 self._backlog.put_back(message)
                 if not (is_connected and self._backlog.has_ended):
                     self._is_now_away(error)

@@ -10,7 +10,7 @@ from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message, header_text, path_word
-from mixpose.publishing.sockets import keep_little
+from mixpose.publishing.sockets import force_down, keep_little
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -33,6 +33,7 @@ class MqttSender:
         self._topic = address.path or "mixpose"
         self._header = header_text(header)
         self._client: Client | None = None
+        self._is_sending = False
         self.dropped = 0
 
     def connect(self) -> None:
@@ -72,15 +73,21 @@ class MqttSender:
     def _publish(self, name: str, text: str, *, retain: bool = False) -> None:
         assert self._client is not None
         sent = self._client.publish(f"{self._topic}/{name}", text, retain=retain)
+        self._is_sending = True
         while not sent.rc and not sent.is_published():
             sent.wait_for_publish(_LOOK_S)
             if not self._client.is_connected():
                 break
+        self._is_sending = False
         if sent.rc or not sent.is_published():
             raise ConnectionError("the broker has gone")
 
     def close(self) -> None:
-        """Disconnect."""
-        if self._client is not None:
-            self._client.disconnect()
-            self._client.loop_stop()
+        """Disconnect; where a message waits for a broker that does not read, by force."""
+        if self._client is None:
+            return
+        connection = self._client.socket()
+        self._client.disconnect()
+        if self._is_sending and connection is not None:
+            force_down(cast(socket.socket, connection))
+        self._client.loop_stop()

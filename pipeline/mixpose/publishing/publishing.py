@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import TracebackType
@@ -50,7 +51,7 @@ class Publishing:
         ahead_s: float = 0.0,
         rules: PublishingRules = PublishingRules(),
     ) -> None:
-        self._foresee, self._ahead_s = foresee or {}, ahead_s
+        self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
         addresses = [parse(url, SENDERS) for url in urls]
         self._channels = [
             Channel(each, SENDERS[each.scheme](each, header), tell, rules) for each in addresses
@@ -69,8 +70,13 @@ class Publishing:
     ) -> None:
         for channel in self._channels:
             channel.end()
+        closing = [threading.Thread(target=channel.close) for channel in self._channels]
+        for thread in closing:
+            thread.start()
+        for thread in closing:
+            thread.join()
         for channel in self._channels:
-            channel.close()
+            self._tell(channel.text())
 
     def watch(self, frame_set: FrameSet, _: object, estimate: Estimate) -> None:
         """Publish an estimate of a frame; to be given to `mixpose.run`.

@@ -6,7 +6,6 @@ https://github.com/RobotWebTools/rosbridge_suite/blob/ros2/ROSBRIDGE_PROTOCOL.md
 from __future__ import annotations
 
 import json
-import socket
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ from mixpose.publishing.address import Address
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.message import Message
 from mixpose.publishing.ros_messages import POSE, TRANSFORMS, ros_messages, topics
-from mixpose.publishing.sockets import connected
+from mixpose.publishing.sockets import connected, force_down
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -69,8 +68,7 @@ class RosbridgeSender:
         if self._connection is None:
             return
         if self._is_sending:
-            with suppress(OSError):
-                self._connection.socket.shutdown(socket.SHUT_RDWR)
+            force_down(self._connection.socket)
         else:
             self._connection.close()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from contextlib import suppress
 from typing import Any
 
 from mixpose.publishing.backlog import PublishingRules
@@ -26,6 +27,12 @@ def connected(place: tuple[str, int]) -> socket.socket:
 def keep_little(connection: socket.socket) -> None:
     """Let the system hold few poses: left to itself it takes in seconds of them, and they age."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, PublishingRules.buffer)
+
+
+def force_down(connection: socket.socket) -> None:
+    """End a connection, and what waits for it in another thread; what was sent still arrives."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class Datagrams:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import socket
-from contextlib import suppress
 
 from mixpose.poses.header import Header
 from mixpose.publishing.address import Address
 from mixpose.publishing.message import Message, header_text
-from mixpose.publishing.sockets import connected
+from mixpose.publishing.sockets import connected, force_down
 
 
 class TcpSender:
@@ -35,6 +34,5 @@ class TcpSender:
     def close(self) -> None:
         """Close the connection; what was sent still arrives."""
         if self._socket is not None:
-            with suppress(OSError):
-                self._socket.shutdown(socket.SHUT_RDWR)
+            force_down(self._socket)
             self._socket.close()

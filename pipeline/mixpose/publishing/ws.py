@@ -26,9 +26,16 @@ if TYPE_CHECKING:
 class _Client:
     """What waits for one browser."""
 
+    connection: ServerConnection
     waiting: deque[str] = field(default_factory=deque)
     changed: asyncio.Event = field(default_factory=asyncio.Event)
     has_gone: bool = False
+    began: float | None = None  # when the send began that goes on
+
+    def is_stuck(self) -> bool:
+        """Whether it does not read."""
+        now = asyncio.get_running_loop().time()
+        return self.began is not None and now - self.began > PublishingRules.stuck_s
 
 
 class WebSocketSender:
@@ -99,9 +106,17 @@ class WebSocketSender:
         ):
             await self._end.wait()
             deadline = self._loop.time() + PublishingRules.farewell_s
-            while any(c.waiting for c in self._clients) and self._loop.time() < deadline:
+            while self._are_waiting() and self._loop.time() < deadline:
                 await asyncio.sleep(0.01)
-            self.dropped += sum(len(client.waiting) for client in self._clients)
+            for client in self._clients:
+                self.dropped += len(client.waiting) + (client.began is not None)
+                if client.is_stuck():
+                    client.connection.transport.abort()
+
+    def _are_waiting(self) -> bool:
+        """Whether anything is still to be sent to those who read."""
+        there = [one for one in self._clients if not one.is_stuck()]
+        return any(one.waiting or one.began is not None for one in there)
 
     def _refuse_other_paths(
         self, connection: ServerConnection, request: Request
@@ -113,7 +128,7 @@ class WebSocketSender:
     async def _serve_one(self, connection: ServerConnection) -> None:
         from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
 
-        client = _Client()
+        client = _Client(connection)
         reading = asyncio.create_task(_heed(connection, client))
         try:
             await connection.send(self._header)
@@ -122,8 +137,9 @@ class WebSocketSender:
                 await client.changed.wait()
                 client.changed.clear()
                 while client.waiting:
-                    await connection.send(client.waiting[0])
-                    client.waiting.popleft()
+                    client.began = self._loop.time()
+                    await connection.send(client.waiting.popleft())
+                    client.began = None
         except ConnectionClosed:
             return
         finally:
