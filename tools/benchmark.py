@@ -23,6 +23,7 @@ import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from benchmarks import (  # noqa: E402
     calls_case,
+    live_case,
     many_case,
     memory_case,
     objective_case,
@@ -39,6 +40,7 @@ CASES: dict[str, Callable[[argparse.Namespace], dict[str, Any]]] = {
     "pose": pose_case.run,
     "calls": calls_case.run,
     "stream": stream_case.run,
+    "live": live_case.run,
     "search": search_rows.run,
     "scaling": scaling_case.run,
     "many": many_case.run,

@@ -13,7 +13,7 @@ from mixpose.publishing.address import parse
 from mixpose.publishing.backlog import PublishingRules
 from mixpose.publishing.channel import Channel
 from mixpose.publishing.message import Message
-from mixpose.publishing.senders import SENDERS
+from mixpose.publishing.senders import SENDERS, sender_for
 from mixpose.records import Estimate, FrameSet
 
 Foresee = Callable[[Estimate], Estimate]
@@ -54,7 +54,7 @@ class Publishing:
         self._foresee, self._ahead_s, self._tell = foresee or {}, ahead_s, tell
         addresses = [parse(url, SENDERS) for url in urls]
         self._channels = [
-            Channel(each, SENDERS[each.scheme](each, header), tell, rules) for each in addresses
+            Channel(each, sender_for(each, header), tell, rules) for each in addresses
         ]
 
     def __enter__(self) -> Publishing:
