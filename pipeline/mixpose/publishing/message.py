@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from mixpose.poses.header import Header
@@ -24,13 +24,20 @@ class Message:
         When its frame was taken, by `time.monotonic`; None of a recording.
     ahead_s : float
         How much later the pose is foretold for.
+    unix_s : float or None
+        The moment that the pose is of, in seconds since 1970; None of a recording.
     """
 
     estimate: Estimate
     moment: Moment | None = None
     ahead_s: float = 0.0
+    unix_s: float | None = field(init=False, default=None)  # the same for all receivers
 
-    @cached_property
+    def __post_init__(self) -> None:
+        if self.age_s is not None:
+            object.__setattr__(self, "unix_s", time.time() - self.age_s)
+
+    @property
     def age_s(self) -> float | None:
         """Seconds from the moment that the pose is of to now; negative if it is to come."""
         return None if self.moment is None else self.late_s - self.ahead_s
@@ -39,11 +46,6 @@ class Message:
     def late_s(self) -> float:
         """Seconds from the moment of the frame to now; 0 of a recording."""
         return 0.0 if self.moment is None else time.monotonic() - self.moment.seconds
-
-    @cached_property
-    def unix_s(self) -> float | None:
-        """The moment that the pose is of, in seconds since 1970; None of a recording."""
-        return None if self.age_s is None else time.time() - self.age_s
 
     @cached_property
     def text(self) -> str:
