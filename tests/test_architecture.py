@@ -49,6 +49,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"sensors", "body", "density", "extraction", "objective", "session"}
     | {"fit", "judgement", "matching", "tracking"},
     "poses": GROUND,
+    "publishing": GROUND | {"poses"},
     "session": GROUND | {"sensors", "body", "extraction", "objective", "fit"},
     "simulation": GROUND | {"sensors", "body", "session", "frames"},
     "checking": GROUND

@@ -30,7 +30,8 @@ def built(source: Path, kind: str, folder: Path) -> Path:
 
 # distributions whose modules have other names
 NAMES = {"cv2": "opencv-python-headless", "yaml": "pyyaml", "skimage": "scikit-image",
-         "rerun": "rerun-sdk", "dask": "distributed"}  # fmt: skip
+         "rerun": "rerun-sdk", "dask": "distributed", "pythonosc": "python-osc",
+         "paho": "paho-mqtt"}  # fmt: skip
 
 
 def required(words: Iterable[str]) -> set[str]:

@@ -49,6 +49,7 @@ TESTS: dict[str, tuple[str, ...]] = {
     ),
     "session": ("test_session_*.py",),
     "poses": ("test_poses_*.py",),
+    "publishing": ("test_publishing.py", "test_publishing_*.py"),
     "simulation": ("test_simulation_*.py",),
     "checking": ("test_check_*.py",),
     "importing": ("test_import*.py",),

@@ -156,16 +156,33 @@ Pattern: TypeAlias = PointPattern | GridPattern
 
 
 @dataclass(frozen=True)
+class Moment:
+    """When a frame was taken, by the steady clock of this machine.
+
+    Attributes
+    ----------
+    seconds : float
+        Of `time.monotonic`.
+    of : {"capture", "arrival"}
+        What happened then: "capture" where the source tells, else "arrival".
+    """
+
+    seconds: float
+    of: Literal["capture", "arrival"]
+
+
+@dataclass(frozen=True)
 class RawFrame:
     """What one sensor recorded at one moment.
 
     `data` is an image (H, W) of a camera, or a pattern where the source holds detections
-    (`PointPattern`) or range profiles (`GridPattern`) already.
+    (`PointPattern`) or range profiles (`GridPattern`) already.  `moment` is None in a recording.
     """
 
     number: int
     time_s: float | None
     data: Image | Pattern
+    moment: Moment | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True)
@@ -175,6 +192,11 @@ class FrameSet:
     number: int
     time_s: float | None
     frames: Mapping[str, RawFrame]
+
+    @property
+    def moment(self) -> Moment | None:
+        """When it was taken, by the first sensor that knows, as `time_s`; None in a recording."""
+        return next((one.moment for one in self.frames.values() if one.moment is not None), None)
 
 
 @dataclass(frozen=True)

@@ -308,4 +308,42 @@ _RUNNER = (
     ),
 )
 
-MUTANTS = (*_SIMULATION, *_CHECKING, *_RUNNER)
+_PUBLISHING = (
+    Mutant(
+        "publishing-newest-goes",
+        "publishing/backlog.py",
+        "self._messages.popleft()\n                self.dropped += 1",
+        "self._messages.pop()\n                self.dropped += 1",
+        "a receiver that was away gets what is old",
+    ),
+    Mutant(
+        "publishing-put-back-at-the-end",
+        "publishing/backlog.py",
+        "self._messages.appendleft(message)",
+        "self._messages.append(message)",
+        "poses arrive out of their order after a receiver was away",
+    ),
+    Mutant(
+        "publishing-stamp-of-the-frame",
+        "publishing/message.py",
+        "self.late_s - self.ahead_s",
+        "self.late_s",
+        "a pose ahead has the stamp of now",
+    ),
+    Mutant(
+        "publishing-password-told",
+        "publishing/address.py",
+        'text = re.sub(r"//[^/]*@", "//", url)',
+        "text = url",
+        "a broker's password is in every message",
+    ),
+    Mutant(
+        "publishing-ambiguous-is-ok",
+        "publishing/channel.py",
+        'if message.estimate.status == "ok" or',
+        'if message.estimate.status != "lost" or',
+        "a filter that asked for sure poses gets others",
+    ),
+)
+
+MUTANTS = (*_SIMULATION, *_CHECKING, *_RUNNER, *_PUBLISHING)

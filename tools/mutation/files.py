@@ -303,7 +303,7 @@ _FORMATS = (
     Mutant(
         "poses-ros-covariance-in-the-unit-of-the-file",
         "poses/ros.py",
-        "scale = np.array([1 / self._per_metre] * 3 + [1.0] * 3)",
+        "scale = np.array([1 / per_metre] * 3 + [1.0] * 3)",
         "scale = np.ones(6)",
         "variances in mm² are read as m²",
     ),

@@ -101,6 +101,21 @@ Scheduler = Annotated[
         "local for one on this machine.",
     ),
 ]
+Publish = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="URL",
+        help="Send each pose to another program too: udp://host:port, tcp://host:port, "
+        "ws://host:port, osc://host:port, lsl://name, mqtt://host/topic, ros2://topic; with "
+        "'?only=ok' none but those that are ok; repeatable.",
+    ),
+]
+Predict = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Publish where the body will be so much after each frame."
+    ),
+]
 
 
 @app.command()
@@ -118,6 +133,8 @@ def run(
     overlay: Overlay = None,
     scheduler: Scheduler = None,
     labels: Labels = False,
+    publish: Publish = None,
+    predict: Predict = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
@@ -132,10 +149,26 @@ def run(
     named = None if format is None else format.value
     written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
     request = RunRequest(
-        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler, labels
+        output,
+        written,
+        sources,
+        selection,
+        resume,
+        overlay,
+        debug,
+        allow_code,
+        scheduler,
+        labels,
+        tuple(publish or ()),
+        predict,
     )
     if labels and written != "jsonl":
         raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")
+    if many and (publish or predict is not None):
+        raise SessionError(
+            "--publish: found several sessions; allowed is one, whose poses receivers take for one "
+            "recording"
+        )
     if many:
         raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))
     from mixpose.cli.notices import warn  # noqa: PLC0415

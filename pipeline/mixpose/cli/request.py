@@ -21,6 +21,9 @@ SUFFIXES = {
 }
 """Formats of poses by how the name of a file ends."""
 
+FARTHEST_S = 0.5
+"""What poses are foretold at most: a hand has turned round by then."""
+
 
 @dataclass(frozen=True)
 class RunRequest:
@@ -36,6 +39,31 @@ class RunRequest:
     allow_code: bool = False
     scheduler: str | None = None
     labels: bool = False
+    publish: tuple[str, ...] = ()
+    predict: float | None = None
+
+    @property
+    def ahead_s(self) -> float:
+        """How far poses that are published are foretold.
+
+        Raises
+        ------
+        SessionError
+            If nothing is published, or the time is not one that can be looked ahead.
+        """
+        seconds = self.predict
+        if seconds is None:
+            return 0.0
+        if not self.publish:
+            raise SessionError(
+                "--predict: found no --publish; poses are foretold for receivers, the file has "
+                "those of its frames"
+            )
+        if not 0 < seconds <= FARTHEST_S:
+            raise SessionError(
+                f"--predict: found {seconds:g}; allowed: seconds above 0, up to {FARTHEST_S:g}"
+            )
+        return seconds
 
 
 def format_of(output: Path | None, named: str | None) -> str:

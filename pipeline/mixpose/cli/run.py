@@ -66,7 +66,11 @@ def run_session(path: Path, request: RunRequest) -> None:
     summary = Summary(session)
     output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
-        watch = _both(summary.watch, _overlay(stack, session, request))
+        watch = _each(
+            _publishing(stack, session, request, header),
+            summary.watch,
+            _overlay(stack, session, request),
+        )
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
             session,
@@ -143,14 +147,28 @@ def _overlay(stack: ExitStack, session: Session, request: RunRequest) -> Watch |
     return stack.enter_context(Overlay(session, request.overlay, resume=request.resume)).watch
 
 
-def _both(first: Watch, second: Watch | None) -> Watch:
-    """Two that look at each frame, one after the other."""
-    if second is None:
-        return first
+def _publishing(
+    stack: ExitStack, session: Session, request: RunRequest, header: Header
+) -> Watch | None:
+    """What sends each pose on, finished with the stack; None where nothing is published."""
+    ahead_s = request.ahead_s
+    if not request.publish:
+        return None
+    from mixpose.cli.foreseeing import foreseeing  # noqa: PLC0415 - only where it is published
+    from mixpose.publishing import Publishing  # noqa: PLC0415
+
+    foresee = foreseeing(session, ahead_s) if ahead_s else None
+    publishing = Publishing(request.publish, header, say, foresee, ahead_s)
+    return stack.enter_context(publishing).watch
+
+
+def _each(*watches: Watch | None) -> Watch:
+    """Several that look at each frame, one after the other."""
+    there = [one for one in watches if one is not None]
 
     def watch(frame_set: FrameSet, views: Sequence[View], estimate: Estimate) -> None:
-        first(frame_set, views, estimate)
-        second(frame_set, views, estimate)
+        for one in there:
+            one(frame_set, views, estimate)
 
     return watch
 

@@ -24,6 +24,9 @@ from mixpose.records import Image
 # How long a stream may take to open, and then to deliver its next frame.
 PATIENCE_S = 10.0
 
+# Of a pipe: a raw frame in one piece; else writer and reader take turns for each 64 kB of it.
+_PIPE_BYTES = 2**20
+
 # Pixel formats of grey videos as FFmpeg tags them: 8 and 16 bits.
 _GREY_FORMATS = (b"Y800", b"Y1\x00\x10")
 
@@ -113,6 +116,10 @@ def _reading_end(path: str, stack: contextlib.ExitStack) -> int:
     """
     end = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     stack.callback(os.close, end)
+    with contextlib.suppress(ImportError, AttributeError, OSError):  # where pipes can be widened
+        import fcntl  # noqa: PLC0415 - not on every system
+
+        fcntl.fcntl(end, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
     # a pipe that nobody has opened for writing reads as ended, but is not readable
     if not select.select([end], [], [], PATIENCE_S)[0]:
         raise RecordingError(f"{path}: nothing was written to this pipe for {PATIENCE_S:g} s")

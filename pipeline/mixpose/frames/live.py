@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import threading
 import time
+from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ from pathlib import PurePosixPath
 from types import TracebackType
 from typing import ClassVar
 from urllib.parse import urlsplit
+
+import cv2
 
 from mixpose.errors import RecordingError
 from mixpose.frames.capture import (
@@ -31,6 +34,7 @@ from mixpose.frames.capture import (
     opened,
     retrieve,
 )
+from mixpose.frames.moments import CaptureTimes
 from mixpose.frames.source import SourceKind, selection
 from mixpose.frames.times import Clock
 from mixpose.records import FrameSet, RawFrame
@@ -47,6 +51,7 @@ STALLED_S = 3.0
 RETURN_S = 60.0
 """How long a source that has given frames may be away, until the run ends."""
 
+_KEPT = 8  # frames of each source to choose from where several are paired
 _AGAIN_S = 0.5  # between two attempts to open it
 
 
@@ -74,7 +79,8 @@ class LiveSource:
     resolution : (width, height) or None
         Size that every frame must have, in px.
     clock : callable or None
-        Gives the time of a frame number; None means when the frame arrived, in s since the start.
+        Gives the time of a frame number; None means when the frame was captured, or arrived where
+        the source does not tell, in s since the start.
     """
 
     kind: ClassVar[SourceKind] = "live"
@@ -115,9 +121,9 @@ class LiveSource:
 def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[FrameSet, None, None]:
     """The newest frames of all sources, once each has one that was not given yet.
 
-    The frames of a set are at most one period of the fastest source apart, or what its
-    transmission adds to that.  A source that has ended is left out of further sets, and one that
-    is silent until it gives frames again.
+    The frames of a set are those that were captured nearest to the latest moment which all have
+    reached: at most half a period apart, however long each was on its way.  A source that has
+    ended is left out of further sets, and one that is silent until it gives frames again.
 
     Yields
     ------
@@ -132,7 +138,7 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
     began = time.monotonic()
     with ExitStack() as stack:
         readers = {
-            sensor: stack.enter_context(_Reader(source, began))
+            sensor: stack.enter_context(_Reader(source, began, _KEPT if len(sources) > 1 else 1))
             for sensor, source in sources.items()
         }
         given = dict.fromkeys(readers, -1)
@@ -151,7 +157,7 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
             stalled = set(left) - set(going)
             if not going:
                 continue
-            frames = {sensor: readers[sensor].newest() for sensor in going}
+            frames = _together({each: readers[each].newer_than(given[each]) for each in going})
             given.update((sensor, frame.number) for sensor, frame in frames.items())
             number = max(number + 1, *given.values())
             if number >= wanted.stop:
@@ -161,13 +167,27 @@ def join_live(sources: Mapping[str, LiveSource], wanted: range) -> Generator[Fra
                 yield FrameSet(number, next(iter(frames.values())).time_s, frames)
 
 
-class _Reader:
-    """Reads a live source in a thread of its own and keeps its newest frame."""
+def _together(waiting: Mapping[str, list[RawFrame]]) -> dict[str, RawFrame]:
+    """Of each source the frame nearest to the latest moment that all of them have reached."""
+    latest = min(_seconds(frames[-1]) for frames in waiting.values())
+    return {
+        sensor: min(frames, key=lambda frame: abs(_seconds(frame) - latest))
+        for sensor, frames in waiting.items()
+    }
 
-    def __init__(self, source: LiveSource, began: float) -> None:
+
+def _seconds(frame: RawFrame) -> float:
+    assert frame.moment is not None, "live frames have moments"
+    return frame.moment.seconds
+
+
+class _Reader:
+    """Reads a live source in a thread of its own and keeps its newest frames."""
+
+    def __init__(self, source: LiveSource, began: float, kept: int) -> None:
         self._source, self._began = source, began
         self._changed = threading.Condition()
-        self._newest: RawFrame | None = None
+        self._frames = deque[RawFrame](maxlen=kept)
         self._count = 0
         self._error: BaseException | None = None
         self._ended = False
@@ -200,14 +220,15 @@ class _Reader:
         """Whether no further frame will come."""
         return self._ended
 
-    def newest(self) -> RawFrame:
-        """The newest frame; `is_newer_than` has told that there is one."""
-        assert self._newest is not None
-        return self._newest
+    def newer_than(self, number: int) -> list[RawFrame]:
+        """Frames with numbers above this one, the newest last."""
+        with self._changed:
+            return [frame for frame in self._frames if frame.number > number]
 
     def is_newer_than(self, number: int) -> bool:
         """Whether there is a frame with a number above this one."""
-        return self._newest is not None and self._newest.number > number
+        with self._changed:
+            return bool(self._frames) and self._frames[-1].number > number
 
     def _read(self) -> None:
         try:
@@ -237,13 +258,15 @@ class _Reader:
     def _read_on(self) -> None:
         """Read frames until there are no more."""
         address, clock = self._source.address, self._source.clock
+        times = CaptureTimes(address)
         with opened(address) as capture:
             while not self._stop.is_set() and grab(capture, address):
-                number, arrived = self._count, time.monotonic() - self._began
+                number = self._count
+                moment = times.moment(capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
                 image = retrieve(capture, address, number, self._source.resolution)
-                time_s = arrived if clock is None else clock(number)
+                time_s = moment.seconds - self._began if clock is None else clock(number)
                 with self._changed:
-                    self._newest = RawFrame(number, time_s, image)
+                    self._frames.append(RawFrame(number, time_s, image, moment))
                     self._changed.notify_all()
                 self._count += 1
         if isinstance(address, int) and not self._stop.is_set():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
 from mixpose.limits import MOST_PIXELS
-from mixpose.records import RawFrame
+from mixpose.records import Moment, RawFrame
 
 
 @dataclass(frozen=True)
@@ -125,10 +126,11 @@ class Video:
         self, capture: cv2.VideoCapture, number: int, time_s: float | None, room: ColourRoom
     ) -> RawFrame:
         """Convert the grabbed frame."""
+        moment = Moment(time.monotonic(), "arrival") if self.size is None else None
         image = retrieve(capture, self.address, number, self.resolution or self.size, room)
         if self.clock is not None:
             time_s = self.clock(number)
-        return RawFrame(number, time_s, image)
+        return RawFrame(number, time_s, image, moment)
 
     def _check_end(self, capture: cv2.VideoCapture, count: int, last_time_s: float | None) -> None:
         """Complain where the video ends after `count` frames but should not."""

@@ -39,7 +39,7 @@ class JsonlWriter:
     def __init__(self, stream: TextIO, header: Header, *, resume: bool = False) -> None:
         self._stream = stream
         if not resume:
-            self._write_line(_header_line(header))
+            self._write_line(header_line(header))
 
     def write(self, estimate: Estimate) -> None:
         """Write the line of one frame and flush it.
@@ -50,7 +50,7 @@ class JsonlWriter:
             If the estimate holds a value that is not finite.
         """
         require_finite(estimate)
-        self._write_line(_pose_line(estimate))
+        self._write_line(pose_line(estimate))
 
     def close(self) -> None:
         """Flush; the stream stays open."""
@@ -62,7 +62,8 @@ class JsonlWriter:
         self._stream.flush()
 
 
-def _header_line(header: Header) -> dict[str, Any]:
+def header_line(header: Header) -> dict[str, Any]:
+    """The first line of a poses file, as what JSON holds."""
     line: dict[str, Any] = {
         "type": "header",
         "format": FORMAT,
@@ -84,7 +85,8 @@ def _header_line(header: Header) -> dict[str, Any]:
     return line
 
 
-def _pose_line(estimate: Estimate) -> dict[str, Any]:
+def pose_line(estimate: Estimate) -> dict[str, Any]:
+    """The line of an estimate, as what JSON holds."""
     T = pose_of(estimate)
     covariance = estimate.covariance if T is not None else None
     turn = None if T is None else rigid.quaternion_xyzw(T)
@@ -302,7 +304,7 @@ def _last_whole_frame(file: PoseFile, data: bytes, bodies: int) -> tuple[int | N
 
 
 def _check_same_run(path: Path, found: Mapping[str, Any], wanted: Header) -> None:
-    line = _header_line(wanted)
+    line = header_line(wanted)
     if found.get("session_sha256") != line["session_sha256"]:
         raise SessionError(
             f"--resume: the session has changed since {path} was written; leave out --resume to "

@@ -7,7 +7,8 @@ https://docs.ros.org/en/rolling/p/geometry_msgs/msg/PoseWithCovarianceStamped.ht
 from __future__ import annotations
 
 import json
-from typing import TextIO
+from collections.abc import Mapping
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -39,7 +40,7 @@ class RosWriter:
 
     def __init__(self, stream: TextIO, header: Header, *, frame_id: str = "world") -> None:
         self._stream = stream
-        self._per_metre = UNITS_PER_METRE[header.unit]
+        self._unit = header.unit
         self._stamps = Stamps(stream, "ros")
         self._frame_id = frame_id
 
@@ -52,30 +53,26 @@ class RosWriter:
             If some frames have a time and others have none, or a time is beyond the message's.
         """
         require_finite(estimate)
-        T = pose_of(estimate)
-        if T is None:
+        if pose_of(estimate) is None:
             return
-        second, nanosecond = divmod(round(1e9 * self._stamps.time_of(estimate)), 10**9)
-        if abs(second) > _LARGEST_SECOND:
-            raise RecordingError(
-                f"frame {estimate.frame}: time {second} s is beyond what format 'ros' can say, "
-                f"{_LARGEST_SECOND} s; give the sensors times in seconds"
-            )
+        seconds = self._stamps.time_of(estimate)
+        message = pose_message(estimate, self._unit, seconds, self._frame_id)
+        header, posed = message["header"], message["pose"]
         self._stream.write(
             f"# frame {estimate.frame}, {estimate.status}\n"
             "header:\n"
             "  stamp:\n"
-            f"    sec: {second}\n"
-            f"    nanosec: {nanosecond}\n"
-            f"  frame_id: {json.dumps(self._frame_id)}\n"
+            f"    sec: {header['stamp']['sec']}\n"
+            f"    nanosec: {header['stamp']['nanosec']}\n"
+            f"  frame_id: {json.dumps(header['frame_id'])}\n"
             "pose:\n"
             "  pose:\n"
             "    position:\n"
-            + _fields("xyz", T[:3, 3] / self._per_metre)
+            + _fields(posed["pose"]["position"])
             + "    orientation:\n"
-            + _fields("xyzw", rigid.quaternion_xyzw(T))
+            + _fields(posed["pose"]["orientation"])
             + "  covariance:\n"
-            + "".join(f"  - {_number(value)}\n" for value in self._covariance(estimate))
+            + "".join(f"  - {_number(value)}\n" for value in posed["covariance"])
             + "---\n"
         )
         self._stream.flush()
@@ -84,16 +81,58 @@ class RosWriter:
         """Flush; the stream stays open."""
         self._stream.flush()
 
-    def _covariance(self, estimate: Estimate) -> Floats:
-        """The covariance in m and rad, (36,)."""
-        if estimate.covariance is None:
-            return np.zeros(36)
-        scale = np.array([1 / self._per_metre] * 3 + [1.0] * 3)
-        return np.asarray(estimate.covariance * np.outer(scale, scale)).ravel()
+
+def pose_message(
+    estimate: Estimate, unit: str, seconds: float, frame_id: str = "world"
+) -> dict[str, Any]:
+    """A geometry_msgs/msg/PoseWithCovarianceStamped, its fields by name, in metres and radians.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Which has a pose.
+    unit : str
+        Of its lengths.
+    seconds : float
+        The stamp.
+    frame_id : str
+        What the pose is relative to.
+
+    Raises
+    ------
+    RecordingError
+        If the stamp is beyond what a message can say.
+    """
+    T, per_metre = estimate.T_world_object, UNITS_PER_METRE[unit]
+    assert T is not None, "lost frames have no message"
+    second, nanosecond = divmod(round(1e9 * seconds), 10**9)
+    if abs(second) > _LARGEST_SECOND:
+        raise RecordingError(
+            f"frame {estimate.frame}: time {second} s is beyond what format 'ros' can say, "
+            f"{_LARGEST_SECOND} s; give the sensors times in seconds"
+        )
+    return {
+        "header": {"stamp": {"sec": second, "nanosec": nanosecond}, "frame_id": frame_id},
+        "pose": {
+            "pose": {
+                "position": dict(zip("xyz", plain(T[:3, 3] / per_metre))),
+                "orientation": dict(zip("xyzw", plain(rigid.quaternion_xyzw(T)))),
+            },
+            "covariance": plain(_covariance(estimate, per_metre)),
+        },
+    }
 
 
-def _fields(names: str, values: Floats) -> str:
-    return "".join(f"      {name}: {_number(value)}\n" for name, value in zip(names, values))
+def _covariance(estimate: Estimate, per_metre: float) -> Floats:
+    """The covariance in m and rad, (36,)."""
+    if estimate.covariance is None:
+        return np.zeros(36)
+    scale = np.array([1 / per_metre] * 3 + [1.0] * 3)
+    return np.asarray(estimate.covariance * np.outer(scale, scale)).ravel()
+
+
+def _fields(values: Mapping[str, float]) -> str:
+    return "".join(f"      {name}: {_number(value)}\n" for name, value in values.items())
 
 
 def _number(value: float) -> str:

@@ -6,6 +6,7 @@ from mixpose.tracking.clouds import (
     with_clouds as with_clouds,
 )
 from mixpose.tracking.labels import labelled as labelled
+from mixpose.tracking.prediction import Foreseen as Foreseen
 from mixpose.tracking.rules import Rules as Rules
 from mixpose.tracking.scene import (
     Expectation as Expectation,

@@ -185,6 +185,17 @@ class Course:
         rates[3:] += np.cross(moved[3:], rates[3:], axisb=0, axisc=0) / 2
         return Expected(rates[:, 0], gains[:, 0], np.sqrt(np.maximum(variance, 0.0)), rates[:, 1])
 
+    def ahead(self, elapsed: float) -> tuple[Floats, Floats]:
+        """The twist (6,) to where the body goes in some seconds, and by what variance it may err.
+
+        That is what is added to the variance of the last pose.
+        """
+        likeliest = self.log_likelihoods.argmax(axis=0).repeat(3), np.arange(6)
+        means, covariances = (each[likeliest] for each in self._foretold(elapsed))
+        now, before = self.means[likeliest], self.covariances[likeliest]
+        grown = covariances[:, 0, 0] - before[:, 0, 0]
+        return means[:, 0] - now[:, 0], np.maximum(grown, 0.0)
+
     def followed(self, moved: Floats, deviation: Floats, elapsed: float) -> Course:
         """The course after one more pose, a twist (6,) on, with standard deviations (6,)."""
         means, covariances = self._foretold(elapsed)

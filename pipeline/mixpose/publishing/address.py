@@ -1,0 +1,123 @@
+"""Where poses are published to, as people write it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from mixpose.errors import SessionError
+
+
+@dataclass(frozen=True)
+class Address:
+    """An address, taken apart.
+
+    Attributes
+    ----------
+    text : str
+        For messages: without a password.
+    scheme : str
+    host : str
+        Empty where there is none.
+    port : int or None
+    path : str
+        Without a slash before it or behind it.
+    name : str
+        Host and path as they are written, where they are no host but a name.
+    user, password : str or None
+    options : mapping of str to str
+        What stands behind a question mark.
+    """
+
+    text: str
+    scheme: str
+    host: str
+    port: int | None
+    path: str
+    name: str
+    user: str | None
+    password: str | None
+    options: Mapping[str, str]
+
+    def error(self, reason: str) -> SessionError:
+        """An error about this address."""
+        return SessionError(f"--publish {self.text}: {reason}")
+
+    def place(self, example: str, port: int | None = None) -> tuple[str, int]:
+        """Host and port; this port where none is written.
+
+        Raises
+        ------
+        SessionError
+            If host or port are missing; `example` shows how it is written.
+        """
+        found = self.port or port
+        if not self.host or found is None:
+            raise self.error(f"found no host and port; allowed: {example}")
+        return self.host, found
+
+    def allow(self, *names: str) -> None:
+        """Refuse options other than these, and those that all addresses have.
+
+        Raises
+        ------
+        SessionError
+        """
+        self._one_of("option", set(self.options), {*names, "only"})
+        if "only" in self.options:
+            self._one_of("only", {self.options["only"]}, {"ok"})
+
+    def _one_of(self, what: str, found: Collection[str], allowed: Collection[str]) -> None:
+        for each in found:
+            if each not in allowed:
+                listed = ", ".join(sorted(allowed))
+                raise self.error(f"{what}: found {each}; allowed: {listed}")
+
+    def needs(self, package: str, extra: str) -> None:
+        """Make sure that a package is installed.
+
+        Raises
+        ------
+        SessionError
+            Else, naming the extra that installs it.
+        """
+        if find_spec(package) is None:
+            raise self.error(
+                f"needs the package {package}; install it with: "
+                f"python -m pip install 'mixpose[{extra}]'"
+            )
+
+
+def parse(url: str, schemes: Collection[str]) -> Address:
+    """Take an address apart.
+
+    Raises
+    ------
+    SessionError
+        If it is none, or of a scheme that is not allowed.
+    """
+    allowed = ", ".join(f"{each}://" for each in schemes)
+    # a password is for the receiver, not for those who read what is said
+    text = re.sub(r"//[^/]*@", "//", url)
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError as error:
+        raise SessionError(f"--publish {text}: is no address: {error}") from error
+    if parts.scheme not in schemes:
+        raise SessionError(f"--publish {text}: no address of a receiver; allowed: {allowed}")
+    place = parts.netloc.rpartition("@")[2]
+    return Address(
+        text=text,
+        scheme=parts.scheme,
+        host=parts.hostname or "",
+        port=port,
+        path=parts.path.strip("/"),
+        name=unquote(f"{place}{parts.path}").strip("/"),
+        user=None if parts.username is None else unquote(parts.username),
+        password=None if parts.password is None else unquote(parts.password),
+        options=dict(parse_qsl(parts.query, keep_blank_values=True)),
+    )

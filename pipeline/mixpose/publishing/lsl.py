@@ -1,0 +1,95 @@
+"""Lab Streaming Layer by pylsl, for experiments that record many devices."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+from mixpose import rigid
+from mixpose.poses.header import Header
+from mixpose.publishing.address import Address
+from mixpose.publishing.message import Message
+
+if TYPE_CHECKING:
+    from pylsl import StreamOutlet
+
+# labels, types and units as of https://github.com/sccn/xdf/wiki/MoCap-Meta-Data
+_CHANNELS = (
+    *((f"Position{axis}", f"Position{axis}") for axis in "XYZ"),
+    *((f"Orientation{axis}", f"Orientation{axis}") for axis in "XYZW"),
+    ("Status", "Status"),
+    ("Frame", "Frame"),
+)
+_STATUS = {"lost": 0.0, "ambiguous": 1.0, "ok": 2.0}
+_FLUSH_S = 0.5  # outlets send in a thread of their own, which ends with them
+
+
+class LslSender:
+    """An outlet ``lsl://name``; of several bodies ``name-<body>`` for each.
+
+    Channels (float64, irregular rate): x y z in the unit of the session, the quaternion x y z w,
+    the status (0 lost, 1 ambiguous, 2 ok) and the frame number; NaN, as LSL has it, for the pose of
+    a lost frame.  The time of a sample is when its frame was taken, by LSL's own clock.
+    """
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        if not address.name:
+            raise address.error("found no name; allowed: lsl://tracker")
+        address.needs("pylsl", "lsl")
+        try:
+            import pylsl  # noqa: PLC0415 - an extra
+        except RuntimeError as error:  # the package is there, and its library is not
+            raise address.error(
+                f"liblsl cannot be loaded: {' '.join(str(error).split())}"
+            ) from error
+        self._clock = pylsl.local_clock
+        self._nan = float("nan")
+        names = {label: f"{address.name}-{label}" for label in header.labels}
+        if len(names) == 1:
+            names = dict.fromkeys(names, address.name)
+        # from the start, so that receivers find them before the first pose
+        self._outlets = {
+            label: pylsl.StreamOutlet(_info(pylsl, name, header)) for label, name in names.items()
+        }
+        self.dropped = 0
+
+    def connect(self) -> None:
+        """Nothing to do: receivers come by themselves."""
+
+    def send(self, message: Message) -> bool:
+        """Push the sample of one body."""
+        estimate, T = message.estimate, message.estimate.T_world_object
+        pose = [self._nan] * 7
+        if T is not None:
+            pose = [*T[:3, 3].tolist(), *rigid.quaternion_xyzw(T).tolist()]
+        outlet: StreamOutlet = self._outlets[estimate.label]
+        heard = bool(outlet.have_consumers())
+        stamp = self._clock() - (0.0 if message.age_s is None else message.age_s)
+        outlet.push_sample([*pose, _STATUS[estimate.status], float(estimate.frame)], stamp)
+        return heard
+
+    def close(self) -> None:
+        """Let what was pushed go out, and end the streams."""
+        if any(outlet.have_consumers() for outlet in self._outlets.values()):
+            time.sleep(_FLUSH_S)
+        self._outlets.clear()
+
+
+def _info(pylsl: Any, name: str, header: Header) -> Any:
+    """What an outlet says of its stream."""
+    info = pylsl.StreamInfo(
+        name, "MoCap", len(_CHANNELS), pylsl.IRREGULAR_RATE, pylsl.cf_double64, f"mixpose-{name}"
+    )
+    description = info.desc()
+    description.append_child_value("manufacturer", "mixpose")
+    channels = description.append_child("channels")
+    for label, kind in _CHANNELS:
+        channel = channels.append_child("channel")
+        channel.append_child_value("label", label)
+        channel.append_child_value("type", kind)
+        if kind.startswith("Position"):
+            channel.append_child_value("unit", header.unit)
+        elif kind.startswith("Orientation"):
+            channel.append_child_value("unit", "quaternion")
+    return info

@@ -1,0 +1,69 @@
+"""What is published: an estimate, and when its frame was taken."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from mixpose.poses.header import Header
+from mixpose.poses.jsonl import header_line, pose_line
+from mixpose.records import Estimate, Moment
+
+
+@dataclass(frozen=True)
+class Message:
+    """An estimate on its way.
+
+    Attributes
+    ----------
+    estimate : Estimate
+    moment : Moment or None
+        When its frame was taken, by `time.monotonic`; None of a recording.
+    ahead_s : float
+        How much later the pose is foretold for.
+    unix_s : float or None
+        The moment that the pose is of, in seconds since 1970; None of a recording.
+    """
+
+    estimate: Estimate
+    moment: Moment | None = None
+    ahead_s: float = 0.0
+    unix_s: float | None = field(init=False, default=None)  # the same for all receivers
+
+    def __post_init__(self) -> None:
+        if self.age_s is not None:
+            object.__setattr__(self, "unix_s", time.time() - self.age_s)
+
+    @property
+    def age_s(self) -> float | None:
+        """Seconds from the moment that the pose is of to now; negative if it is to come."""
+        return None if self.moment is None else self.late_s - self.ahead_s
+
+    @property
+    def late_s(self) -> float:
+        """Seconds from the moment of the frame to now; 0 of a recording."""
+        return 0.0 if self.moment is None else time.monotonic() - self.moment.seconds
+
+    @cached_property
+    def text(self) -> str:
+        """The pose line, and in it when the frame was taken, without an end of line."""
+        line = pose_line(self.estimate)
+        if self.moment is not None:
+            line["stamp_s"], line["stamp_of"] = self.unix_s, self.moment.of
+        if self.ahead_s:
+            line["ahead_s"] = self.ahead_s
+        return json.dumps(line, allow_nan=False)
+
+
+def header_text(header: Header) -> str:
+    """The header line, without an end of line."""
+    return json.dumps(header_line(header), allow_nan=False)
+
+
+def path_word(label: str) -> str:
+    """What a body is called in topics and paths, which allow few characters."""
+    word = re.sub(r"\W", "_", label, flags=re.ASCII)
+    return f"_{word}" if word[:1].isdigit() else word

@@ -1,0 +1,155 @@
+"""A WebSocket server (RFC 6455), for pages in a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+
+from mixpose.poses.header import Header
+from mixpose.publishing.address import Address
+from mixpose.publishing.backlog import PublishingRules
+from mixpose.publishing.message import Message, header_text
+from mixpose.publishing.sockets import keep_little
+
+if TYPE_CHECKING:
+    from websockets.asyncio.server import ServerConnection
+    from websockets.http11 import Request, Response
+
+
+@dataclass(eq=False)
+class _Client:
+    """What waits for one browser."""
+
+    connection: ServerConnection
+    waiting: deque[str] = field(default_factory=deque)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+    has_gone: bool = False
+    began: float | None = None  # when the send began that goes on
+
+    def is_stuck(self) -> bool:
+        """Whether it does not read."""
+        now = asyncio.get_running_loop().time()
+        return self.began is not None and now - self.began > PublishingRules.stuck_s
+
+
+class WebSocketSender:
+    """Listens at ``ws://host:port/path``; who connects there gets the header and further lines.
+
+    Each gets what it is quick enough for.  Who asks for another path is refused, so that a path
+    that nobody guesses keeps others out.
+    """
+
+    def __init__(self, address: Address, header: Header) -> None:
+        address.allow()
+        address.needs("websockets", "ws")
+        host, port = address.place("ws://127.0.0.1:9871")
+        self._path = f"/{address.path}"
+        self._header = header_text(header)
+        try:
+            kind = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=kind)
+            keep_little(self._socket)  # and so do the connections that it takes
+        except OSError as error:
+            raise address.error(
+                f"cannot be listened at: {error.strerror}; name a free port of this machine"
+            ) from error
+        self._clients = set[_Client]()
+        self._loop = asyncio.new_event_loop()
+        self._end = asyncio.Event()
+        self._thread = threading.Thread(target=self._run, name="mixpose-ws", daemon=True)
+        self._thread.start()
+        self.dropped = 0
+
+    def connect(self) -> None:
+        """Nothing to do: receivers come by themselves."""
+
+    def send(self, message: Message) -> bool:
+        """Hand a line to all who are there."""
+        if not self._clients:
+            return False
+        self._loop.call_soon_threadsafe(self._hand_out, message.text)
+        return True
+
+    def close(self) -> None:
+        """Let what waits go out, and stop listening."""
+        with suppress(RuntimeError):  # closed already
+            self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join(2 * PublishingRules.farewell_s)
+
+    def _hand_out(self, text: str) -> None:
+        for client in self._clients:
+            if len(client.waiting) == PublishingRules.waiting:
+                client.waiting.popleft()
+                self.dropped += 1
+            client.waiting.append(text)
+            client.changed.set()
+
+    def _run(self) -> None:
+        self._loop.run_until_complete(self._serve())
+        self._loop.close()
+
+    async def _serve(self) -> None:
+        from websockets.asyncio.server import serve  # noqa: PLC0415 - an extra
+
+        async with serve(
+            self._serve_one,
+            sock=self._socket,
+            process_request=self._refuse_other_paths,
+            compression=None,  # takes longer than the way
+            close_timeout=PublishingRules.farewell_s,
+        ):
+            await self._end.wait()
+            deadline = self._loop.time() + PublishingRules.farewell_s
+            while self._are_waiting() and self._loop.time() < deadline:
+                await asyncio.sleep(0.01)
+            for client in self._clients:
+                self.dropped += len(client.waiting) + (client.began is not None)
+                if client.is_stuck():
+                    client.connection.transport.abort()
+
+    def _are_waiting(self) -> bool:
+        """Whether anything is still to be sent to those who read."""
+        there = [one for one in self._clients if not one.is_stuck()]
+        return any(one.waiting or one.began is not None for one in there)
+
+    def _refuse_other_paths(
+        self, connection: ServerConnection, request: Request
+    ) -> Response | None:
+        if request.path.rstrip("/") == self._path.rstrip("/"):
+            return None
+        return connection.respond(HTTPStatus.NOT_FOUND, "mixpose publishes at another path\n")
+
+    async def _serve_one(self, connection: ServerConnection) -> None:
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        client = _Client(connection)
+        reading = asyncio.create_task(_heed(connection, client))
+        try:
+            await connection.send(self._header)
+            self._clients.add(client)
+            while not client.has_gone:
+                await client.changed.wait()
+                client.changed.clear()
+                while client.waiting:
+                    client.began = self._loop.time()
+                    await connection.send(client.waiting.popleft())
+                    client.began = None
+        except ConnectionClosed:
+            return
+        finally:
+            self._clients.discard(client)
+            reading.cancel()
+
+
+async def _heed(connection: ServerConnection, client: _Client) -> None:
+    """Read what a client says, so that answers to pings are not held up behind it, to its end."""
+    async for _ in connection:
+        pass
+    client.has_gone = True
+    client.changed.set()

@@ -1,0 +1,73 @@
+"""Poses of a little later than the last frame, for what shows or steers something."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.errors import SessionError
+from mixpose.records import Estimate, Floats
+from mixpose.rigid import perturb, twist_between
+from mixpose.tracking.motion import Course, MotionRules
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """A body as its poses so far let it go on: the state of a prediction.
+
+    Each coordinate is followed by `mixpose.tracking.motion.Course`, whose filters take the
+    velocity, and how steady it is, from the poses and their covariances.
+    """
+
+    body: Body
+    rules: MotionRules = MotionRules()
+    T_world_object: Floats | None = None  # (4, 4), the last pose
+    time_s: float = 0.0  # of that pose
+    course: Course | None = None
+
+    def after(self, estimate: Estimate) -> Foreseen:
+        """The state after one more estimate of the body; a lost one changes nothing.
+
+        Raises
+        ------
+        SessionError
+            If the estimate has no time.
+        """
+        T, time_s, covariance = estimate.T_world_object, estimate.time_s, estimate.covariance
+        if time_s is None:
+            raise SessionError(
+                f"--predict: frame {estimate.frame} has no time; add fps to the [[sensor]], or "
+                "times with a row for each frame"
+            )
+        if T is None or covariance is None:
+            return self
+        deviation, elapsed = np.sqrt(covariance.diagonal()), time_s - self.time_s
+        known = self.course is not None and 0 < elapsed <= self.rules.longest_s
+        if known and self.course is not None and self.T_world_object is not None:
+            moved = twist_between(self.T_world_object, T)
+            course = self.course.followed(moved, deviation, elapsed)
+        else:
+            course = Course.begun(deviation, self.body, self.rules)
+        return replace(self, T_world_object=T, time_s=time_s, course=course)
+
+    def ahead(self, estimate: Estimate, seconds: float) -> Estimate:
+        """The estimate that this is the state after, some seconds later.
+
+        The covariance is that of the estimate, and what the velocity and its changes add to it in
+        that time.  Directions that are not estimated stay as they are.  Hypotheses are of the
+        frame alone and left out; a lost frame stays lost.
+        """
+        T, covariance, course = estimate.T_world_object, estimate.covariance, self.course
+        later = None if estimate.time_s is None else estimate.time_s + seconds
+        estimate = replace(estimate, time_s=later, hypotheses=())
+        if T is None or covariance is None or course is None:
+            return estimate
+        twist, grown = course.ahead(seconds)
+        free = covariance.diagonal() > 0
+        return replace(
+            estimate,
+            T_world_object=perturb(T, np.where(free, twist, 0.0)),
+            covariance=covariance + np.diag(np.where(free, grown, 0.0)),
+        )
