@@ -84,6 +84,18 @@ Overlay = Annotated[
     Path | None,
     typer.Option(help="Draw each pose on its frames: a video (.mp4, .mkv, .avi) or a folder."),
 ]
+View = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[PORT]",
+        help="Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
+        "opens it to others who have the address with its token.",
+    ),
+]
+Pause = Annotated[
+    bool,
+    typer.Option("--pause", help="With --view, on files: begin paused, to go on from the page."),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -107,6 +119,8 @@ def run(
     resume: Resume = False,
     workers: Workers = 1,
     overlay: Overlay = None,
+    view: View = None,
+    pause: Pause = False,
     scheduler: Scheduler = None,
     allow_code: AllowCode = False,
 ) -> None:
@@ -121,7 +135,17 @@ def run(
     named = None if format is None else format.value
     written = (named or "jsonl") if many else format_of(output, named)  # of many: a folder
     request = RunRequest(
-        output, written, sources, selection, resume, overlay, debug, allow_code, scheduler
+        output,
+        written,
+        sources,
+        selection,
+        resume,
+        overlay,
+        debug,
+        allow_code,
+        scheduler,
+        view,
+        pause,
     )
     if many:
         raise typer.Exit(run_sessions(sessions_of(sessions), request, workers))

@@ -35,6 +35,8 @@ class RunRequest:
     debug: bool = False
     allow_code: bool = False
     scheduler: str | None = None
+    view: str | None = None
+    pause: bool = False
 
 
 def format_of(output: Path | None, named: str | None) -> str:

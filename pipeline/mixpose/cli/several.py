@@ -116,7 +116,8 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     SessionError
         If there is no folder for the poses, or an option is given that serves a single recording.
     """
-    for option, value in (("--source", request.sources), ("--overlay", request.overlay)):
+    alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
+    for option, value in alone.items():
         if value:
             shown = value if isinstance(value, Path) else value[0]
             raise SessionError(

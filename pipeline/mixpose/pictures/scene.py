@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import cv2
 import numpy as np
@@ -115,7 +116,7 @@ def resized(image: Image, room: tuple[int, int] | None) -> tuple[Image, float]:
         return image, 1.0
     size = max(round(image.shape[1] * zoom), 1), max(round(image.shape[0] * zoom), 1)
     way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
-    return cv2.resize(image, size, interpolation=way), zoom
+    return cast(Image, cv2.resize(image, size, interpolation=way)), zoom
 
 
 def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
