@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mixpose.records import Floats
-from mixpose.sensors import Rays
+from mixpose.sensors import Rays, Sensor
 from mixpose.session import SensorSetup, Session
 from mixpose.viewing.moment import Shown
 
 _ALONG_EDGE = 8  # rays along an edge of an image: lenses bend edges
 _LENGTH = 0.12  # of the scene, that lines of sight are drawn
+_SHARES = (1 - 1e-6, *np.linspace(0.95, 0.05, 19).tolist())  # the very edge rounds to outside
 _UPRIGHT = np.cos(np.deg2rad(30.0))  # an axis of the world that is nearer than this is up
 
 
@@ -59,9 +60,8 @@ def outlines_of(session: Session, shown: Mapping[str, Shown]) -> list[Outline]:
         if position is not None:
             found.append(Outline(setup.name, np.reshape(position, (1, 3)), None))
             continue
-        lower, upper = _bounds(setup, shown.get(setup.name))
-        rays = setup.sensor.rays(_edge(lower, upper))
-        if rays is not None and len(rays):
+        rays = _border(setup.sensor, *_bounds(setup, shown.get(setup.name)))
+        if rays is not None:
             places = rays.origins[:1] if rays.central else rays.origins[::_ALONG_EDGE]
             found.append(Outline(setup.name, places, rays))
     return found
@@ -98,6 +98,17 @@ def _bounds(setup: SensorSetup, shown: Shown | None) -> tuple[Floats, Floats]:
     matrix = getattr(setup.sensor, "camera_matrix", None)
     middle = getattr(setup.sensor, "principal_point", None) if matrix is None else matrix[:2, 2]
     return np.zeros(2), 2.0 * np.asarray(middle if middle is not None else (320.0, 240.0))
+
+
+def _border(sensor: Sensor, lower: Floats, upper: Floats) -> Rays | None:
+    """Rays of the edge of an image, or of as much amid it as its lens model explains."""
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    for share in _SHARES:
+        edge = _edge(middle - share * half, middle + share * half)
+        rays = sensor.rays(edge)
+        if rays is not None and len(rays) == len(edge):
+            return rays
+    return None
 
 
 def _edge(lower: Floats, upper: Floats) -> Floats:

@@ -50,6 +50,7 @@ class Page:
         self._server = server
         self._session = session
         self._last: Moment | None = None
+        self._buttons: tuple[viser.GuiButtonHandle, ...] = ()
         self._lock = threading.RLock()  # what is clicked comes from other threads
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         server.gui.set_panel_label(f"mixpose: {session.path.name}")
@@ -90,6 +91,8 @@ class Page:
         """Say that this was the last frame."""
         if self._last is not None:
             self._status.content = status_text(self._last, ended=True)
+        for button in self._buttons:
+            button.visible = False
         self._server.flush()
 
     def _draw(
@@ -121,7 +124,7 @@ class Page:
 
     def _add_buttons(self, wish: Callable[[Wish], None], paused: bool) -> None:
         gui = self._server.gui
-        pause, go_on, step = (
+        self._buttons = pause, go_on, step = (
             gui.add_button("Pause", hint="The run waits after this frame.", visible=not paused),
             gui.add_button("Go on", visible=paused),
             gui.add_button("Step", hint="One frame, then wait."),
@@ -156,7 +159,8 @@ def status_text(moment: Moment, *, ended: bool = False) -> str:
     counts = ", ".join(
         f"{moment.counts.get(status, 0)} {_coloured(status, status)}" for status in STATUS_COLOURS
     )
-    speed = "done" if ended else f"{moment.per_second:.3g} frames a second"
+    speed = f"{moment.per_second:.3g} frames a second" if moment.per_second else "one at a time"
+    speed = "done" if ended else speed
     rows = "".join(_line(one) for one in moment.estimates)
     return (
         f"<div style='padding: 0 0.8em; font-size: 0.9em'><b>frame {first.frame}</b>{when}"

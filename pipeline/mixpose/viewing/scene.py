@@ -28,10 +28,13 @@ from mixpose.viewing.outlines import Outline, outlines_of, up_of
 
 _SIZE = 4.0  # of the scene, in units of the page
 _BODY_RADII = 4.0  # that a scene has at least
-_EYE_DEG = (25.0, 25.0)  # beside and above the line from the scene to its sensors
-_EYE_AWAY = 0.9  # of the scene
+_EYE_DEG = (40.0, 30.0)  # beside and above the line from the bodies to their sensors
+_FOV_DEG = 50.0  # vertical
+_ASPECT = 0.65  # width of what is certainly seen, of its height
+_FILLED = 0.85  # of what is seen, by the scene
+_SMALL = 0.7  # letters, of the usual size
 _GREY = (150, 150, 150)
-_GRID = ((90, 90, 90), (110, 110, 110))
+_GRID = ((50, 50, 50), (80, 80, 80))
 _POWERS = (1, 10, 100, 1000, 10000)
 _SEEN_SHARE = 0.1  # of a body's radius: an ellipsoid of this size is seen
 
@@ -106,14 +109,14 @@ class Scene:
         all_places = np.concatenate([corners.reshape(-1, 3), np.reshape(bodies, (-1, 3))])
         size = max(float(pdist(all_places).max(initial=0.0)), _BODY_RADII * radius)
         self._scale = _SIZE / size
-        target = np.mean(bodies, axis=0) if bodies else all_places.mean(axis=0)
         up = up_of(self._session)
         for k, outline in enumerate(outlines):
             self._draw_sensor(k, outline, size)
         self._draw_ground(all_places, up, radius)
         self._nodes = [self._draw_body(k, body, one) for k, (body, one) in enumerate(posed)]
         self.magnification = self._seen(posed)
-        self._look(target, corners.reshape(-1, 3), up)
+        shown = np.array(bodies) if bodies else all_places.mean(axis=0, keepdims=True)
+        self._look(shown, radius, corners.reshape(-1, 3), up)
 
     def _seen(self, posed: Sequence[tuple[Body, Estimate]]) -> int:
         """The least magnification at which the ellipsoid of a body is seen."""
@@ -130,9 +133,14 @@ class Scene:
         if len(segments):
             scene.add_line_segments(f"/sensors/{k}", segments, _GREY, thickness=0.008)
         scene.add_icosphere(
-            f"/sensors/{k}/place", 0.03, _GREY, position=self._scale * outline.places[0]
+            f"/sensors/{k}/place", 0.02, _GREY, position=self._scale * outline.places[0]
         )
-        scene.add_label(f"/sensors/{k}/name", outline.name, position=self._scale * outline.middle)
+        scene.add_label(
+            f"/sensors/{k}/name",
+            outline.name,
+            position=self._scale * outline.middle,
+            font_screen_scale=_SMALL,
+        )
 
     def _draw_body(self, k: int, body: Body, one: Estimate) -> _BodyNodes:
         scene, scale = self._server.scene, self._scale
@@ -155,7 +163,7 @@ class Scene:
                 f"/bodies/{k}/shape", scale * edges, colour, thickness=0.03 * length
             )
         if len(self._session.labels) > 1:
-            scene.add_label(f"/bodies/{k}/name", one.label, position=(0.0, 0.0, 0.0))
+            scene.add_label(f"/bodies/{k}/name", one.label, font_screen_scale=_SMALL)
         trail = scene.add_line_segments(
             f"/trails/{k}", np.zeros((0, 2, 3)), colour, thickness=0.006
         )
@@ -194,9 +202,9 @@ class Scene:
         power = 10.0 ** np.floor(np.log10(wanted))
         return float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
 
-    def _look(self, target: Floats, sensors: Floats, up: Floats) -> None:
-        """Look at a place over the shoulders of the sensors."""
-        away = (sensors - target).sum(axis=0) if len(sensors) else np.zeros(3)
+    def _look(self, bodies: Floats, radius: float, sensors: Floats, up: Floats) -> None:
+        """Look at all that is there, over the shoulders of the sensors."""
+        away = sensors.mean(axis=0) - bodies.mean(axis=0) if len(sensors) else np.zeros(3)
         away -= (away @ up) * up
         if np.linalg.norm(away) < 1e-6 * _SIZE / self._scale:
             away = np.eye(3)[int(np.argmin(np.abs(up)))]
@@ -205,16 +213,29 @@ class Scene:
         beside, above = np.deg2rad(_EYE_DEG)
         away = rigid.rotation_matrix(beside * up) @ away
         away = np.cos(above) * away + np.sin(above) * up
-        at = self._scale * target
-        eye = at + _EYE_AWAY * _SIZE * away
+        everything = np.concatenate([sensors, bodies, bodies - radius, bodies + radius])
+        middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+        at = self._scale * middle
+        eye = at + self._scale * _distance(everything - middle, away, up) * away
         cameras = [client.camera for client in self._server.get_clients().values()]
         for camera in (self._server.initial_camera, *cameras):
+            camera.fov = np.deg2rad(_FOV_DEG)
             if isinstance(camera, viser.CameraHandle):
                 camera.up_direction = up
             else:
                 camera.up = up
             camera.position = eye
             camera.look_at = at
+
+
+def _distance(places: Floats, away: Floats, up: Floats) -> float:
+    """From how far away all places (n, 3) about the origin are seen, along a unit vector."""
+    right = np.cross(up, away)
+    right /= np.linalg.norm(right)
+    half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
+    across = np.abs(places @ right) / (_ASPECT * half)
+    upwards = np.abs(places @ np.cross(away, right)) / half
+    return float((places @ away + np.maximum(across, upwards)).max())
 
 
 def _trail(places: Sequence[Floats | None]) -> Floats:

@@ -67,7 +67,8 @@ def _plot(
     ]
     axis = uplot.Axis(stroke=_INK, grid={"stroke": "#444444"}, ticks={"stroke": "#444444"})
     return gui.add_uplot(
-        data=(np.zeros(0),) * (1 + len(names)),
+        # the page keeps what share of the frames is shown, which of no frames is nothing
+        data=(np.arange(2.0), *(np.full(2, np.nan) for _ in names)),
         series=(uplot.Series(label="frame"), *lines),
         title=title,
         scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
