@@ -1,13 +1,18 @@
-"""A viewer without a browser: what the page of ``run --view`` tells, and clicks on its buttons."""
+"""Runs with a page, and a viewer without a browser: what a page tells, and clicks on it."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import viser
 import zstandard
+from command_line import started
 from websockets.sync.client import ClientConnection, connect
 
 CAMERA = {
@@ -63,6 +68,20 @@ class PageClient:
         content = told.get("content")
         if isinstance(content, str) and "frame" in content:
             self.statuses.append(content)
+
+
+@contextmanager
+def viewed(
+    session: Path, *options: str | Path, place: str = "0"
+) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """A run with a page, and the address that it told."""
+    command = [sys.executable, "-m", "mixpose", "run", str(session), *map(str, options)]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with started([*command, "--view", place], **streams) as process:
+        assert process.stderr is not None
+        said = process.stderr.readline()
+        assert said.startswith("mixpose: see http://"), said + process.stderr.read()
+        yield process, said.split()[2].rstrip(";")
 
 
 def messages_of(data: bytes) -> Iterator[dict[str, Any]]:

@@ -7,16 +7,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from command_line import assert_one_line, mixpose, started, wait_until
+from command_line import assert_one_line, mixpose, wait_until
 from report_runs import estimate
 
 from mixpose.errors import SessionError
@@ -25,7 +22,7 @@ from mixpose.session import load_session
 
 pytest.importorskip("viser")
 
-from page_client import PageClient, open_page
+from page_client import PageClient, open_page, viewed
 
 from mixpose.viewing import Viewer
 
@@ -33,20 +30,6 @@ SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="no /proc here")
 TWO = SYNTHETIC / "two_cameras" / "session.toml"
 RANGES = SYNTHETIC / "range_profiles" / "session.toml"
-
-
-@contextmanager
-def viewed(
-    session: Path, *options: str | Path, place: str = "0"
-) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A run with a page, and the address that it told."""
-    command = [sys.executable, "-m", "mixpose", "run", str(session), *map(str, options)]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with started([*command, "--view", place], **streams) as process:
-        assert process.stderr is not None
-        said = process.stderr.readline()
-        assert said.startswith("mixpose: see http://"), said + process.stderr.read()
-        yield process, said.split()[2].rstrip(";")
 
 
 def until(client: PageClient, words: str) -> str:

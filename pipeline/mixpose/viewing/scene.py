@@ -31,10 +31,11 @@ _BODY_RADII = 4.0  # that a scene has at least
 _EYE_DEG = (40.0, 30.0)  # beside and above the line from the bodies to their sensors
 _FOV_DEG = 50.0  # vertical
 _ASPECT = 0.65  # width of what is certainly seen, of its height
-_FILLED = 0.85  # of what is seen, by the scene
+_FILLED = 0.95  # of what is seen, by the scene
 _SMALL = 0.7  # letters, of the usual size
 _GREY = (150, 150, 150)
 _GRID = ((50, 50, 50), (80, 80, 80))
+_LINE = {"thickness": 2.0, "thickness_units": "screen"}  # px
 _POWERS = (1, 10, 100, 1000, 10000)
 _SEEN_SHARE = 0.1  # of a body's radius: an ellipsoid of this size is seen
 
@@ -131,7 +132,7 @@ class Scene:
         scene = self._server.scene
         segments = self._scale * outline.segments(size)
         if len(segments):
-            scene.add_line_segments(f"/sensors/{k}", segments, _GREY, thickness=0.008)
+            scene.add_line_segments(f"/sensors/{k}", segments, _GREY, **_LINE)
         scene.add_icosphere(
             f"/sensors/{k}/place", 0.02, _GREY, position=self._scale * outline.places[0]
         )
@@ -159,14 +160,10 @@ class Scene:
         )
         edges = _skeleton(body.means)
         if len(edges):
-            scene.add_line_segments(
-                f"/bodies/{k}/shape", scale * edges, colour, thickness=0.03 * length
-            )
+            scene.add_line_segments(f"/bodies/{k}/shape", scale * edges, colour, **_LINE)
         if len(self._session.labels) > 1:
             scene.add_label(f"/bodies/{k}/name", one.label, font_screen_scale=_SMALL)
-        trail = scene.add_line_segments(
-            f"/trails/{k}", np.zeros((0, 2, 3)), colour, thickness=0.006
-        )
+        trail = scene.add_line_segments(f"/trails/{k}", np.zeros((0, 2, 3)), colour, **_LINE)
         ellipsoid = scene.add_icosphere(
             f"/covariance/{k}", 1.0, (255, 255, 255), opacity=0.4, visible=False, cast_shadow=False
         )
