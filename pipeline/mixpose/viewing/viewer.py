@@ -242,11 +242,10 @@ class Viewer:
                     self._paused, self._steps = message == "pause", 0
                 self._state.notify_all()
         with self._state:
+            if not self._ended:  # said before the run goes on, which may be at its end by then
+                self._say("warning: the page of --view has ended; the run goes on without it")
             self._gone = True
-            ended = self._ended
             self._state.notify_all()
-        if not ended:
-            self._say("warning: the page of --view has ended; the run goes on without it")
 
 
 def _shown(frame: RawFrame | None, found: Floats | None, room: tuple[int, int]) -> Shown:
