@@ -61,6 +61,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "importing": GROUND | {"session"},
     "report": GROUND | {"frames", "pictures", "poses", "runner", "session", "calibration"},
 }
+MAY_IMPORT["viewing"] = GROUND | {"sensors", "body", "objective", "pictures", "session"}
 MAY_IMPORT["design"] = GROUND | {
     "executing",
     "sensors",

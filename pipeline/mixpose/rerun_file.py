@@ -44,7 +44,6 @@ _BODY_COLOURS = (
     *((90, 230, 230), (255, 120, 150), (140, 200, 120), (190, 120, 255)),
 )
 _FOUND = (90, 170, 255)
-_CHI2_95 = 7.815  # of three degrees of freedom
 _DENSITY_WIDTH = 640
 _JPEG_QUALITY = 85
 # Rerun's pixels have their corners at integers
@@ -218,11 +217,10 @@ def _transform(T_parent_child: Floats) -> Any:
 
 def _ellipsoid(centre: Floats, covariance: Floats, colour: tuple[int, int, int]) -> Any:
     """Where the position is with 95 %; `covariance` is (6, 6)."""
-    variances, axes = np.linalg.eigh(covariance[:3, :3])
-    axes[:, 0] *= np.linalg.det(axes)  # right-handed, as a rotation is
+    half_axes, axes = rigid.position_ellipsoid_95(covariance)
     turn = rigid.quaternion_xyzw(rigid.from_parts(axes, np.zeros(3)))
     return rr.Ellipsoids3D(
-        half_sizes=[np.sqrt(_CHI2_95 * np.maximum(variances, 0.0))],
+        half_sizes=[half_axes],
         centers=[centre],
         quaternions=[rr.Quaternion(xyzw=turn)],
         colors=[colour],

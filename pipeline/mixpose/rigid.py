@@ -24,6 +24,8 @@ from mixpose.records import Floats
 
 TWIST_NAMES = ("x", "y", "z", "rx", "ry", "rz")
 
+_CHI2_95 = 7.815  # of three degrees of freedom
+
 
 def transform(T_a_b: Floats, points_b: Floats) -> Floats:
     """Map points to another frame.
@@ -155,6 +157,21 @@ def rotation_angle_deg(T_a: Floats, T_b: Floats) -> Floats:
     """Angle in degrees (...,) of the rotation that leads from one pose to the other."""
     angle = np.linalg.norm(twist_between(T_a, T_b)[..., 3:], axis=-1)
     return np.asarray(np.degrees(angle), dtype=np.float64)
+
+
+def position_ellipsoid_95(covariance: Floats) -> tuple[Floats, Floats]:
+    """The ellipsoid that holds the position with 95 %, of a pose's covariance (6, 6).
+
+    Returns
+    -------
+    half_axes : (3,) float64
+        Lengths, ascending.
+    axes : (3, 3) float64
+        Their directions in world axes as columns: a rotation.
+    """
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    axes[:, 0] *= np.linalg.det(axes)  # right-handed, as a rotation is
+    return np.sqrt(_CHI2_95 * np.maximum(variances, 0.0)), np.asarray(axes)
 
 
 def quaternion_xyzw(T_a_b: Floats) -> Floats:

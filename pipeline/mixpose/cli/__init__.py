@@ -72,10 +72,12 @@ def _status(arguments: list[str]) -> int:
     import typer  # noqa: PLC0415
 
     from mixpose.cli.app import app  # noqa: PLC0415
+    from mixpose.cli.optional_values import with_values  # noqa: PLC0415
     from mixpose.errors import MixposeError  # noqa: PLC0415
 
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"] or ["--help"]
+    arguments = with_values(arguments)
     try:
         outcome = typer.main.get_command(app).main(
             args=arguments, prog_name="mixpose", standalone_mode=False, obj=debug

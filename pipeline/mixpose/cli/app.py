@@ -93,6 +93,18 @@ Labels = Annotated[
         "space by these alone; .jsonl only.",
     ),
 ]
+View = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[PORT]",
+        help="Show the run on a page in the browser, at 127.0.0.1:8080 or this port; HOST:PORT "
+        "opens it to others who have the address with its token.",
+    ),
+]
+Pause = Annotated[
+    bool,
+    typer.Option("--pause", help="With --view, on files: begin paused, to go on from the page."),
+]
 Scheduler = Annotated[
     str | None,
     typer.Option(
@@ -131,6 +143,8 @@ def run(
     resume: Resume = False,
     workers: Workers = 1,
     overlay: Overlay = None,
+    view: View = None,
+    pause: Pause = False,
     scheduler: Scheduler = None,
     labels: Labels = False,
     publish: Publish = None,
@@ -161,6 +175,8 @@ def run(
         labels,
         tuple(publish or ()),
         predict,
+        view,
+        pause,
     )
     if labels and written != "jsonl":
         raise SessionError(f"--labels: found --format {written}; allowed: jsonl, which has room")

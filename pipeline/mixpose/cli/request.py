@@ -41,6 +41,8 @@ class RunRequest:
     labels: bool = False
     publish: tuple[str, ...] = ()
     predict: float | None = None
+    view: str | None = None
+    pause: bool = False
 
     @property
     def ahead_s(self) -> float:

@@ -42,6 +42,11 @@ def run_session(path: Path, request: RunRequest) -> None:
     RecordingError
         If the recording cannot be read; frames already estimated stay written.
     """
+    with ExitStack() as pages:  # what outlives the poses
+        _run_session(path, request, pages)
+
+
+def _run_session(path: Path, request: RunRequest, pages: ExitStack) -> None:
     session = load_session(path, allow_code=request.allow_code)
     replaced = named_sources(request.sources)
     header = header_of(session, replaced)
@@ -64,12 +69,14 @@ def run_session(path: Path, request: RunRequest) -> None:
         return
     warn_of_sources(session, opened, replaced)
     summary = Summary(session)
+    view = _view(pages, session, request, opened)
     output = _output(request, header, go_on.file)
     with output, prompt_switching(), ExitStack() as stack:
         watch = _each(
             _publishing(stack, session, request, header),
             summary.watch,
             _overlay(stack, session, request),
+            view,
         )
         memories: deque[Memory] = deque(maxlen=1)
         estimates = run(
@@ -160,6 +167,21 @@ def _publishing(
     foresee = foreseeing(session, ahead_s) if ahead_s else None
     publishing = Publishing(request.publish, header, say, foresee, ahead_s)
     return stack.enter_context(publishing).watch
+
+
+def _view(
+    stack: ExitStack, session: Session, request: RunRequest, opened: Mapping[str, Source]
+) -> Watch | None:
+    """What shows each frame on a page, gone with the stack; None where nothing is to be shown."""
+    if request.view is None:
+        if request.pause:
+            raise SessionError("--pause: nothing to go on with; add --view")
+        return None
+    from mixpose.viewing import Viewer  # noqa: PLC0415 - only where it is shown
+
+    waits = all(source.kind != "live" for source in opened.values())
+    viewer = Viewer(session, request.view, say, on_files=waits, paused=request.pause)
+    return stack.enter_context(viewer).watch
 
 
 def _each(*watches: Watch | None) -> Watch:

@@ -116,11 +116,12 @@ def run_sessions(sessions: Sequence[Path], request: RunRequest, workers: int) ->
     SessionError
         If there is no folder for the poses, or an option is given that serves a single recording.
     """
-    for option, value in (("--source", request.sources), ("--overlay", request.overlay)):
-        if value:
-            shown = value if isinstance(value, Path) else value[0]
+    alone = {"--source": request.sources, "--overlay": request.overlay, "--view": request.view}
+    for option, value in alone.items():
+        if value or value == "":  # the usual port
+            shown = f" {value[0] if isinstance(value, tuple) else value}".rstrip()
             raise SessionError(
-                f"{option} {shown}: found {len(sessions)} sessions, allowed with one only"
+                f"{option}{shown}: found {len(sessions)} sessions, allowed with one only"
             )
     folder = _folder(request.output, len(sessions))
     jobs = _jobs(sessions, folder, request)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import cv2
 import numpy as np
@@ -13,7 +14,15 @@ from mixpose.pictures.display import displayable
 from mixpose.pictures.layout import columns_for, in_grid, stacked
 from mixpose.pictures.overlay import BODY_COLOURS, FOUND, Part, caption, draw_pose, legend
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
-from mixpose.records import Estimate, FrameSet, GridPattern, PointPattern, RawFrame
+from mixpose.records import (
+    Estimate,
+    Floats,
+    FrameSet,
+    GridPattern,
+    Image,
+    PointPattern,
+    RawFrame,
+)
 from mixpose.session import SensorSetup, Session
 
 LARGEST = (1920, 1080)
@@ -39,15 +48,16 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     (H, W, 3) uint8
         The same size for every frame, as long as the frames are.
     """
-    bodies = {one.body.name: one.body for one in session.objects}
-    posed = [(bodies.get(one.object, session.body), one) for one in estimates]
+    posed = with_bodies(session, estimates)
     cameras = [setup for setup in session.sensors if setup.sensor.dimension == 2]
     strips = [setup for setup in session.sensors if setup.sensor.dimension == 1]
     rows: list[Picture] = []
     if cameras:
-        columns = columns_for(len(cameras))
-        room = LARGEST[0] // columns, LARGEST[1] // -(-len(cameras) // columns)
-        panels = [_camera(posed, one, frame_set, room) for one in cameras]
+        columns, room = columns_for(len(cameras)), room_for(len(cameras))
+        panels = [
+            draw_camera(posed, one, *backdrop(one, frame_set.frames.get(one.name), room))
+            for one in cameras
+        ]
         for panel, setup in zip(panels, cameras, strict=True):
             if setup.name not in frame_set.frames:
                 _name(panel, f"{setup.name}: no frame", GREY)
@@ -58,14 +68,21 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
         head = np.full((36, STRIP_SIZE[0], 3), BACKGROUND, np.uint8)
         caption(head, estimates[0].status if len(estimates) == 1 else None, estimates[0].frame)
         rows.append(head)
-    rows += [
-        _strip(body, setup, frame_set, estimate, f"{setup.name}, {estimate.label}")
-        if len(posed) > 1
-        else _strip(body, setup, frame_set, estimate, setup.name)
-        for setup in strips
-        for body, estimate in posed
-    ]
+    for setup in strips:
+        rows += draw_strips(posed, setup, frame_set.frames.get(setup.name))
     return stacked(rows)
+
+
+def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[Body, Estimate]]:
+    """Estimates with the bodies that they are of."""
+    bodies = {one.body.name: one.body for one in session.objects}
+    return [(bodies.get(one.object, session.body), one) for one in estimates]
+
+
+def room_for(cameras: int) -> tuple[int, int]:
+    """Width and height in px that each of so many cameras has in a picture of them all."""
+    columns = columns_for(cameras)
+    return LARGEST[0] // columns, LARGEST[1] // -(-cameras // columns)
 
 
 def backdrop(
@@ -88,12 +105,18 @@ def backdrop(
             for place in part.places(data.points):
                 ring(picture, place, _DETECTION_PX * stroke(picture), FOUND)
         return picture, part
-    zoom = _zoom((data.shape[1], data.shape[0]), room)
-    if zoom != 1:
-        size = max(round(data.shape[1] * zoom), 1), max(round(data.shape[0] * zoom), 1)
-        way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
-        return displayable(cv2.resize(data, size, interpolation=way)), Part(zoom)
-    return displayable(data), Part()
+    data, zoom = resized(data, room)
+    return displayable(data), Part(zoom)
+
+
+def resized(image: Image, room: tuple[int, int] | None) -> tuple[Image, float]:
+    """An image as large as some room has it, and by how much it was enlarged."""
+    zoom = _zoom((image.shape[1], image.shape[0]), room)
+    if zoom == 1:
+        return image, 1.0
+    size = max(round(image.shape[1] * zoom), 1), max(round(image.shape[0] * zoom), 1)
+    way = cv2.INTER_AREA if zoom < 1 else cv2.INTER_NEAREST
+    return cast(Image, cv2.resize(image, size, interpolation=way)), zoom
 
 
 def _zoom(size: tuple[int, int], room: tuple[int, int] | None) -> float:
@@ -112,41 +135,53 @@ def _size_of(data: PointPattern | GridPattern | None) -> tuple[int, int]:
     return max(int(width), _BLANK_SIZE[0]), max(int(height), _BLANK_SIZE[1])
 
 
-def _camera(
+def draw_camera(
     posed: Sequence[tuple[Body, Estimate]],
     setup: SensorSetup,
-    frame_set: FrameSet,
-    room: tuple[int, int],
+    picture: Picture,
+    part: Part,
+    found: Floats | None = None,
 ) -> Picture:
-    picture, part = backdrop(setup, frame_set.frames.get(setup.name), room)
+    """Draw the bodies of a moment on a camera's frame, as of `backdrop`.
+
+    Of several each has a colour of its own.  Features `found` (M, 2), in pixels of the sensor, are
+    marked too.
+    """
     if len(posed) == 1:
         body, one = posed[0]
         T, covariance = one.T_world_object, one.covariance
         return draw_pose(
-            picture, setup.sensor, body, T, covariance, one.status, one.frame, part=part
-        )
+            picture, setup.sensor, body, T, covariance, one.status, one.frame,
+            part=part, found=found,
+        )  # fmt: skip
     for k, (body, one) in enumerate(posed):
         colour = BODY_COLOURS[k % len(BODY_COLOURS)]
         T, covariance = one.T_world_object, one.covariance
-        picture = draw_pose(picture, setup.sensor, body, T, covariance, part=part, colour=colour)
+        picture = draw_pose(
+            picture, setup.sensor, body, T, covariance, part=part, colour=colour,
+            found=None if k else found,
+        )  # fmt: skip
     legend(picture, [(one.label, one.status) for _, one in posed], posed[0][1].frame)
     return picture
 
 
-def _strip(
-    body: Body, setup: SensorSetup, frame_set: FrameSet, estimate: Estimate, name: str
-) -> Picture:
-    frame = frame_set.frames.get(setup.name)
+def draw_strips(
+    posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, frame: RawFrame | None
+) -> list[Picture]:
+    """Draw what a range sensor measured, with the ranges of each body: a strip for each."""
     data = None if frame is None else frame.data
-    return draw_ranges(
-        name,
-        data if isinstance(data, PointPattern | GridPattern) else None,
-        setup.sensor,
-        body,
-        estimate.T_world_object,
-        estimate.covariance,
-        estimate.status,
-    )
+    return [
+        draw_ranges(
+            f"{setup.name}, {one.label}" if len(posed) > 1 else setup.name,
+            data if isinstance(data, PointPattern | GridPattern) else None,
+            setup.sensor,
+            body,
+            one.T_world_object,
+            one.covariance,
+            one.status,
+        )
+        for body, one in posed
+    ]
 
 
 def _name(picture: Picture, name: str, colour: Colour) -> None:

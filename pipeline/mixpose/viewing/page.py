@@ -1,0 +1,184 @@
+"""What is on the page: pictures of the sensors, status, plots, buttons, and the scene in space."""
+
+from __future__ import annotations
+
+import html
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from mixpose.body import Body
+from mixpose.pictures.canvas import GREY, Picture, words
+from mixpose.pictures.layout import stacked
+from mixpose.pictures.overlay import STATUS_COLOURS
+from mixpose.pictures.scene import backdrop, draw_camera, draw_strips, room_for, with_bodies
+from mixpose.records import Estimate, Status
+from mixpose.session import SensorSetup, Session
+from mixpose.viewing.moment import Moment, Shown, Wish
+from mixpose.viewing.scene import MAGNIFICATIONS, Scene
+from mixpose.viewing.series import Series
+
+_SENSORS_PX, _CONTROL_PX = 460, 380
+_JPEG_QUALITY = 80
+
+
+class Page:
+    """The page of a run.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    session : Session
+    wish : callable or None
+        Asks the run to pause, go on or step; None where it cannot.
+    paused : bool
+        Whether the run is paused to begin with.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        wish: Callable[[Wish], None] | None,
+        *,
+        paused: bool = False,
+    ) -> None:
+        self._server = server
+        self._session = session
+        self._last: Moment | None = None
+        self._buttons: tuple[viser.GuiButtonHandle, ...] = ()
+        self._lock = threading.RLock()  # what is clicked comes from other threads
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        server.gui.set_panel_label(f"mixpose: {session.path.name}")
+        self._pictures = self._add_pictures()
+        main = server.gui.main_panel
+        main.dock_right()
+        main.set_width(_CONTROL_PX)
+        self._status = server.gui.add_html("<p>waiting for the first frame</p>")
+        if wish is not None:
+            self._add_buttons(wish, paused)
+        self._series = Series(server.gui, session)
+        self._scene = Scene(server, session)
+        self._magnified = server.gui.add_dropdown(
+            "covariance",
+            MAGNIFICATIONS,
+            hint="The ellipsoid that holds a position with 95 % is drawn so many times larger.",
+        )
+        self._magnified.on_update(self._on_magnified)
+
+    def show(self, moment: Moment) -> None:
+        """Show a frame; browsers that are behind get the newest only."""
+        with self._lock:
+            self._last = moment
+            posed = with_bodies(self._session, moment.estimates)
+            with self._server.atomic():
+                for setup in self._session.sensors:
+                    shown = moment.sensors.get(setup.name, Shown(None))
+                    drawn = self._draw(posed, setup, shown)
+                    self._pictures[setup.name].image = _rgb(drawn)
+                self._status.content = status_text(moment)
+                self._series.add(moment.rows)
+                before = self._scene.magnification
+                self._scene.add(moment)
+                if self._scene.magnification != before:
+                    self._magnified.value = f"× {self._scene.magnification}"
+
+    def end(self) -> None:
+        """Say that this was the last frame."""
+        if self._last is not None:
+            self._status.content = status_text(self._last, ended=True)
+        for button in self._buttons:
+            button.visible = False
+        self._server.flush()
+
+    def _draw(
+        self, posed: Sequence[tuple[Body, Estimate]], setup: SensorSetup, shown: Shown
+    ) -> Picture:
+        if setup.sensor.dimension != 2:
+            return stacked(draw_strips(posed, setup, shown.frame))
+        cameras = sum(one.sensor.dimension == 2 for one in self._session.sensors)
+        picture, part = backdrop(setup, shown.frame, room_for(cameras) if shown.zoom == 1 else None)
+        part = replace(part, zoom=part.zoom * shown.zoom)
+        picture = draw_camera(posed, setup, picture, part, shown.found)
+        if shown.frame is None:
+            words(picture, "no frame", (10, picture.shape[0] - 10), GREY)
+        return picture
+
+    def _add_pictures(self) -> dict[str, viser.GuiImageHandle]:
+        panel = self._server.gui.add_panel()
+        blank = np.zeros((120, 160, 3), np.uint8)
+        with panel.add_tab("sensors"):
+            pictures = {
+                setup.name: self._server.gui.add_image(
+                    blank, label=setup.name, format="jpeg", jpeg_quality=_JPEG_QUALITY
+                )
+                for setup in self._session.sensors
+            }
+        panel.dock_left()
+        panel.set_width(_SENSORS_PX)
+        return pictures
+
+    def _add_buttons(self, wish: Callable[[Wish], None], paused: bool) -> None:
+        gui = self._server.gui
+        self._buttons = pause, go_on, step = (
+            gui.add_button("Pause", hint="The run waits after this frame.", visible=not paused),
+            gui.add_button("Go on", visible=paused),
+            gui.add_button("Step", hint="One frame, then wait."),
+        )
+
+        def on(button: viser.GuiButtonHandle, what: Wish) -> None:
+            def clicked(_: object) -> None:
+                pause.visible, go_on.visible = what == "go on", what != "go on"
+                wish(what)
+
+            button.on_click(clicked)
+
+        on(pause, "pause")
+        on(go_on, "go on")
+        on(step, "step")
+
+    def _on_magnified(self, _: object) -> None:
+        with self._lock:
+            self._scene.magnification = int(self._magnified.value.split()[-1])
+            if self._last is not None:
+                self._scene.draw_ellipsoids(self._last.estimates)
+
+
+def _rgb(picture: Picture) -> NDArray[np.uint8]:
+    return picture[:, :, ::-1]
+
+
+def status_text(moment: Moment, *, ended: bool = False) -> str:
+    """What the page says about a frame, as HTML; names of the session are only ever words in it."""
+    first = moment.estimates[0]
+    when = "" if first.time_s is None else f", {first.time_s:.3f} s"
+    counts = ", ".join(
+        f"{moment.counts.get(status, 0)} {_coloured(status, status)}" for status in STATUS_COLOURS
+    )
+    speed = f"{moment.per_second:.3g} frames a second" if moment.per_second else "one at a time"
+    speed = "done" if ended else speed
+    rows = "".join(_line(one) for one in moment.estimates)
+    return (
+        f"<div style='padding: 0 0.8em; font-size: 0.9em'><b>frame {first.frame}</b>{when}"
+        f"<br>{counts}<br>{speed}, {first.latency_ms:.3g} ms for this one"
+        "<table style='width: 100%; text-align: left'><tr><th>body</th><th>status</th>"
+        f"<th>confidence</th><th>score</th></tr>{rows}</table></div>"
+    )
+
+
+def _line(one: Estimate) -> str:
+    confidence = "" if one.confidence is None else f"{one.confidence:.4f}"
+    doubt = f" title='{html.escape(one.doubt, quote=True)}'" if one.doubt else ""
+    return (
+        f"<tr{doubt}><td>{html.escape(one.label)}</td><td>{_coloured(one.status, one.status)}</td>"
+        f"<td>{confidence}</td><td>{one.score:.2f}</td></tr>"
+    )
+
+
+def _coloured(status: Status, text: str) -> str:
+    blue, green, red = STATUS_COLOURS[status]
+    return f"<span style='color: rgb({red}, {green}, {blue})'>{text}</span>"

@@ -1,0 +1,105 @@
+"""The process of the page: asks for moments as fast as somebody sees them, and draws them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from typing import TYPE_CHECKING
+
+from mixpose.session import Session
+from mixpose.viewing.address import Place
+from mixpose.viewing.moment import PACE, Done, Moment, Viewers, Wish
+
+if TYPE_CHECKING:  # an extra
+    from mixpose.viewing.page import Page
+
+_LOOK_S = 0.05
+_NICENESS = 5  # the run goes first where there are few processors
+
+
+def show(
+    place: Place, connection: Connection, session: Session, on_files: bool, paused: bool
+) -> None:
+    """Show the moments that come through a pipe until it ends.
+
+    Parameters
+    ----------
+    place : Place
+        Where the page listens.
+    connection : Connection
+        Takes `Moment` and `Done`; gives `Viewers` and what the page wishes.
+    session : Session
+    on_files : bool
+        Whether the run can be paused.
+    paused : bool
+        Whether it is, to begin with.
+    """
+    _be_quiet()
+    from mixpose.viewing.page import Page  # noqa: PLC0415 - an extra
+    from mixpose.viewing.server import started  # noqa: PLC0415
+
+    wishes = Wishes(connection)
+    with started(place, on_viewers=wishes.viewers_are) as server:
+        page = Page(server, session, wishes.wish if on_files else None, paused=paused)
+        with suppress(EOFError, OSError):  # the run is gone
+            _play(connection, wishes, page)
+
+
+def _play(connection: Connection, wishes: Wishes, page: Page) -> None:
+    asked, ready_at = False, 0.0
+    while True:
+        if not asked and wishes.viewers and time.monotonic() >= ready_at:
+            wishes.wish("next")
+            asked = True
+        if not connection.poll(_LOOK_S if asked or not wishes.viewers else 1e-3):
+            continue
+        message = connection.recv()
+        if isinstance(message, Done):
+            page.end()
+        if isinstance(message, Moment):
+            began = time.monotonic()
+            page.show(message)
+            took = time.monotonic() - began
+            ready_at = began + max(1.0 / PACE.most_per_second, took / PACE.share)
+            asked = False
+
+
+class Wishes:
+    """What the page tells the run, from any thread."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._lock = threading.Lock()
+        self.viewers = 0
+
+    def wish(self, what: Wish) -> None:
+        """Ask the run for something."""
+        self._tell(what)
+
+    def viewers_are(self, count: int) -> None:
+        """Tell how many browsers look."""
+        self.viewers = count
+        self._tell(Viewers(count))
+
+    def _tell(self, message: object) -> None:
+        with self._lock:
+            self._connection.send(message)
+
+
+def _be_quiet() -> None:
+    """Leave standard output, to which poses may go, and interrupts to the run."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
+    sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123
+    if hasattr(os, "nice"):
+        os.nice(_NICENESS)
+    import cv2  # noqa: PLC0415
+
+    cv2.setNumThreads(1)

@@ -1,0 +1,257 @@
+"""The scene in space: sensors and what they look at, bodies, trails, and how sure they are.
+
+Lengths of the page are those of the session times a factor, so that any scene is some units large,
+as the browser's camera expects.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import viser
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import pdist, squareform
+from scipy.spatial.transform import Rotation
+
+from mixpose import rigid
+from mixpose.body import Body
+from mixpose.pictures.overlay import BODY_COLOURS, STATUS_COLOURS
+from mixpose.pictures.scene import with_bodies
+from mixpose.records import Estimate, Floats
+from mixpose.session import Session
+from mixpose.viewing.moment import PACE, Moment, Row
+from mixpose.viewing.outlines import Outline, outlines_of, up_of
+
+_SIZE = 4.0  # of the scene, in units of the page
+_BODY_RADII = 4.0  # that a scene has at least
+_EYE_DEG = (40.0, 30.0)  # beside and above the line from the bodies to their sensors
+_FOV_DEG = 50.0  # vertical
+_ASPECT = 0.65  # width of what is certainly seen, of its height
+_FILLED = 0.95  # of what is seen, by the scene
+_SMALL = 0.7  # letters, of the usual size
+_GREY = (150, 150, 150)
+_GRID = ((50, 50, 50), (80, 80, 80))
+_LINE = {"thickness": 2.0, "thickness_units": "screen"}  # px
+_POWERS = (1, 10, 100, 1000, 10000)
+_SEEN_SHARE = 0.1  # of a body's radius: an ellipsoid of this size is seen
+
+MAGNIFICATIONS = tuple(f"× {power}" for power in _POWERS)
+"""By how much ellipsoids may be enlarged, as words."""
+
+
+@dataclass(frozen=True)
+class _BodyNodes:
+    """What is drawn of one body."""
+
+    pose: viser.FrameHandle
+    markers: viser.PointCloudHandle
+    trail: viser.LineSegmentsHandle
+    ellipsoid: viser.IcosphereHandle
+
+
+class Scene:
+    """The scene of a run.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    session : Session
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server = server
+        self._session = session
+        self._scale = 0.0  # units of the page per length; 0: nothing is drawn yet
+        self._has_pose = False
+        self._nodes: list[_BodyNodes] = []
+        self._rows: deque[Row] = deque(maxlen=PACE.trail)
+        self.magnification = 1
+
+    def add(self, moment: Moment) -> None:
+        """Go on to a frame."""
+        self._rows.extend(moment.rows)
+        posed = with_bodies(self._session, moment.estimates)
+        has_pose = any(one.T_world_object is not None for _, one in posed)
+        if not self._scale or (has_pose and not self._has_pose):
+            self._has_pose = has_pose
+            self._begin(moment, posed)
+        for k, (nodes, (_, one)) in enumerate(zip(self._nodes, posed, strict=True)):
+            nodes.pose.visible = one.T_world_object is not None
+            if one.T_world_object is not None:
+                nodes.pose.position = self._scale * one.T_world_object[:3, 3]
+                nodes.pose.wxyz = _wxyz(one.T_world_object)
+                if len(posed) == 1:
+                    nodes.markers.colors = np.array(_rgb(STATUS_COLOURS[one.status]), np.uint8)
+            nodes.trail.points = self._scale * _trail([row.places[k] for row in self._rows])
+        self.draw_ellipsoids(moment.estimates)
+
+    def draw_ellipsoids(self, estimates: Sequence[Estimate]) -> None:
+        """Draw where positions are with 95 %, enlarged by `magnification`."""
+        for nodes, one in zip(self._nodes, estimates, strict=True):
+            known = one.covariance is not None and bool(np.isfinite(one.covariance).all())
+            nodes.ellipsoid.visible = known
+            if known and one.covariance is not None and one.T_world_object is not None:
+                half_axes, axes = rigid.position_ellipsoid_95(one.covariance)
+                size = self.magnification * self._scale * half_axes
+                nodes.ellipsoid.scale = tuple(np.maximum(size, 1e-6).tolist())
+                nodes.ellipsoid.position = self._scale * one.T_world_object[:3, 3]
+                nodes.ellipsoid.wxyz = _wxyz(rigid.from_parts(axes, np.zeros(3)))
+
+    def _begin(self, moment: Moment, posed: Sequence[tuple[Body, Estimate]]) -> None:
+        """Draw what stands still, and look at it."""
+        outlines = outlines_of(self._session, moment.sensors)
+        radius = max(body.radius for body, _ in posed)
+        bodies = [one.T_world_object[:3, 3] for _, one in posed if one.T_world_object is not None]
+        corners = np.array([place for one in outlines for place in one.places])
+        all_places = np.concatenate([corners.reshape(-1, 3), np.reshape(bodies, (-1, 3))])
+        size = max(float(pdist(all_places).max(initial=0.0)), _BODY_RADII * radius)
+        self._scale = _SIZE / size
+        up = up_of(self._session)
+        for k, outline in enumerate(outlines):
+            self._draw_sensor(k, outline, size)
+        self._draw_ground(all_places, up, radius)
+        self._nodes = [self._draw_body(k, body, one) for k, (body, one) in enumerate(posed)]
+        self.magnification = self._seen(posed)
+        shown = np.array(bodies) if bodies else all_places.mean(axis=0, keepdims=True)
+        self._look(shown, radius, corners.reshape(-1, 3), up)
+
+    def _seen(self, posed: Sequence[tuple[Body, Estimate]]) -> int:
+        """The least magnification at which the ellipsoid of a body is seen."""
+        for body, one in posed:
+            if one.covariance is not None and np.isfinite(one.covariance).all():
+                largest = float(rigid.position_ellipsoid_95(one.covariance)[0][-1])
+                seen = [p for p in _POWERS if p * largest >= _SEEN_SHARE * body.radius]
+                return seen[0] if seen else _POWERS[-1]
+        return 1
+
+    def _draw_sensor(self, k: int, outline: Outline, size: float) -> None:
+        scene = self._server.scene
+        segments = self._scale * outline.segments(size)
+        if len(segments):
+            scene.add_line_segments(f"/sensors/{k}", segments, _GREY, **_LINE)
+        scene.add_icosphere(
+            f"/sensors/{k}/place", 0.02, _GREY, position=self._scale * outline.places[0]
+        )
+        scene.add_label(
+            f"/sensors/{k}/name",
+            outline.name,
+            position=self._scale * outline.middle,
+            font_screen_scale=_SMALL,
+        )
+
+    def _draw_body(self, k: int, body: Body, one: Estimate) -> _BodyNodes:
+        scene, scale = self._server.scene, self._scale
+        colour = _rgb(BODY_COLOURS[k % len(BODY_COLOURS)])
+        length = 0.5 * scale * body.radius
+        pose = scene.add_frame(
+            f"/bodies/{k}", axes_length=length, axes_radius=0.03 * length, visible=False
+        )
+        markers = scene.add_point_cloud(
+            f"/bodies/{k}/markers",
+            scale * body.means,
+            colour,
+            point_size=0.12 * length,
+            point_shape="circle",
+            precision="float32",
+        )
+        edges = _skeleton(body.means)
+        if len(edges):
+            scene.add_line_segments(f"/bodies/{k}/shape", scale * edges, colour, **_LINE)
+        if len(self._session.labels) > 1:
+            scene.add_label(f"/bodies/{k}/name", one.label, font_screen_scale=_SMALL)
+        trail = scene.add_line_segments(f"/trails/{k}", np.zeros((0, 2, 3)), colour, **_LINE)
+        ellipsoid = scene.add_icosphere(
+            f"/covariance/{k}", 1.0, (255, 255, 255), opacity=0.4, visible=False, cast_shadow=False
+        )
+        return _BodyNodes(pose, markers, trail, ellipsoid)
+
+    def _draw_ground(self, places: Floats, up: Floats, radius: float) -> None:
+        """The world's axes, and a grid below all that is there, of cells of a round length."""
+        self._server.scene.set_up_direction(tuple(up.tolist()))
+        length = self._scale * radius
+        self._server.scene.add_frame("/world", axes_length=length, axes_radius=0.02 * length)
+        middle, lowest = places.mean(axis=0), float((places @ up).min())
+        below = middle + (lowest - radius - middle @ up) * up
+        cell = self._scale * self.cell
+        turn, _ = Rotation.align_vectors([up], [[0.0, 0.0, 1.0]])
+        self._server.scene.add_grid(
+            "/grid",
+            width=40 * cell,
+            height=40 * cell,
+            cell_size=cell,
+            section_size=5 * cell,
+            cell_color=_GRID[0],
+            section_color=_GRID[1],
+            wxyz=tuple(np.roll(turn.as_quat(), 1).tolist()),
+            position=self._scale * below,
+        )
+
+    @property
+    def cell(self) -> float:
+        """Length of a grid's cell: 1, 2 or 5 times a power of ten, about a tenth of the scene."""
+        if not self._scale:
+            return 0.0
+        wanted = 0.1 * _SIZE / self._scale
+        power = 10.0 ** np.floor(np.log10(wanted))
+        return float(power * max(k for k in (1, 2, 5) if k * power <= wanted))
+
+    def _look(self, bodies: Floats, radius: float, sensors: Floats, up: Floats) -> None:
+        """Look at all that is there, over the shoulders of the sensors."""
+        away = sensors.mean(axis=0) - bodies.mean(axis=0) if len(sensors) else np.zeros(3)
+        away -= (away @ up) * up
+        if np.linalg.norm(away) < 1e-6 * _SIZE / self._scale:
+            away = np.eye(3)[int(np.argmin(np.abs(up)))]
+            away -= (away @ up) * up
+        away /= np.linalg.norm(away)
+        beside, above = np.deg2rad(_EYE_DEG)
+        away = rigid.rotation_matrix(beside * up) @ away
+        away = np.cos(above) * away + np.sin(above) * up
+        everything = np.concatenate([sensors, bodies, bodies - radius, bodies + radius])
+        middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+        at = self._scale * middle
+        eye = at + self._scale * _distance(everything - middle, away, up) * away
+        cameras = [client.camera for client in self._server.get_clients().values()]
+        for camera in (self._server.initial_camera, *cameras):
+            camera.fov = np.deg2rad(_FOV_DEG)
+            if isinstance(camera, viser.CameraHandle):
+                camera.up_direction = up
+            else:
+                camera.up = up
+            camera.position = eye
+            camera.look_at = at
+
+
+def _distance(places: Floats, away: Floats, up: Floats) -> float:
+    """From how far away all places (n, 3) about the origin are seen, along a unit vector."""
+    right = np.cross(up, away)
+    right /= np.linalg.norm(right)
+    half = _FILLED * np.tan(np.deg2rad(_FOV_DEG) / 2)
+    across = np.abs(places @ right) / (_ASPECT * half)
+    upwards = np.abs(places @ np.cross(away, right)) / half
+    return float((places @ away + np.maximum(across, upwards)).max())
+
+
+def _trail(places: Sequence[Floats | None]) -> Floats:
+    """Segments (n, 2, 3) between places that follow each other; none where one is missing."""
+    pairs = [(a, b) for a, b in pairwise(places) if a is not None and b is not None]
+    return np.array(pairs, dtype=np.float64).reshape(-1, 2, 3)
+
+
+def _skeleton(points: Floats) -> Floats:
+    """The shortest segments (n - 1, 2, 3) that link all points (n, 3), for the eye."""
+    if len(points) < 2:
+        return np.zeros((0, 2, 3))
+    a, b = minimum_spanning_tree(squareform(pdist(points))).nonzero()
+    return np.stack([points[a], points[b]], axis=1)
+
+
+def _wxyz(T: Floats) -> Floats:
+    return np.roll(rigid.quaternion_xyzw(T), 1)
+
+
+def _rgb(bgr: tuple[int, int, int]) -> tuple[int, int, int]:
+    return bgr[2], bgr[1], bgr[0]

@@ -1,0 +1,98 @@
+"""The server of the page: viser on a socket that is there already, behind a `Guard`."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers, MultipleValuesError
+from websockets.http11 import Request, Response
+
+from mixpose.viewing.address import LOOPBACK, Place
+from mixpose.viewing.guard import ASKED_FOR, Answer, Guard
+
+
+class _Server(viser.ViserServer):  # type: ignore[misc]
+    """A server that never opens itself to the outside, whatever a browser asks of it."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        return None
+
+
+@contextmanager
+def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.ViserServer]:
+    """A server that answers on a socket.
+
+    Parameters
+    ----------
+    place : Place
+    on_viewers : callable
+        Called with the number of browsers whenever it changes.
+    """
+    # a browser that breaks off, or one that is refused, is nothing to report
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)
+    with _behind(place):
+        server = _Server(host=LOOPBACK, port=0, verbose=False)
+
+    def count(_: viser.ClientHandle) -> None:
+        on_viewers(len(server.get_clients()))
+
+    server.on_client_connect(count)
+    server.on_client_disconnect(count)
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+@contextmanager
+def _behind(place: Place) -> Iterator[None]:
+    """Let a server that begins here use the socket of a place, and ask its guard first.
+
+    viser offers neither, so what it serves with is replaced while it begins.
+
+    Raises
+    ------
+    RuntimeError
+        If it began otherwise, and the guard was not asked.
+    """
+    usual = websockets.asyncio.server.serve
+    guard = Guard(place.port, place.token)
+    guarded = []
+
+    def serve(handler: Any, *_: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Request) -> Response | None:
+            answer = _answer(guard, request)
+            if answer is not None:
+                text = answer.text.encode()
+                headers = Headers(**answer.headers)
+                headers["Content-Type"] = "text/plain; charset=utf-8"
+                headers["Content-Length"] = str(len(text))
+                return Response(answer.status, answer.status.phrase, headers, text)
+            response: Response | None = process_request(connection, request)
+            return response
+
+        guarded.append(True)
+        return usual(handler, sock=place.socket, process_request=process, **options)
+
+    websockets.asyncio.server.serve = serve
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = usual
+    if not guarded:
+        raise RuntimeError(f"viser {viser.__version__} does not serve as expected")
+
+
+def _answer(guard: Guard, request: Request) -> Answer | None:
+    try:
+        asked = {name: request.headers.get(name) for name in ASKED_FOR}
+    except MultipleValuesError:
+        asked = {}
+    return guard.answer(
+        request.path, {name: value for name, value in asked.items() if value is not None}
+    )
