@@ -16,7 +16,7 @@ from mixpose.session import load_session
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tools"))
 
-from faults import FAULTS, Fault, outcome, rewritten
+from faults import FAULTS, Fault, moved, outcome, rewritten
 
 from mixpose.records import Floats
 
@@ -90,6 +90,15 @@ def test_a_marker_is_called_by_the_name_that_its_table_has(tmp_path: Path) -> No
 
     found = outcome(Fault(named, "^marker tip is met in none"), tmp_path / "recording", stop=12)
     assert (found.right, found.is_named) == (12, True), found.said
+
+
+def test_a_marker_that_is_so_far_off_that_it_is_missed_in_the_end_is_not_called_gone(
+    tmp_path: Path,
+) -> None:
+    off = Fault(moved(2, (0, 0, 5)), "^marker 3 is met .* mm off in .* measured wrong")
+    found = outcome(off, tmp_path / "recording")
+    assert found.wrong == 0
+    assert found.is_named, found.said
 
 
 def test_a_recording_without_faults_gives_rise_to_no_remark(tmp_path: Path) -> None:

@@ -159,5 +159,6 @@ def _summary(
     for finding in findings:
         lines += describe(finding, body, session.unit)
     if estimate.status == "lost":
-        lines.append("lost: once the counts are right, give [start], or check T_sensor_world")
+        stand = ", or check T_sensor_world" if len(session.sensors) > 1 else ""
+        lines.append(f"lost: once the counts are right, give [start]{stand}")
     return lines
