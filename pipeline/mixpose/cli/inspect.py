@@ -79,7 +79,7 @@ def inspect_frame(
     for prefix, body, findings, estimate in each:
         made = inspection_pictures(session, body, findings, estimate)
         pictures |= {prefix + name: picture for name, picture in made.items()}
-        lines += _summary(session, body, estimate, findings, poses)
+        lines += summary(session, body, estimate, findings, poses)
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -140,13 +140,14 @@ def _from_file(path: Path, session: Session, number: int) -> list[Estimate]:
     return found
 
 
-def _summary(
+def summary(
     session: Session,
     body: Body,
     estimate: Estimate,
     findings: Sequence[Finding],
     poses: Path | None,
 ) -> list[str]:
+    """What is said of a frame beside its pictures: where its pose is from, and what to change."""
     origin = "estimated on its own" if poses is None else f"pose of {poses}"
     whose = f"{estimate.label} " if len(session.labels) > 1 else ""
     head = f"{session.path}, frame {estimate.frame}: {whose}{estimate.status} ({origin})"
