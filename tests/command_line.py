@@ -1,24 +1,67 @@
-"""The command line as a subprocess, and what its one line of an error must be."""
+"""The command line, in a process of its own or in this one, and the one line of its errors."""
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
+
+from mixpose.cli import main
 
 LONGEST_S = 900.0
 """Ends a test that would wait for ever; no test hangs on how fast a machine is."""
 
 
 def mixpose(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command line in a process of its own, whose start takes half a second."""
     command = [sys.executable, "-m", "mixpose", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd)
+
+
+def command(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """The command line in this process, where nothing hangs on its being one of its own.
+
+    What libraries write to the streams is caught too; an exception that leaves it fails the test.
+    """
+    words = [str(argument) for argument in arguments]
+    with (
+        _caught(1, redirect_stdout) as printed,
+        _caught(2, redirect_stderr) as told,
+        chdir(cwd) if cwd else nullcontext(),
+    ):
+        try:
+            main(words)
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+    return subprocess.CompletedProcess(words, status, printed[0], told[0])
+
+
+@contextmanager
+def _caught(number: int, redirected: Callable[[Any], Any]) -> Iterator[list[str]]:
+    """What is written to a stream: its text, in the end."""
+    text: list[str] = []
+    before = os.dup(number)
+    try:
+        with tempfile.TemporaryFile() as file:
+            os.dup2(file.fileno(), number)
+            with (
+                open(number, "w", encoding="utf-8", closefd=False) as stream,
+                redirected(stream),
+            ):
+                yield text
+            file.seek(0)
+            text.append(file.read().decode("utf-8"))
+    finally:
+        os.dup2(before, number)
+        os.close(before)
 
 
 @contextmanager

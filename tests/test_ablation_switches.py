@@ -100,6 +100,19 @@ def case_named(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Case
     return case
 
 
+@pytest.fixture(scope="module")
+def told_with_all(case_named: Callable[[str], Case]) -> Callable[[str], list[tuple[object, ...]]]:
+    """What is told of a case with nothing switched off, once for all rows that it shows."""
+    told: dict[str, list[tuple[object, ...]]] = {}
+
+    def of(name: str) -> list[tuple[object, ...]]:
+        if name not in told:
+            told[name] = _told(case_named(name), all_on)
+        return told[name]
+
+    return of
+
+
 def _made(name: str, folder: Path) -> Case:
     for row in rows_named([]):
         if row.name == name:
@@ -130,11 +143,13 @@ def _told(case: Case, change: Callable[[Tracker], Tracker]) -> list[tuple[object
 
 @pytest.mark.parametrize("name", SHOWN_BY)
 def test_a_row_changes_poses_or_what_is_told_of_them(
-    name: str, case_named: Callable[[str], Case]
+    name: str,
+    case_named: Callable[[str], Case],
+    told_with_all: Callable[[str], list[tuple[object, ...]]],
 ) -> None:
     (switch,) = (one for one in SWITCHES if one.name == name)
-    case = case_named(SHOWN_BY[name])
-    assert _told(case, switch.change) != _told(case, all_on)
+    shown = SHOWN_BY[name]
+    assert _told(case_named(shown), switch.change) != told_with_all(shown)
 
 
 @pytest.mark.parametrize("name", SHOWN_BY_REAL)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import command, mixpose
 
 from mixpose.cli.calibrate import _watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
@@ -17,11 +16,6 @@ from mixpose.session import load_session
 
 RECORDING = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras"
 FRAMES = 8
-
-
-def mixpose(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mixpose", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 @pytest.fixture(scope="module")
@@ -69,21 +63,21 @@ def test_a_wrong_word_for_what_is_free_is_one_line(bumped: Path) -> None:
         ("middle:pose", "no such sensor; allowed: left, right"),
         ("left:range_bias", "it has pose, focal"),
     ):
-        done = mixpose("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--free", word)
+        done = command("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--free", word)
         assert done.returncode == 2
         assert said in done.stderr
         assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_the_session_itself_is_not_overwritten(bumped: Path) -> None:
-    done = mixpose("calibrate", bumped, "-o", bumped)
+    done = command("calibrate", bumped, "-o", bumped)
     assert done.returncode == 2
     assert "is an input of this run" in done.stderr
 
 
 def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: Path) -> None:
     for word in ("bodi@0", "body@77", "middle"):
-        done = mixpose("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--world", word)
+        done = command("calibrate", bumped, "-o", bumped.with_name("x.toml"), "--world", word)
         assert done.returncode == 2
         (line,) = done.stderr.strip().splitlines()  # no line about what is free and searched
         assert f"--world {word}: allowed: left, right, or the body in a frame" in line
@@ -91,7 +85,7 @@ def test_a_world_that_there_is_not_is_told_before_anything_is_searched(bumped: P
 
 
 def test_the_sensor_that_is_held_is_called_so_in_a_check(bumped: Path) -> None:
-    done = mixpose("calibrate", bumped, "--check")
+    done = command("calibrate", bumped, "--check")
     assert done.returncode == 0, done.stderr
     left, right = done.stdout.splitlines()[1:3]
     assert "held, the others are told against it; residual" in left

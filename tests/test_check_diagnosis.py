@@ -17,7 +17,7 @@ from mixpose.checking.adjusted import Adjustment, adjusted, promise
 from mixpose.checking.changes import Change
 from mixpose.checking.meetings import Seen
 from mixpose.checking.rules import DiagnosisRules
-from mixpose.checking.trials import Tried, diagnosis, simplest
+from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
 from mixpose.checking.values import unknowns
 from mixpose.density import Observation
 from mixpose.objective import View
@@ -214,6 +214,35 @@ def test_points_in_another_unit_than_the_start_are_told_of_one_camera(
         "points and translation of [start] are in two units of length: with points 1000 times as "
         "large, the body is at [start] in frame 0",
     )
+
+
+def test_frames_of_fewer_coordinates_than_a_pose_has_are_not_searched(
+    right: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three spots in two images are met by some pose of any body, so that they tell nothing."""
+    setups = []
+    for setup, count in zip(right.sensors, (2, 1), strict=True):
+        rows = [f"0,{u},{v}" for u, v in recorded(right)[setup.name][0][:count].tolist()]
+        table = tmp_path / f"{setup.name}.csv"
+        table.write_text("\n".join(["frame,u,v", *rows, ""]), encoding="utf-8")
+        setups.append(replace(setup, source=table.name, times=None, fps=None))
+    few = replace(right, path=tmp_path / "session.toml", sensors=tuple(setups))
+    sources = open_sources(few, {})
+    surveys = {s.name: survey(few, s, sources[s.name]) for s in few.sensors}
+    asked: list[object] = []
+
+    def asks(*arguments: object) -> Diagnosis:
+        asked.append(arguments)
+        return Diagnosis(good=1)
+
+    monkeypatch.setattr("mixpose.checking.geometry.diagnosis", asks)
+    assert geometry_doubts(few, sources, surveys).warnings == ()
+    assert not asked
+    with (tmp_path / "right.csv").open("a", encoding="utf-8") as table_of_right:
+        table_of_right.write("0,300,200\n")  # a fourth: two coordinates more than a pose
+    sources = open_sources(few, {})
+    geometry_doubts(few, sources, surveys)
+    assert len(asked) == 1
 
 
 def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:

@@ -9,9 +9,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from command_line import assert_one_line, command
+from report_runs import estimate, write
 
 from mixpose.cli import main
+from mixpose.cli.run import named_sources
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 SESSION = str(SYNTHETIC / "two_cameras" / "session.toml")
@@ -123,3 +127,73 @@ def test_a_finished_run_that_is_resumed_says_that_nothing_was_left(
     written = (tmp_path / "p.jsonl").read_bytes()
     assert "nothing left to do" in said(capsys, 0, *run, "--resume")
     assert (tmp_path / "p.jsonl").read_bytes() == written
+
+
+def test_a_dash_is_standard_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    poses = command("run", SESSION, "--stop", "1", "-o", "-")
+    assert poses.returncode == 0, poses.stderr
+    assert [json.loads(line)["type"] for line in poses.stdout.splitlines()] == ["header", "pose"]
+    (tmp_path / "p.jsonl").write_text(poses.stdout, encoding="utf-8")
+    table = command("convert", "p.jsonl", "--format", "csv", "-o", "-")
+    assert table.stdout.startswith("frame,time_s,object")
+    assert [path.name for path in tmp_path.iterdir()] == ["p.jsonl"]
+
+
+def test_a_number_in_place_of_a_recording_is_a_camera_unless_a_file_has_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert named_sources(["left=0", "right=12"]) == {"left": "camera:0", "right": "camera:12"}
+    (tmp_path / "0").mkdir()
+    assert named_sources(["left=0", "right=a0"]) == {"left": "0", "right": "a0"}
+
+
+def test_check_looks_at_the_recording_that_is_named(tmp_path: Path) -> None:
+    for n in range(3):
+        shutil.copy(SYNTHETIC / "two_cameras" / f"left{n:04d}.png", tmp_path / f"seen{n}.png")
+    found = command("check", SESSION, "--quick", "--source", f"left={tmp_path}")
+    assert found.returncode == 0, found.stderr
+    assert "3 images 640x512, frames 0-2" in found.stdout
+    wrong = command("check", SESSION, "--source", "middle=x")
+    assert_one_line(wrong, 2, "--source middle=...: no such sensor, allowed: left, right")
+
+
+def test_a_camera_that_does_not_open_is_an_error_of_a_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    session = SYNTHETIC / "one_camera_video" / "session.toml"
+    found = command("check", session, "--source", "camera=97")
+    assert_one_line(found, 3, "camera:97: does not open")
+
+
+@pytest.mark.parametrize("unit_of_time", ["fps = 25", ""])
+def test_frame_numbers_that_stand_for_seconds_are_told(unit_of_time: str, tmp_path: Path) -> None:
+    text = Path(SESSION).read_text(encoding="utf-8").replace("fps = 25", unit_of_time)
+    text = text.replace('source = "', f'source = "{Path(SESSION).parent.as_posix()}/')
+    (tmp_path / "s.toml").write_text(text, encoding="utf-8")
+    poses = tmp_path / "p.jsonl"
+    run = command("run", tmp_path / "s.toml", "--stop", "2", "-o", poses)
+    assert "warning" not in run.stderr  # JSON lines have both
+    for done in (
+        command("run", tmp_path / "s.toml", "--stop", "2", "-o", tmp_path / "p.tum"),
+        command("convert", poses, "-o", tmp_path / "q.tum"),
+    ):
+        assert done.returncode == 0, done.stderr
+        told = done.stderr.count("poses have no times, so that frame numbers stand for seconds")
+        assert told == (0 if unit_of_time else 1)
+
+
+def test_a_report_is_no_pdf(tmp_path: Path) -> None:
+    poses = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4), "lost")], None)
+    result = command("report", poses, "-o", tmp_path / "report.pdf")
+    assert_one_line(result, 2, "found the suffix .pdf", "name it report.html")
+    assert not (tmp_path / "report.pdf").exists()
+
+
+def test_a_format_that_nothing_tells_is_asked_for(tmp_path: Path) -> None:
+    poses = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4), "lost")], None)
+    assert_one_line(command("convert", poses), 2, "--format: missing, where there is no -o")
+    foreign = command("convert", poses, "-o", tmp_path / "p.foo")
+    assert_one_line(foreign, 2, "p.foo: no format has this suffix; add --format")

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from command_line import assert_one_line, lines_of, mixpose
+from command_line import assert_one_line, command, lines_of, mixpose
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -47,7 +47,7 @@ def test_a_mistake_in_the_session_is_one_line(
         text = text.replace("[[sensor]]", "[extract]\nsigma = 1.5\n\n[[sensor]]", 1)
     assert old in text
     session.write_text(text.replace(old, new, 1), encoding="utf-8")
-    assert_one_line(mixpose("run", session), 2, "session.toml", *words)
+    assert_one_line(command("run", session), 2, "session.toml", *words)
 
 
 def test_an_object_with_too_few_features_is_told(recording: Path) -> None:
@@ -56,31 +56,31 @@ def test_an_object_with_too_few_features_is_told(recording: Path) -> None:
     head, _, rest = text.partition("points = [")
     tail = rest.partition("\n]")[2] if "\n]" in rest else rest.partition("]]")[2]
     session.write_text(head + "points = [[0, 0, 0], [10, 0, 0]]" + tail, encoding="utf-8")
-    assert_one_line(mixpose("check", session), 2, "points", "found 2", "three")
+    assert_one_line(command("check", session), 2, "points", "found 2", "three")
 
 
 def test_missing_files_are_told(recording: Path) -> None:
     assert_one_line(mixpose("run", recording / "no.toml"), 2, "no.toml")
     for path in recording.glob("left*.png"):
         path.unlink()
-    assert_one_line(mixpose("run", recording / "session.toml"), 3, "left*.png")
+    assert_one_line(command("run", recording / "session.toml"), 3, "left*.png")
 
 
 def test_wrong_options_are_one_line() -> None:
-    assert_one_line(mixpose("run", "x.toml", "--steps", "3"), 2, "--step")
-    assert_one_line(mixpose("rum", "x.toml"), 2, "run")
-    assert_one_line(mixpose("run", "x.toml", "--format", "xml"), 2, "jsonl")
+    assert_one_line(command("run", "x.toml", "--steps", "3"), 2, "--step")
+    assert_one_line(command("rum", "x.toml"), 2, "run")
+    assert_one_line(command("run", "x.toml", "--format", "xml"), 2, "jsonl")
 
 
 def test_an_unwritable_output_is_told(recording: Path) -> None:
-    result = mixpose("run", recording / "session.toml", "-o", recording / "no" / "poses.jsonl")
+    result = command("run", recording / "session.toml", "-o", recording / "no" / "poses.jsonl")
     assert_one_line(result, 2, "poses.jsonl")
 
 
 @pytest.mark.parametrize("name", ["session.toml", "left0003.png"])
 def test_an_input_is_never_overwritten(recording: Path, name: str) -> None:
     before = (recording / name).read_bytes()
-    result = mixpose("run", recording / "session.toml", "-o", recording / name)
+    result = command("run", recording / "session.toml", "-o", recording / name)
     assert_one_line(result, 2, name, "input")
     assert (recording / name).read_bytes() == before
 
@@ -90,22 +90,22 @@ def test_a_file_of_another_origin_is_never_overwritten(recording: Path) -> None:
     (recording / "notes.txt").write_text("measured on Monday\n", encoding="utf-8")
     for name in ("truth.jsonl", "notes.txt"):
         before = (recording / name).read_bytes()
-        assert_one_line(mixpose("run", recording / "session.toml", "-o", recording / name), 2, name)
+        assert_one_line(command("run", recording / "session.toml", "-o", recording / name), 2, name)
         assert (recording / name).read_bytes() == before
 
 
 def test_a_run_that_fails_before_its_first_frame_leaves_earlier_poses(recording: Path) -> None:
     poses = recording / "poses.jsonl"
-    assert mixpose("run", recording / "session.toml", "-o", poses, "--stop", "2").returncode == 0
+    assert command("run", recording / "session.toml", "-o", poses, "--stop", "2").returncode == 0
     before = poses.read_bytes()
     (recording / "left0000.png").write_bytes(b"")
-    assert_one_line(mixpose("run", recording / "session.toml", "-o", poses), 3, "left0000.png")
+    assert_one_line(command("run", recording / "session.toml", "-o", poses), 3, "left0000.png")
     assert poses.read_bytes() == before
 
 
 def test_a_stray_file_among_numbered_ones_is_told(recording: Path) -> None:
     shutil.copy(recording / "left0000.png", recording / "left_test.png")
-    result = mixpose("run", recording / "session.toml", "--stop", "1")
+    result = command("run", recording / "session.toml", "--stop", "1")
     assert "warning" in result.stderr
     assert "left_test.png" in result.stderr
 
@@ -118,14 +118,14 @@ def test_a_full_disk_is_one_line() -> None:
 
 
 def test_debug_shows_the_traceback(recording: Path) -> None:
-    result = mixpose("run", recording / "no.toml", "--debug")
+    result = command("run", recording / "no.toml", "--debug")
     assert "Traceback" in result.stderr
 
 
 def test_an_unreadable_image_keeps_the_frames_before_it(recording: Path) -> None:
     (recording / "left0005.png").write_bytes(b"this is no image")
     poses = recording / "poses.jsonl"
-    result = mixpose("run", recording / "session.toml", "-o", poses)
+    result = command("run", recording / "session.toml", "-o", poses)
     assert_one_line(result, 3, "left0005.png")
     assert [pose["frame"] for pose in lines_of(poses.read_text())[1:]] == list(range(5))
 
@@ -133,9 +133,9 @@ def test_an_unreadable_image_keeps_the_frames_before_it(recording: Path) -> None
 def test_a_truncated_image_is_told(recording: Path) -> None:
     path = recording / "right0002.png"
     path.write_bytes(path.read_bytes()[:-400])
-    assert_one_line(mixpose("run", recording / "session.toml"), 3, "right0002.png")
+    assert_one_line(command("run", recording / "session.toml"), 3, "right0002.png")
 
 
 def test_an_image_of_the_wrong_size_is_told(recording: Path) -> None:
     cv2.imwrite(str(recording / "left0001.png"), np.zeros((100, 120), dtype=np.uint8))
-    assert_one_line(mixpose("run", recording / "session.toml"), 3, "left0001.png", "120", "640")
+    assert_one_line(command("run", recording / "session.toml"), 3, "left0001.png", "120", "640")

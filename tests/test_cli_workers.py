@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import LONGEST_S, has_written, started, wait_until
+from command_line import LONGEST_S, command, has_written, started, wait_until
 from long_recordings import RANGE_FRAMES, long_ranges
 
 from mixpose.cli.lines import LineFile
@@ -34,11 +34,6 @@ RANGES = SYNTHETIC / "range_profiles" / "session.toml"
 BEAMS = SYNTHETIC / "parallel_beams" / "session.toml"
 
 
-def mixpose(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "mixpose", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
 def poses_of(path: Path) -> list[dict[str, Any]]:
     lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return [{k: v for k, v in line.items() if k != "latency_ms"} for line in lines]
@@ -56,9 +51,9 @@ def killed_parent(
     sessions: list[Path], folder: Path, begin: Callable[[Iterable[bool]], bool] = all
 ) -> list[Path]:
     """What two sessions write, where the run is killed when both or any of them have begun."""
-    command = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
+    words = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
     begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in names_of(sessions)]
-    with started([*command, "--workers", "2"], stderr=subprocess.DEVNULL) as process:
+    with started([*words, "--workers", "2"], stderr=subprocess.DEVNULL) as process:
         wait_until(lambda: begin(has_written(path) for path in begun), by=process)
     return begun
 
@@ -70,7 +65,7 @@ def status_of(folder: Path) -> dict[str, Any]:
 
 def test_several_sessions_give_the_poses_that_each_gives_alone(tmp_path: Path) -> None:
     folder = tmp_path / "poses"
-    result = mixpose("run", RANGES, BEAMS, "--workers", "2", "-o", folder, "--stop", "3")
+    result = command("run", RANGES, BEAMS, "--workers", "2", "-o", folder, "--stop", "3")
     assert result.returncode == 0, result.stderr
     assert result.stdout == ""
     names = ["parallel_beams", "range_profiles", "summary.csv", "summary.json"]
@@ -81,13 +76,13 @@ def test_several_sessions_give_the_poses_that_each_gives_alone(tmp_path: Path) -
     assert f"mixpose: {RANGES}: 3 frames: 3 ok" in result.stderr
     assert result.stderr.endswith(f"2 recordings: 2 done -> {folder / 'summary.csv'}\n")
     alone = tmp_path / "alone.jsonl"
-    assert mixpose("run", BEAMS, "-o", alone, "--stop", "3").returncode == 0
+    assert command("run", BEAMS, "-o", alone, "--stop", "3").returncode == 0
     assert poses_of(folder / "parallel_beams" / "poses.jsonl") == poses_of(alone)
     status = status_of(folder / "parallel_beams")
     assert (status["state"], status["frames"]) == ("done", {"ok": 3})
 
     before = (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns
-    again = mixpose("run", RANGES, BEAMS, "-o", folder, "--stop", "3")
+    again = command("run", RANGES, BEAMS, "-o", folder, "--stop", "3")
     assert "2 of 2 recordings are done already" in again.stderr
     assert (folder / "parallel_beams" / "poses.jsonl").stat().st_mtime_ns == before
 
@@ -101,8 +96,8 @@ def test_a_session_that_fails_is_named_and_the_same_command_does_what_is_left(
     listed = tmp_path / "all.txt"
     listed.write_text(f"# of today\n{missing}\nspoilt.toml\n\n{RANGES}\n", encoding="utf-8")
     folder = tmp_path / "poses"
-    command = ("run", listed, "--workers", "2", "-o", folder, "--stop", "2")
-    result = mixpose(*command)
+    words = ("run", listed, "--workers", "2", "-o", folder, "--stop", "2")
+    result = command(*words)
     assert result.returncode == 3  # a session that is wrong is 2, a recording that is missing 3
     assert f"mixpose: {missing}: no such file" in result.stderr
     assert f"mixpose: {spoilt}: " in result.stderr
@@ -122,7 +117,7 @@ def test_a_session_that_fails_is_named_and_the_same_command_does_what_is_left(
 
     for name in ("front", "side", "top"):
         shutil.copy(RANGES.parent / f"{name}.npy", tmp_path)
-    again = mixpose(*command)
+    again = command(*words)
     assert "1 of 3 recordings are done already" in again.stderr
     assert again.returncode == 2
     assert status_of(folder / "spoilt")["state"] == "done"
@@ -191,11 +186,11 @@ def test_the_command_of_a_killed_parent_given_again_at_once_writes_each_line_onc
     sessions, folder = make_recordings(tmp_path, 2, 200), tmp_path / "poses"
     begun = killed_parent(sessions, folder, any)
     assert any(path.exists() for path in begun)  # it was killed midway
-    again = mixpose("run", *sessions, "-o", folder, "--workers", "2")
+    again = command("run", *sessions, "-o", folder, "--workers", "2")
     assert again.returncode == 0, again.stderr
     alone = tmp_path / "alone.jsonl"
     for session in sessions:
-        assert mixpose("run", session, "-o", alone).returncode == 0
+        assert command("run", session, "-o", alone).returncode == 0
         poses = folder / session.parent.name / "poses.jsonl"
         assert len(poses_of(poses)) == 201  # with the header
         assert without_latency(poses) == without_latency(alone)
@@ -214,7 +209,7 @@ def test_options_that_serve_one_session_only_are_refused(tmp_path: Path) -> None
 
 
 def test_workers_of_a_single_session_are_told_to_have_nothing_to_do() -> None:
-    result = mixpose("run", RANGES, "--workers", "2", "--stop", "1")
+    result = command("run", RANGES, "--workers", "2", "--stop", "1")
     assert result.returncode == 0
     assert "warning: --workers 2: one session" in result.stderr
     assert len(result.stdout.splitlines()) == 2
@@ -235,9 +230,9 @@ def test_an_interrupt_ends_all_sessions_and_keeps_their_poses(
     sessions = long_ranges(tmp_path, "abc")  # the third one waits its turn
     folder = tmp_path / "poses"
     run = [sys.executable, "-m", "mixpose", "run", *map(str, sessions), "-o", str(folder)]
-    command = ["sh", "-c", f'{ignoring} exec "$@"', "sh", *run, "--workers", "2"]
+    words = ["sh", "-c", f'{ignoring} exec "$@"', "sh", *run, "--workers", "2"]
     begun = [folder / f".{name}.unfinished" / "poses.jsonl" for name in "ab"]
-    with started(command, stderr=subprocess.PIPE) as process:
+    with started(words, stderr=subprocess.PIPE) as process:
         wait_until(lambda: all(map(has_written, begun)), by=process)
         process.send_signal(request_to_end)
         _, stderr = process.communicate(timeout=LONGEST_S)

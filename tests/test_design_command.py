@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+from command_line import command
 
 from mixpose.cli import main
 
 TWO_CAMERAS = Path(__file__).parents[1] / "data" / "synthetic" / "two_cameras" / "session.toml"
-
-
-def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mixpose", "design", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Path) -> None:
@@ -37,7 +26,7 @@ def test_the_command_compares_two_systems_and_writes_what_it_found(tmp_path: Pat
     (tmp_path / "one.toml").write_text(one, encoding="utf-8")
     options = ("--count", "6", "--tip", "0,0,-100", "--json", "d.json", "--plot", "d.png")
     noise = ("--noise", "one:left=0.1", "--noise", "two:left=0.03", "--noise", "two:right=1.2")
-    done = run("two.toml", "one.toml", *options, *noise, cwd=tmp_path)
+    done = command("design", "two.toml", "one.toml", *options, *noise, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "two: features err by left 0.03 px, right 1.2 px" in done.stdout
     assert "one: features err by left 0.1 px" in done.stdout

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import calibration_texts as texts
 import cv2
 import numpy as np
 import pytest
+from command_line import command
 
 from mixpose.errors import SessionError
 from mixpose.importing import gather, session_text
 from mixpose.session import load_session
-
-
-def run(*arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "mixpose", *map(str, arguments)],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
 
 
 def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
@@ -32,7 +21,7 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     (tmp_path / "calibration.toml").write_text(copied, encoding="utf-8")
     (tmp_path / "marks.csv").write_text("name,x,y,z\na,0,0,0\nb,5,0,0\nc,0,9,0\n", encoding="utf-8")
     (tmp_path / "out").mkdir()
-    done = run("import", "calibration.toml", "marks.csv", "-o", "out/s.toml", cwd=tmp_path)
+    done = command("import", "calibration.toml", "marks.csv", "-o", "out/s.toml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == ""
     assert "view0 and again0 are the same camera at the same place" in done.stderr
@@ -40,7 +29,7 @@ def test_the_command_says_what_it_took_for_granted(tmp_path: Path) -> None:
     assert "4 cameras (view0, view1, again0, again1), lengths in mm -> out/s.toml" in done.stderr
     session = load_session(tmp_path / "out" / "s.toml")
     assert session.body.name == "marks"
-    again = run("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
+    again = command("import", "calibration.toml", "-o", "out/s.toml", cwd=tmp_path)
     assert again.returncode == 2
     assert "is there already" in again.stderr
 
@@ -62,7 +51,7 @@ def test_metres_left_in_a_session_in_millimetres_are_doubted(tmp_path: Path) -> 
         lines = lines.replace(source, f'source = "{setup.name}.csv"')
         (tmp_path / f"{setup.name}.csv").write_text("frame,u,v\n0,9,9\n", encoding="utf-8")
     output.write_text(lines, encoding="utf-8")
-    done = run("check", "s.toml", cwd=tmp_path)
+    done = command("check", "s.toml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "'cam0' and 'cam1' stand 0.32 mm apart" in done.stdout
     assert "are translations in mm?" in done.stdout

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import command
 
 from mixpose.rigid import from_rotation_vector, transform
 from mixpose.runner import run
@@ -133,8 +132,7 @@ def test_an_error_that_a_sensor_cannot_have_is_refused(
     path = written(tmp_path, error, model, camera)
     if model == "lateration":
         path.write_text(path.read_text().replace("resolution = [640, 512]\n", ""))
-    command = [sys.executable, "-m", "mixpose", "check", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = command("check", path)
     assert done.returncode == 2
     assert "calibration_error" in done.stderr
     assert said in done.stderr

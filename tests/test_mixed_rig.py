@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import command
 
 FOLDER = Path(__file__).resolve().parents[1] / "data" / "synthetic" / "camera_and_ranges"
 START = re.compile(r"# Near the first pose:.*?\[start\].*?\n\n", re.DOTALL)
 RANGES = re.compile(r'# Beside the camera.*|\[\[sensor\]\]\nname = "(near|aside)".*', re.DOTALL)
 
 
-def mixpose(*arguments: str | Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "mixpose", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout
+def mixpose(*arguments: str | Path) -> None:
+    done = command(*arguments)
+    assert done.returncode == 0, done.stderr
 
 
 def rms_z(poses: Path, truth: Path) -> float:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 import mixpose
 from mixpose.body import Body, PointFeature
 from mixpose.cli import main
+from mixpose.cli.inspect import summary
 from mixpose.density import Observation
 from mixpose.fit import EstimatorOptions
 from mixpose.frames import pair
@@ -401,6 +402,15 @@ def test_a_sensor_without_a_frame_is_said_to_have_none() -> None:
     session = mixpose.load_session(TWO_CAMERAS)
     finding = Finding(session.sensors[0], None, None, None, 0.0, None)
     assert describe(finding, session.body, session.unit) == ["left: no frame of this number"]
+
+
+@pytest.mark.parametrize(("name", "doubted"), [("two_cameras", True), ("one_camera_video", False)])
+def test_where_a_camera_stands_is_doubted_beside_others_only(name: str, doubted: bool) -> None:
+    session = mixpose.load_session(SYNTHETIC / name / "session.toml")
+    lost = Estimate(6, None, session.labels[0], "lost", None, None, 0.0, {})
+    *_, advice = summary(session, session.body, lost, [], None)
+    assert advice.startswith("lost: once the counts are right, give [start]")
+    assert ("T_sensor_world" in advice) == doubted
 
 
 def test_real_frames_have_every_marker_met(

@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from command_line import LONGEST_S
+from command_line import LONGEST_S, command
 from report_runs import RECORDING, SYNTHETIC, estimate, write, write_run
 
 from mixpose.cli.report import write_report
@@ -353,13 +353,10 @@ def test_missing_library_is_named_with_the_extra_that_brings_it(
 def test_command_line_writes_the_page_and_says_where(tmp_path: Path) -> None:
     poses = write(tmp_path / "p.jsonl", [estimate(0, np.eye(4), "lost")], None)
     output = tmp_path / "r.html"
-    command = [sys.executable, "-m", "mixpose", "report", str(poses), "-o", str(output)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = command("report", poses, "-o", output)
     assert (result.returncode, result.stdout) == (0, "")
     assert result.stderr == f"mixpose: 1 frame -> {output}\n"
     assert output.stat().st_size > 5000
-    absent = str(tmp_path / "absent.jsonl")
-    command[4] = absent
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    result = command("report", tmp_path / "absent.jsonl", "-o", output)
     assert result.returncode == 3
     assert len(result.stderr.splitlines()) == 1

@@ -157,6 +157,10 @@ WRONG: list[tuple[dict[str, str], list[str]]] = [
         {"estimator": "[estimator]\nconfidence = 99.9"},
         ["estimator.confidence: found 99.9", "at least 0.5, below 1"],
     ),
+    (
+        {"left": '[[camera]]\nname = "left"\nmodel = "pinhole"\nsource = "l*.png"'},
+        ["camera: unknown key", "did you mean [[sensor]]?"],
+    ),
     ({"estimator": '[estimator]\nfree = "x"'}, ['estimator.free: found "x"', "a list"]),
     ({"estimator": '[estimator]\nfree = ["x", "w"]'}, ['estimator.free[1]: found "w"', '"rx"']),
     ({"estimator": '[estimator]\nfree = ["x", "x"]'}, ["estimator.free", '"x" stands there twice']),

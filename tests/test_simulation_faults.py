@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from command_line import command
 from numpy.typing import NDArray
 
 from mixpose.errors import SessionError
@@ -277,23 +276,13 @@ def test_the_command_takes_every_fault(tmp_path: Path) -> None:
         "--frames 2 --readout 0.02 --exposure 0.004 --delay left=0.003 --lamps 2 --mirror 0.4 "
         "--others 1 --occluder 1 --jpeg 80 --bayer --turned-camera 0.1 --away-from 1"
     )
-    command = [sys.executable, "-m", "mixpose", "simulate", str(session), "-o"]
-    done = subprocess.run(
-        [*command, str(tmp_path / "out"), *words.split()],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = command("simulate", session, "-o", tmp_path / "out", *words.split())
     assert done.returncode == 0, done.stderr
     header = json.loads((tmp_path / "out" / TRUTH_NAME).read_text().splitlines()[0])
     assert header["simulation"]["delay"] == {"left": 0.003}
     for delay, words in (("0.003", "NAME=SECONDS"), ("right=0.1", "allowed: left")):
-        failed = subprocess.run(
-            [*command, str(tmp_path / "no"), "--frames", "2", "--delay", delay],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        asked = ("--frames", "2", "--delay", delay)
+        failed = command("simulate", session, "-o", tmp_path / "no", *asked)
         assert failed.returncode == 2
         assert words in failed.stderr
 

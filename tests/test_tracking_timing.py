@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from command_line import command
 from numpy.typing import NDArray
 
 from mixpose.records import Estimate
@@ -145,10 +144,8 @@ def test_run_says_in_the_end_which_camera_is_late(tmp_path: Path) -> None:
     )
 
     def said(path: Path) -> str:
-        command = [sys.executable, "-m", "mixpose", "run", str(path), "-o"]
-        done = subprocess.run(
-            [*command, str(path.parent / "poses.jsonl")], capture_output=True, text=True, check=True
-        )
+        done = command("run", path, "-o", path.parent / "poses.jsonl")
+        assert done.returncode == 0, done.stderr
         return done.stderr
 
     found = re.search(r"sensor 'right' is early by (\S+) s .*: delay = (\S+) in its", said(late))
@@ -168,7 +165,6 @@ def test_a_delay_without_times_is_an_error(tmp_path: Path) -> None:
     for name in ("left", "right"):
         table.with_name(f"{name}.csv").write_text("\n".join(rows) + "\n")
     path.write_text(path.read_text().replace('name = "right"', 'name = "right"\ndelay = 0.004'))
-    command = [sys.executable, "-m", "mixpose", "run", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = command("run", path)
     assert done.returncode == 2
     assert "sensor 'right': delay: stands without times" in done.stderr

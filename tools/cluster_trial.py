@@ -23,6 +23,9 @@ from statistics import median
 
 from kills import without_latency
 
+from mixpose.session import load_session
+from mixpose.simulation import SimulationOptions, simulate
+
 ROUNDS = 3  # of the measurement of throughput
 PATIENCE_S = 300.0
 
@@ -60,12 +63,10 @@ def make_recordings(folder: Path, count: int, frames: int) -> list[Path]:
     """Sessions with tables of their own, simulated."""
     plan = folder / "plan.toml"
     plan.write_text(SESSION, encoding="utf-8")
-    sessions = []
+    session, sessions = load_session(plan), []
     for k in range(count):
         place = folder / f"recording{k:03d}"
-        options = ["--frames", str(frames), "--seed", str(k), "--clutter", "1"]
-        command = mixpose("simulate", plan, "-o", place, *options)
-        subprocess.run(command, check=True, capture_output=True)
+        simulate(session, place, SimulationOptions(frames=frames, seed=k, clutter=1.0))
         sessions.append(place / "session.toml")
     return sessions
 

@@ -12,7 +12,7 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.checking.advice import judge
 from mixpose.checking.changes import Change, of_units
-from mixpose.checking.evidence import Frames, evidence_of, pose_near
+from mixpose.checking.evidence import Frames, Views, evidence_of, pose_near
 from mixpose.checking.placement import expected_count, fewest_count
 from mixpose.checking.recordings import Survey
 from mixpose.checking.rules import DiagnosisRules
@@ -20,7 +20,8 @@ from mixpose.checking.trials import diagnosis
 from mixpose.errors import RecordingError
 from mixpose.frames import Source
 from mixpose.frames.video import Video
-from mixpose.records import FrameSet
+from mixpose.records import FrameSet, PointPattern
+from mixpose.rigid import TWIST_NAMES
 from mixpose.runner import begin, observe
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 from mixpose.session import SensorSetup, Session
@@ -76,12 +77,22 @@ def geometry_doubts(
     frames = [(each.number, observe(session, each)) for each in chosen]
     if not frames:
         return Doubts()
-    found = diagnosis(session, frames, _otherwise(session, surveys, chosen))
+    others = _otherwise(session, surveys, chosen)
+    if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
+        return _at_the_start(session, sources, surveys)
+    found = diagnosis(session, frames, others)
     if found.change:
         return Doubts((f"{found.change}, {found.gain}",), explains=True)
     if not found.good and len(sources) > 1:
         return Doubts(_contradiction(session, frames))
     return _at_the_start(session, sources, surveys)
+
+
+def _can_tell(views: Views) -> bool:
+    """Whether features have more coordinates than a pose, which meets as many as it has itself."""
+    patterns = [view.observation.pattern for view in views]
+    points = [each.points for each in patterns if isinstance(each, PointPattern)]
+    return len(points) < len(patterns) or sum(each.size for each in points) > len(TWIST_NAMES)
 
 
 def _at_the_start(

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -79,15 +80,19 @@ def diagnosis(
     """
     rules, began = DiagnosisRules(), time.process_time()
 
-    def is_late() -> bool:
-        return time.process_time() - began > rules.patience_s
+    def is_late(share: float = 1.0) -> bool:
+        return time.process_time() - began > share * rules.patience_s
 
     session = anywhere(session)
     before = _explained(session, session.body, frames)
     is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
-    tried = list(_with_values(session, frames, before, is_late))  # they take less time
+    tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        tried += _without_values(session, frames, before, others, is_late)
+        half = partial(is_late, 0.5)  # the other half is for values
+        tried += _without_values(session, frames, before, others, half)
+    # values only follow the noise where all frames are explained to within it without any
+    if not any(_is_all_explained(one, rules) for one in tried):
+        tried += _with_values(session, frames, before, is_late)
     return simplest(tried, before, rules)
 
 
@@ -107,6 +112,12 @@ def explanation(session: Session, frames: Frames) -> str | None:
 
 def _explained(session: Session, body: Body, frames: Frames) -> Explained:
     return Explained(tuple(best_pose(session, body, n, views) for n, views in frames))
+
+
+def _is_all_explained(one: Tried, rules: DiagnosisRules) -> bool:
+    """Whether a change without values explains all frames to within what good recordings err by."""
+    well = all(is_well_explained(pose, rules) for pose in one.explained.poses)
+    return well and not one.change.values and one.gain > rules.margin
 
 
 def _without_values(
@@ -214,6 +225,8 @@ def _fitted(
     after = list(before.poses)
     for k, pose in zip(known, found):
         after[k] = pose
+    if Explained(tuple(after)).evidence <= before.evidence:
+        return  # nor are the others worth a search then
     for k, (number, views) in enumerate(frames):
         # a pose that wrong values led to may be another one
         if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]):

@@ -63,7 +63,7 @@ RunOutput = Annotated[
     typer.Option(
         "-o",
         "--output",
-        help="Write poses here, not to stdout, in the format that the suffix tells. With "
+        help="Write poses here, not to stdout (-), in the format that the suffix tells. With "
         "several sessions, a folder in which each gets its own for poses, log and status; what "
         "is done there already is not done again.",
     ),
@@ -76,7 +76,8 @@ Sources = Annotated[
     list[str] | None,
     typer.Option(
         metavar="NAME=PATH",
-        help="Another recording of a sensor, relative to the working folder; repeatable.",
+        help="Another recording of a sensor, relative to the working folder, or the number of a "
+        "camera; repeatable.",
     ),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on after the last frame in the output.")]
@@ -152,12 +153,12 @@ def run(
     allow_code: AllowCode = False,
 ) -> None:
     """Estimate a pose per frame."""
-    from mixpose.cli.request import RunRequest, format_of  # noqa: PLC0415
+    from mixpose.cli.request import RunRequest, format_of, output_of  # noqa: PLC0415
     from mixpose.cli.several import are_many, run_sessions, sessions_of  # noqa: PLC0415
     from mixpose.errors import SessionError  # noqa: PLC0415
     from mixpose.selection import Selection  # noqa: PLC0415
 
-    selection = Selection(start, stop, step)
+    selection, output = Selection(start, stop, step), output_of(output)
     sources, debug = tuple(source or ()), bool(context.obj)
     many = are_many(sessions, scheduler)
     named = None if format is None else format.value
@@ -201,12 +202,13 @@ def check(
     quick: Annotated[
         bool, typer.Option("--quick", help="Look at a few frames of each sensor only.")
     ] = False,
+    source: Sources = None,
     allow_code: AllowCode = False,
 ) -> None:
     """Read every frame before any run: features found, placement, accuracy to expect."""
     from mixpose.cli.check import check_session  # noqa: PLC0415
 
-    check_session(session, quick=quick, allow_code=allow_code)
+    check_session(session, quick=quick, sources=tuple(source or ()), allow_code=allow_code)
 
 
 @app.command()
@@ -287,7 +289,7 @@ def evaluate(
 def convert(
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout.")
+        Path | None, typer.Option("-o", "--output", help="Write here, not to stdout (-).")
     ] = None,
     format: Annotated[
         ConvertFormat | None,
@@ -329,9 +331,10 @@ def convert(
 ) -> None:
     """Write poses in the format of another program."""
     from mixpose.cli.convert import ConvertRequest, convert_poses  # noqa: PLC0415
+    from mixpose.cli.request import output_of  # noqa: PLC0415
 
     request = ConvertRequest(
-        output=output,
+        output=output_of(output),
         format=None if format is None else format.value,
         unit=unit,
         object=object,

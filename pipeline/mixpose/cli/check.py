@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,6 +34,7 @@ from mixpose.checking import (
     typical_poses,
     with_image_sizes,
 )
+from mixpose.cli.run import named_sources
 from mixpose.errors import RecordingError
 from mixpose.fit import free_mask
 from mixpose.frames import ALL_NUMBERS, Source
@@ -74,7 +75,9 @@ class _Report:
         self.lines, self.warnings = [], []
 
 
-def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) -> None:
+def check_session(
+    path: Path, *, quick: bool = False, sources: Sequence[str] = (), allow_code: bool = False
+) -> None:
     """Print sensors, recordings, the object's symmetries and the expected accuracy.
 
     Parameters
@@ -82,6 +85,8 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
     path : Path
     quick : bool
         Look at a few frames only instead of all.
+    sources : sequence of str
+        Recordings in place of the session's, as ``left=frames/``.
     allow_code : bool
         Whether functions that the session names may be run.
 
@@ -94,22 +99,21 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
         printed, if a frame is damaged.
     """
     session = load_session(path, allow_code=allow_code)
-    sources = open_sources(session, {})
-    for source in sources.values():
+    replaced = named_sources(sources)
+    opened = open_sources(session, replaced)
+    for source in opened.values():
         source.check_times(ALL_NUMBERS)
     report = _Report()
     report.say("session", f"{session.path}, lengths in {session.unit}")
     for one in session.objects:
         _say_object(report, session, one)
     surveys: dict[str, Survey] = {}
-    with _progress(sources, quick=quick) as done:
+    with _progress(opened, quick=quick) as done:
         for setup in session.sensors:
-            surveys[setup.name] = survey(
-                session, setup, sources[setup.name], quick=quick, done=done
-            )
+            surveys[setup.name] = survey(session, setup, opened[setup.name], quick=quick, done=done)
     for setup in session.sensors:
-        _say_sensor(report, session, setup, sources[setup.name], surveys)
-    report.warnings += shared_source_warnings(session, {}) + _pairing_warnings(sources)
+        _say_sensor(report, session, setup, opened[setup.name], surveys)
+    report.warnings += shared_source_warnings(session, replaced) + _pairing_warnings(opened)
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     report.warnings += key_warnings(sized) + placement_warnings(sized)
     for one in session.objects:
@@ -117,7 +121,7 @@ def check_session(path: Path, *, quick: bool = False, allow_code: bool = False) 
         _say_accuracy(report, sized.alone(one.body.name))
     report.of = ""
     report.warnings += shared_part_warnings(sized)
-    doubts = geometry_doubts(session, sources, surveys)
+    doubts = geometry_doubts(session, opened, surveys)
     report.warnings += doubts.warnings
     if not doubts.explains:
         report.warnings = told_apart(report.of_counts) + report.warnings

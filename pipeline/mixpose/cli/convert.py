@@ -168,10 +168,15 @@ def _format(request: ConvertRequest) -> str:
     name = "" if request.output is None else request.output.name.casefold()
     found_by_suffix = next((each for end, each in _BY_SUFFIX.items() if name.endswith(end)), None)
     if found_by_suffix is None:
-        found = "no -o" if request.output is None else f"-o {request.output}"
+        suffixes = ", ".join(_BY_SUFFIX)
+        if request.output is None:
+            raise SessionError(
+                "--format: missing, where there is no -o whose suffix tells the format; add "
+                f"--format csv, or -o with a name that ends in {suffixes}"
+            )
         raise SessionError(
-            f"--format: found none, and {found} does not tell; name the format, or a file that "
-            f"ends in {', '.join(_BY_SUFFIX)}"
+            f"-o {request.output}: no format has this suffix; add --format, or choose a name that "
+            f"ends in {suffixes}"
         )
     return found_by_suffix
 

@@ -300,9 +300,6 @@ def _about(called: str, marker: _Marker, typical: float, unit: str) -> list[str]
             f"{called} is met in none of {marker.expected} frames where it should be seen: gone, "
             "or measured wrong?"
         ]
-    gone = marker.missed_since
-    if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
-        return [f"{called} is not met from frame {marker.since} on, in {gone} frames: gone?"]
     systematic = marker.systematic()
     own = max(marker.squares / marker.views - systematic, 1e-12)
     sure = systematic * marker.views / own > _SURE
@@ -312,6 +309,10 @@ def _about(called: str, marker: _Marker, typical: float, unit: str) -> list[str]
             f"{called} is met {off:.2g} {unit} off in {marker.met} of {marker.expected} frames: "
             "measured wrong?"
         ]
+    # one that is measured wrong is missed, too, wherever it is too far off
+    gone = marker.missed_since
+    if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
+        return [f"{called} is not met from frame {marker.since} on, in {gone} frames: gone?"]
     return []
 
 

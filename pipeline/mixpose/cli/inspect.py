@@ -85,7 +85,7 @@ def inspect_frame(
     for prefix, body, findings, estimate in each:
         made = inspection_pictures(shown, body, findings, estimate) if drawn else {}
         pictures |= {prefix + name: picture for name, picture in made.items()}
-        lines += _summary(session, body, estimate, findings, poses)
+        lines += summary(session, body, estimate, findings, poses)
         lines += _of_clouds(session, frame_set, body, estimate)
     try:
         folder.mkdir(exist_ok=True)
@@ -167,13 +167,14 @@ def _of_clouds(
         )
 
 
-def _summary(
+def summary(
     session: Session,
     body: Body,
     estimate: Estimate,
     findings: Sequence[Finding],
     poses: Path | None,
 ) -> list[str]:
+    """What is said of a frame beside its pictures: where its pose is from, and what to change."""
     origin = "estimated on its own" if poses is None else f"pose of {poses}"
     whose = f"{estimate.label} " if len(session.labels) > 1 else ""
     head = f"{session.path}, frame {estimate.frame}: {whose}{estimate.status} ({origin})"
@@ -186,5 +187,6 @@ def _summary(
     for finding in findings:
         lines += describe(finding, body, session.unit)
     if estimate.status == "lost":
-        lines.append("lost: once the counts are right, give [start], or check T_sensor_world")
+        stand = ", or check T_sensor_world" if len(session.sensors) > 1 else ""
+        lines.append(f"lost: once the counts are right, give [start]{stand}")
     return lines

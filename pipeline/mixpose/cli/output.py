@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TextIO, cast
 
 from mixpose.cli.lines import LineFile
+from mixpose.cli.notices import warn
 from mixpose.errors import SessionError
 from mixpose.poses.formats import FORMATS, ONE_TRAJECTORY, PoseWriter
 from mixpose.poses.header import Header
@@ -78,6 +79,11 @@ class Output:
 
     def write(self, estimate: Estimate) -> None:
         """Write one frame, at once."""
+        if self._writer is None and self._format == "tum" and estimate.time_s is None:
+            warn(
+                f"{self._called or 'standard output'}: poses have no times, so that frame numbers "
+                "stand for seconds; fps or times in [[sensor]] gives them times"
+            )
         writer = self._writer or self._open()
         writer.write(estimate)
 

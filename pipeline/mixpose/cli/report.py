@@ -13,6 +13,8 @@ from mixpose.report.origin import find_session
 from mixpose.report.page import MARK, render
 from mixpose.whole_files import appearing_whole
 
+_PAGES = (".html", ".htm")
+
 
 def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> None:
     """Write the report of a run to a page of its own.
@@ -24,6 +26,11 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
     RecordingError
         If the poses or the truth cannot be read or compared.
     """
+    if output.suffix and output.suffix.casefold() not in _PAGES:
+        raise SessionError(
+            f"-o {output}: found the suffix {output.suffix}; a report is a page for a browser: "
+            f"name it {output.with_suffix('.html').name}, and print that for a PDF"
+        )
     poses, cut = read_unfinished_poses(poses_path)
     truth = None if truth_path is None else read_poses(truth_path)
     inputs = (poses_path, truth_path, find_session(poses).path)

@@ -68,6 +68,11 @@ class RunRequest:
         return seconds
 
 
+def output_of(named: Path | None) -> Path | None:
+    """Where ``-o`` says that poses go; None, standard output, also where it says ``-``."""
+    return None if named == Path("-") else named
+
+
 def format_of(output: Path | None, named: str | None) -> str:
     """The format of poses: the one that is named, else that of the file's suffix.
 

@@ -229,7 +229,7 @@ def header_of(session: Session, sources: Mapping[str, str] | None = None) -> Hea
 
 
 def named_sources(named: Iterable[str]) -> dict[str, str]:
-    """Recordings by sensor name, from texts like ``left=frames/``.
+    """Recordings by sensor name, from texts like ``left=frames/``; ``left=0`` is camera 0.
 
     Raises
     ------
@@ -241,7 +241,9 @@ def named_sources(named: Iterable[str]) -> dict[str, str]:
         name, separator, path = text.partition("=")
         if not separator or not name or not path:
             raise SessionError(f"--source {text}: found no NAME=PATH, as in --source left=frames/")
-        sources[name] = path
+        # as in a session file, where it is no text; of two meanings a file that is there is meant
+        is_camera = path.isdecimal() and not Path(path).exists()
+        sources[name] = f"camera:{path}" if is_camera else path
     return sources
 
 

@@ -131,11 +131,16 @@ def _tag_problem(place: _Place, value: Any) -> BadKeyError:
     return BadKeyError(f"missing; allowed: {one_of(models)}", *place.key, _TAG)
 
 
+_SENSORS = ("camera", "cameras")  # as other programs call their tables of sensors
+
+
 def _unknown_key(root: type[BaseModel], place: _Place) -> str:
     """Suggest the nearest key of the same table, else say where the key is at home."""
     key, known = str(place.key[-1]), list(place.table.model_fields)
     homes = _homes(root, key)
     # a key that is right elsewhere is more likely misplaced than misspelt
+    if len(place.key) == 1 and key.casefold() in _SENSORS:
+        return "unknown key; did you mean [[sensor]]? Each camera is one of these"
     close = nearest(key, known, cutoff=0.8) if homes else nearest(key, known)
     if close:
         return f'unknown key; did you mean "{close}"{_if_inverse(key, close)}?'
