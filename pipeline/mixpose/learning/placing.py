@@ -175,3 +175,19 @@ def weighted_motion(source: Floats, target: Floats, reach: Floats) -> Floats:
     turn, _ = Rotation.align_vectors(target - b, source - a, weights=weight)
     R = turn.as_matrix()
     return from_parts(R, b - R @ a)
+
+
+def apart(points: Floats, far: float) -> Indices:
+    """Which of the poses that put a shape to points (K, N, 3) are new (K,): numbers from 0.
+
+    Poses in which no point of the shape is farther away than `far` from where an earlier pose has
+    it have the number of that.
+    """
+    number = np.full(len(points), -1, dtype=np.intp)
+    count = 0
+    for k in range(len(points)):
+        if number[k] < 0:
+            away = np.abs(points - points[k]).max(axis=(1, 2), initial=0.0)
+            number[(number < 0) & (away <= far)] = count
+            count += 1
+    return number

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,10 @@ class Cloud:
             self.detections[chosen],
             self.seen,
         )
+
+    def loosened(self, times: float) -> Cloud:
+        """The cloud with points that are known less well."""
+        return replace(self, reach=times * self.reach)
 
     def without(self, detections: Indices) -> Cloud:
         """What is left where detections (n, L) are taken by something else."""

@@ -25,7 +25,18 @@ class LearningRules:
     )
     triples: int = constant(120, "of a reference frame that are tried")
     compared: int = constant(24, "frames in which each of them is looked for")
-    least_frames: int = constant(5, "in which a marker, or a body, must be seen")
+    far_triples: int = constant(120, "likewise, of points anywhere: some bodies are wide")
+    apart: float = constant(
+        6.0, "gates by which a body must be elsewhere for a frame to tell anything new of it"
+    )
+    looser: tuple[float, ...] = constant(
+        (1.0, 4.0, 12.0),
+        "times the error of triangulation that points of a body may be off, as on skin and cloth",
+    )
+    worth: float = constant(1.15, "times as many frames as a tighter body a looser one must be in")
+    least_frames: int = constant(
+        5, "in which a marker, or a body, must be seen, at poses apart from each other"
+    )
     least_share: float = constant(
         0.1, "of the frames of a body in which a marker must be seen: ghosts are in 0.03 and less"
     )

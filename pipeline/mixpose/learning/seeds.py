@@ -71,7 +71,7 @@ def _spread(count: int, most: int) -> Indices:
 def _near_triples(
     cloud: Cloud, rules: LearningRules, rng: np.random.Generator
 ) -> list[tuple[int, int, int]]:
-    """Triples of a point and two of its neighbours, not on a line."""
+    """Triples that are not on a line: of a point and two of its neighbours, and of any."""
     reach = min(rules.neighbours + 1, len(cloud))
     _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
     found = set[tuple[int, int, int]]()
@@ -81,6 +81,10 @@ def _near_triples(
     drawn = sorted(found)
     if len(drawn) > rules.triples:
         drawn = [drawn[k] for k in rng.choice(len(drawn), rules.triples, replace=False)]
+    for _ in range(rules.far_triples if len(cloud) > reach else 0):
+        a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
+        if (a, b, c) not in found and wide_triples(cloud.points[[a, b, c]], cloud.reach[[a, b, c]], 1):
+            drawn.append((a, b, c))
     return drawn
 
 
@@ -89,9 +93,15 @@ def _seed(
 ) -> Seed | None:
     base = list(triple)
     goes_along, matched, score = np.zeros(len(reference)), 0, 0
+    seen = [reference.points[base]]
+    far = rules.apart * rules.gate * reference.reach[base].max()
     for other in others:
-        met = _goes_along(reference, base, other, rules)
-        if met is not None:
+        there = _goes_along(reference, base, other, rules)
+        if there is None:
+            continue
+        met, places = there
+        if min(np.abs(places - each).max() for each in seen) > far:
+            seen.append(places)
             matched += 1
             score += int(met.sum()) - FEWEST + 1
             goes_along += met
@@ -105,8 +115,8 @@ def _seed(
 
 def _goes_along(
     reference: Cloud, base: list[int], other: Cloud, rules: LearningRules
-) -> Mask | None:
-    """Points (P,) of a cloud that lie in another one as they do about a triple of them."""
+) -> tuple[Mask, Floats] | None:
+    """Points (P,) of a cloud that lie in another as they do about a triple, and where this is."""
     points = reference.points[base]
     typical = np.hypot(np.median(other.reach), reference.reach[base].max())
     triples = congruent_triples(points, other.points, rules.gate * np.sqrt(2.0) * typical)
@@ -119,9 +129,5 @@ def _goes_along(
     met &= (share[:, base] < 1).all(axis=1)[:, None]
     counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
     best = int(np.argmax(counts))
-    return np.asarray(met[best]) if met[best].any() else None
+    return (met[best], other.points[triples[best]]) if met[best].any() else None
 
-
-def turned(shape: Shape, T: Floats) -> Shape:
-    """The shape in another frame."""
-    return Shape(transform(T, shape.points), shape.reach)

@@ -23,7 +23,7 @@ def gathered_places(
     reach : (n,) array
         How far off a point may be, standard deviations times the gate.
     frame : (n,) array
-        That a point is of.
+        That a point is of; of frames that tell the same, one number.
     least : float
         Frames below which a place is none.
     rules : LearningRules
