@@ -58,7 +58,9 @@ def camera(azimuth_deg: float, distance: float = 1000.0, height: float = 250.0) 
     return T
 
 
-def body(markers: int, rng: np.random.Generator, radius: float = 60.0, apart: float = 18.0) -> Array:
+def body(
+    markers: int, rng: np.random.Generator, radius: float = 60.0, apart: float = 18.0
+) -> Array:
     """Markers (N, 3) at random, none near another."""
     points = np.zeros((0, 3))
     while len(points) < markers:
@@ -111,7 +113,9 @@ def detections(
     return frames
 
 
-def write_recording(folder: Path, frames: Sequence[Sequence[Array]], cameras: Sequence[Array]) -> Path:
+def write_recording(
+    folder: Path, frames: Sequence[Sequence[Array]], cameras: Sequence[Array]
+) -> Path:
     """Write tables of detections and a session that names a body which is not there yet."""
     lines = ['unit = "mm"', "[object]", 'name = "tool"', 'file = "body.csv"', "[extract]"]
     lines += ["sigma = 1.0"]
@@ -137,7 +141,7 @@ def aligned_errors(found: Array, true: Array) -> Array:
 
     Partners are those whose distances to all others are most alike.
     """
-    from itertools import permutations  # noqa: PLC0415 - small bodies only
+    from itertools import permutations
 
     if len(found) != len(true):
         raise AssertionError(f"found {len(found)} markers of {len(true)}")

@@ -9,6 +9,7 @@ import typer
 
 from mixpose.cli.app_calibrate import calibrate
 from mixpose.cli.app_design import design
+from mixpose.cli.app_learn import learn
 from mixpose.cli.app_simulate import simulate
 from mixpose.cli.words import (
     AllowCode,
@@ -294,3 +295,4 @@ def report(
 
 app.command()(calibrate)
 app.command()(design)
+app.command()(learn)

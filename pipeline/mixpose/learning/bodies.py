@@ -84,7 +84,7 @@ def _is_chance(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> bo
     expected = float(np.mean(counts))
     # the best of very many shapes recurs more often than one of them
     most = rules.by_chance * (expected + np.sqrt(expected))
-    return len(body.places) < 2 * rules.least_frames + most
+    return bool(len(body.places) < 2 * rules.least_frames + most)
 
 
 def _with_copies(body: Found, clouds: Sequence[Cloud], rules: LearningRules) -> Found:

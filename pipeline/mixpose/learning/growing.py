@@ -23,7 +23,7 @@ from mixpose.learning.placing import (
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.learning.still import gathered_places
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import inverse, transform
 
 Places: TypeAlias = Sequence[tuple[int, Placement]]
@@ -117,7 +117,7 @@ def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found 
         shape = with_hidden(shape, places, clouds, rules)
         if len(shape) == before and turn:
             break
-    if not wide_triples(shape.points, shape.reach, 1):
+    if not len(wide_triples(shape.points, shape.reach, 1)):
         return None
     places = placed(shape, clouds, rules)
     found = Found(shape, tuple(places), poses_apart(shape, places, clouds, rules))
@@ -151,8 +151,21 @@ def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: Learn
         reach[own] += clouds[k].reach[there]
         seen[own, n] = True
     kept = seen.sum(axis=1) >= max(rules.least_frames, rules.least_share * seen.shape[1])
+    near = rules.alike * rules.gate * reach / np.maximum(counts, 1)
+    kept &= _only_once(shape.points, counts, near)
     middle = total[kept] / weight[kept, None]
     return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept]))
+
+
+def _only_once(points: Floats, counts: Floats, near: Floats) -> Mask:
+    """Which points (N,) are not beside one that is seen more often: that is the same one."""
+    kept = np.ones(len(points), dtype=np.bool_)
+    for k in np.argsort(-counts, kind="stable"):
+        if kept[k]:
+            beside = np.linalg.norm(points - points[k], axis=1) < near[k]
+            kept[beside] = False
+            kept[k] = True
+    return kept
 
 
 def _reach_of(reach: Floats, counts: Floats) -> Floats:

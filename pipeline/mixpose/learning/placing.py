@@ -16,6 +16,7 @@ from mixpose.records import Floats, Indices
 from mixpose.rigid import from_parts, transform
 
 FEWEST = 3
+_HEIGHT = 4.0  # deviations of a point above the longest side: less fixes no turn
 _REFINED = 3  # fits to all that is met, of which later ones reach farther from the first three
 
 
@@ -64,28 +65,34 @@ class Placement:
         return int((self.met >= 0).sum())
 
 
-def wide_triples(points: Floats, reach: Floats, most: int) -> list[tuple[int, int, int]]:
-    """Triples of points (N, 3) that fix a turn best, together with all of the points."""
-    found = []
-    for triple in combinations(range(len(points)), FEWEST):
-        a, b, c = points[list(triple)]
-        sides = [np.linalg.norm(b - a), np.linalg.norm(c - a), np.linalg.norm(c - b)]
-        height = float(np.linalg.norm(np.cross(b - a, c - a))) / max(*sides, 1e-300)
-        if height > 4 * reach[list(triple)].max():
-            found.append((height, triple))
-    found.sort(key=lambda each: -each[0])
-    kept, used = list[tuple[int, int, int]](), np.zeros(len(points))
-    while found and len(kept) < most:  # points that stand in few triples so far go first
-        k = min(range(len(found)), key=lambda n: (used[list(found[n][1])].sum(), n))
-        _, triple = found.pop(k)
-        used[list(triple)] += 1
-        kept.append(triple)
-    return kept
+def triples_of(points: Floats, reach: Floats) -> Indices:
+    """Triples (K, 3) of points (N, 3) that are not on a line, the largest heights first."""
+    triples = np.array(list(combinations(range(len(points)), FEWEST)), dtype=np.intp)
+    if not len(triples):
+        return np.zeros((0, FEWEST), dtype=np.intp)
+    a, b, c = np.moveaxis(points[triples], 1, 0)
+    longest = np.linalg.norm(np.array([b - a, c - a, c - b]), axis=2).max(axis=0)
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-300)
+    order = np.argsort(-height, kind="stable")
+    return np.asarray(triples[order][(height > _HEIGHT * reach[triples].max(axis=1))[order]])
+
+
+def wide_triples(points: Floats, reach: Floats, most: int) -> Indices:
+    """Some of these triples (K, 3), in which all points stand about equally often."""
+    triples = triples_of(points, reach)
+    kept, used = list[int](), np.zeros(len(points))
+    left = np.ones(len(triples), dtype=np.bool_)
+    while left.any() and len(kept) < most:
+        k = int(np.argmin(np.where(left, used[triples].sum(axis=1), np.inf)))
+        used[triples[k]] += 1
+        left[k] = False
+        kept.append(k)
+    return np.asarray(triples[kept])
 
 
 def placements(
     shape: Shape,
-    bases: list[tuple[int, int, int]],
+    bases: Indices,
     cloud: Cloud,
     rules: LearningRules,
     most: int,
@@ -96,7 +103,7 @@ def placements(
     Parameters
     ----------
     shape : Shape
-    bases : list of (int, int, int)
+    bases : (B, 3) int
         Triples of it that are looked for.
     cloud : Cloud
     rules : LearningRules
@@ -105,15 +112,15 @@ def placements(
     least : int
         Points that must be met.
     """
-    if len(cloud) < least or not bases:
+    if len(cloud) < least or not len(bases):
         return []
     typical = np.hypot(np.median(cloud.reach), np.median(shape.reach))
     candidates = []
     for base in bases:
         triples = congruent_triples(
-            shape.points[list(base)], cloud.points, rules.gate * np.sqrt(2.0) * typical
+            shape.points[base], cloud.points, rules.gate * np.sqrt(2.0) * typical
         )
-        candidates.append(motions(shape.points[list(base)], cloud.points[triples]))
+        candidates.append(motions(shape.points[base], cloud.points[triples]))
     poses = np.concatenate(candidates)
     if not len(poses):
         return []

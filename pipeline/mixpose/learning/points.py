@@ -107,8 +107,8 @@ def _seen(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[
         found = sensors[sensor].rays(points) if len(points) else None
         if found is not None and len(found):
             rays[sensor] = found
-    points = {sensor: found.pixels for sensor, found in rays.items()}
-    return SeenFrame(frame.number, frame.time_s, points, frame.times), rays
+    pixels = {sensor: found.pixels for sensor, found in rays.items()}
+    return SeenFrame(frame.number, frame.time_s, pixels, frame.times), rays
 
 
 def _meetings(
@@ -119,7 +119,7 @@ def _meetings(
     index = np.array(sorted(rays), dtype=np.intp)
     if len(lines) < 2:
         return np.zeros((0, 3)), np.zeros((0, len(gates)), dtype=np.intp), np.zeros(0)
-    met = triangulate(lines, gates[index], rules.min_sine)
+    met = triangulate(lines, gates[index].tolist(), rules.min_sine)
     detections = np.full((len(met.points), len(gates)), -1, dtype=np.intp)
     rows = np.arange(len(met.points))
     for side in (0, 1):
@@ -163,7 +163,7 @@ def _cloud(
         points = points[(detections >= 0).any(axis=1)]
         detections = detections[(detections >= 0).any(axis=1)]
     points, reach = _refined(points, detections, frame, sensors, noise)
-    fine = np.isfinite(points).all(axis=1) & np.isfinite(reach)
+    fine = np.isfinite(np.column_stack([points, reach])).all(axis=1)
     return Cloud(frame.number, points[fine], reach[fine], detections[fine], frame)
 
 
@@ -222,7 +222,7 @@ def _refined(
             r = np.where(visible[:, None], pixels[detections[seen, sensor]] - y, 0.0)
             information[seen] += np.swapaxes(J, 1, 2) @ J
             pull[seen] += np.einsum("nmk,nm->nk", J, r / noise[sensor])
-        fixed = _is_fixed(information)
+        fixed = _are_fixed(information)
         information[~fixed] = np.nan
         step = np.full(points.shape, np.nan)
         step[fixed] = np.linalg.solve(information[fixed], pull[fixed][..., None])[..., 0]
@@ -233,7 +233,7 @@ def _refined(
     return points, reach
 
 
-def _is_fixed(information: Floats) -> Mask:
+def _are_fixed(information: Floats) -> Mask:
     """Whether a point (P,) is known in all directions."""
     finite = np.isfinite(information).all(axis=(1, 2))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))

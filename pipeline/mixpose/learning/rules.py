@@ -19,7 +19,7 @@ class LearningRules:
     still_share: float = constant(
         0.5, "of the frames in which something is at one place of the world: it does not move"
     )
-    references: int = constant(6, "frames whose points shapes are taken from, each time one is left")
+    references: int = constant(6, "frames whose points shapes are taken from")
     neighbours: int = constant(
         7, "of a point, of which two make a triple with it: bodies are compact, clutter is not"
     )
@@ -40,6 +40,9 @@ class LearningRules:
     least_share: float = constant(
         0.1, "of the frames of a body in which a marker must be seen: ghosts are in 0.03 and less"
     )
+    alike: float = constant(
+        2.0, "gates within which two markers are one: of cameras out of step they are 1.5 off"
+    )
     gathered: float = constant(
         0.6, "of points within three gates of a marker's place that must be within one"
     )
@@ -52,7 +55,7 @@ class LearningRules:
     adjusted: int = constant(
         240, "frames that are adjusted together, those that add most information; as in calibrate"
     )
-    most_frames: int = constant(3000, "read: each is a cloud of points that is kept")
+    most_frames: int = constant(400, "read: a longer recording is thinned out evenly")
     most_bodies: int = constant(60, "different ones that are looked for")
     turned_deg: float = constant(
         15.0, "a body that turned less may be one with whatever else moved along"

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mixpose.body.symmetry import congruent_triples, motions
-from mixpose.learning.placing import FEWEST, Shape, wide_triples
+from mixpose.learning.placing import FEWEST, Shape, triples_of
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
 from mixpose.records import Floats, Indices, Mask
@@ -36,9 +36,7 @@ class Seed:
     frames: int
 
 
-def seeds(
-    clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator
-) -> list[Seed]:
+def seeds(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> list[Seed]:
     """Shapes that recur, the most promising first.
 
     Parameters
@@ -76,14 +74,15 @@ def _near_triples(
     _, near = cKDTree(cloud.points).query(cloud.points, k=reach)
     found = set[tuple[int, int, int]]()
     for row in near:
-        own = wide_triples(cloud.points[row], cloud.reach[row], reach * reach)
-        found |= {(int(a), int(b), int(c)) for a, b, c in (sorted(row[list(t)]) for t in own)}
+        own = np.sort(row[triples_of(cloud.points[row], cloud.reach[row])], axis=1)
+        found |= {(a, b, c) for a, b, c in own.tolist()}
     drawn = sorted(found)
     if len(drawn) > rules.triples:
         drawn = [drawn[k] for k in rng.choice(len(drawn), rules.triples, replace=False)]
     for _ in range(rules.far_triples if len(cloud) > reach else 0):
         a, b, c = np.sort(rng.choice(len(cloud), FEWEST, replace=False)).tolist()
-        if (a, b, c) not in found and wide_triples(cloud.points[[a, b, c]], cloud.reach[[a, b, c]], 1):
+        some = [a, b, c]
+        if (a, b, c) not in found and len(triples_of(cloud.points[some], cloud.reach[some])):
             drawn.append((a, b, c))
     return drawn
 
@@ -130,4 +129,3 @@ def _goes_along(
     counts = met.sum(axis=1) - np.minimum(share[:, base], 1).mean(axis=1)
     best = int(np.argmax(counts))
     return (met[best], other.points[triples[best]]) if met[best].any() else None
-
