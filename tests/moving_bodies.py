@@ -68,7 +68,7 @@ def body(
         if not len(points) or np.linalg.norm(points - new, axis=1).min() > apart:
             points = np.concatenate([points, new])
         if len(points) == 3 and np.linalg.svd(points - points.mean(axis=0))[1][1] < 15:
-            points = points[:2]  # three on a line fix no turn
+            points = points[:0]  # three on a line fix no turn
     return points
 
 

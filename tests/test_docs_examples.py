@@ -127,7 +127,8 @@ def test_the_examples_of_the_python_page_run_and_print_what_it_shows(
 
 
 @pytest.mark.parametrize(
-    ("page", "written"), [("importing", "poses.jsonl"), ("design", "design.png")]
+    ("page", "written"),
+    [("importing", "poses.jsonl"), ("design", "design.png"), ("learn", "poses.jsonl")],
 )
 def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(
     page: str,

@@ -129,7 +129,13 @@ def placements(
     allowed = rules.gate * np.hypot(cloud.reach[nearest], shape.reach)
     counts = (away < 2 * allowed).sum(axis=1) - 0.1 * np.minimum(away / allowed, 2).mean(axis=1)
     order = np.argsort(-counts, kind="stable")[: rules.placements * most]
-    refined = [_refined(shape, poses[k], cloud, tree, rules) for k in order]
+    refined = list[Placement]()
+    for k in order:
+        # most triples of a shape lead to the one place where it is; triangles fit in many ways
+        alone = most == 1 and len(shape) > FEWEST and refined
+        if alone and max(each.count for each in refined) >= counts[k]:
+            break
+        refined.append(_refined(shape, poses[k], cloud, tree, rules))
     good = [each for each in refined if each.count >= least]
     good.sort(key=lambda each: (-each.count, each.off))
     kept, taken = list[Placement](), set[int]()

@@ -235,6 +235,6 @@ def _refined(
 
 def _are_fixed(information: Floats) -> Mask:
     """Whether a point (P,) is known in all directions."""
-    finite = np.isfinite(information).all(axis=(1, 2))
+    finite: Mask = np.asarray(np.isfinite(information).all(axis=(1, 2)))
     values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))
     return np.asarray(values[:, 0] > 1e-12 * values[:, 2])
