@@ -116,6 +116,9 @@ def test_two_bodies_are_told_apart() -> None:
     assert [len(one.points) for one in lesson.bodies] == [5, 4]
     assert np.abs(aligned_errors(lesson.bodies[0].points, first[0])).max() < 0.1
     assert np.abs(aligned_errors(lesson.bodies[1].points, second[0])).max() < 0.1
+    # each of them in its own frames: a body takes no detections from the other
+    assert min(one.frames.min() for one in lesson.bodies) > 0.6 * SHORT.frames
+    assert [one.spread for one in lesson.bodies] == [0.0, 0.0]
 
 
 def test_two_congruent_bodies_are_one_of_which_there_are_two() -> None:
@@ -176,3 +179,16 @@ def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "holds something that mixpose did not write" in done.stderr
+
+
+def test_a_board_before_web_cams_is_learnt_from_tables_without_identities(
+    recordings: Path,
+) -> None:
+    (found,) = learn(load_scene(recordings / "webcams4_a" / "session_reference.toml")).bodies
+    grid = np.array([[x, y, 0.0] for x in range(3) for y in range(4)]) * 0.054
+    likeness = like(found, grid, [])
+    assert likeness is not None
+    assert likeness.shared == len(found.points) == 12
+    # cameras out of step by up to 20 ms, and a printed board
+    assert likeness.off < 1e-3
+    assert np.linalg.norm(likeness.learnt.points - grid, axis=1).max() < 1e-3

@@ -15,11 +15,11 @@ from mixpose.calibration.gauge import Freedom, gauge_rows
 from mixpose.calibration.interpolation import neighbours
 from mixpose.calibration.matching import clock_of
 from mixpose.calibration.rig import blocks_of
-from mixpose.learning.growing import Found
+from mixpose.learning.growing import Found, only_once
 from mixpose.learning.placing import FEWEST
 from mixpose.learning.points import Cloud
 from mixpose.learning.rules import LearningRules
-from mixpose.records import Floats, Indices
+from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import inverse, transform
 from mixpose.sensors import Sensor
 
@@ -116,12 +116,26 @@ def adjusted(
         while len(points) >= FEWEST:
             found = _adjusted(points, frames, poses, eyes)
             seen = _seen(found, len(points), len(frames))
-            least = max(rules.least_frames, rules.least_share * len(frames))
-            if (seen >= least).all():
+            kept = seen >= max(rules.least_frames, rules.least_share * len(frames))
+            kept &= _are_single(found.rig.points, seen, body, clouds, rules)
+            if kept.all():
                 learnt.append(_learnt(body, found, frames, seen, clouds, eyes))
                 break
-            points = points[seen >= least]
+            points = points[kept]
     return learnt
+
+
+def _are_single(
+    points: Floats,
+    seen: Indices,
+    body: Found,
+    clouds: Sequence[Cloud],
+    rules: LearningRules,
+) -> Mask:
+    """Which markers (N,) are not what another one is, once adjusted."""
+    reach = np.median([clouds[k].reach[one.met[one.met >= 0]].mean() for k, one in body.places])
+    near = np.full(len(points), rules.alike * rules.gate * float(reach))
+    return only_once(points, seen, near)
 
 
 def _frames_of(

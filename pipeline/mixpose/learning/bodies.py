@@ -33,6 +33,11 @@ def find_bodies(
     rules : LearningRules
     rng : Generator
     progress : callable
+
+    Returns
+    -------
+    list of Found
+        Which points they meet is told by `Cloud.rows`.
     """
     left, found = list(clouds), list[Found]()
     while len(found) < rules.most_bodies:
@@ -40,9 +45,18 @@ def find_bodies(
         body = _next(left, rules, rng)
         if body is None:
             break
-        found.append(body)
+        found.append(_of_all(body, left))
         left = _without(left, body, rules)
     return sorted(found, key=lambda each: -each.met)
+
+
+def _of_all(body: Found, clouds: Sequence[Cloud]) -> Found:
+    """The body with points numbered as they were before any were left out."""
+    places = tuple(
+        (k, replace(one, met=np.where(one.met >= 0, clouds[k].rows[one.met], -1)))
+        for k, one in body.places
+    )
+    return replace(body, places=places)
 
 
 def _next(clouds: Sequence[Cloud], rules: LearningRules, rng: np.random.Generator) -> Found | None:

@@ -152,12 +152,12 @@ def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: Learn
         seen[own, n] = True
     kept = seen.sum(axis=1) >= max(rules.least_frames, rules.least_share * seen.shape[1])
     near = rules.alike * rules.gate * reach / np.maximum(counts, 1)
-    kept &= _only_once(shape.points, counts, near)
+    kept &= only_once(shape.points, counts, near)
     middle = total[kept] / weight[kept, None]
     return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept]))
 
 
-def _only_once(points: Floats, counts: Floats, near: Floats) -> Mask:
+def only_once(points: Floats, counts: Floats | Indices, near: Floats) -> Mask:
     """Which points (N,) are not beside one that is seen more often: that is the same one."""
     kept = np.ones(len(points), dtype=np.bool_)
     for k in np.argsort(-counts, kind="stable"):

@@ -34,6 +34,8 @@ class Cloud:
         Standard deviation of a point along the axis in which it is known worst.
     detections : (P, L) int
         Of each sensor the detection that it is seen as, or -1.
+    rows : (P,) int
+        Which points these are of all that the frame shows.
     seen : SeenFrame
         All detections of the frame.
     """
@@ -42,6 +44,7 @@ class Cloud:
     points: Floats
     reach: Floats
     detections: Indices
+    rows: Indices
     seen: SeenFrame
 
     def __len__(self) -> int:
@@ -54,6 +57,7 @@ class Cloud:
             self.points[chosen],
             self.reach[chosen],
             self.detections[chosen],
+            self.rows[chosen],
             self.seen,
         )
 
@@ -164,7 +168,8 @@ def _cloud(
         detections = detections[(detections >= 0).any(axis=1)]
     points, reach = _refined(points, detections, frame, sensors, noise)
     fine = np.isfinite(np.column_stack([points, reach])).all(axis=1)
-    return Cloud(frame.number, points[fine], reach[fine], detections[fine], frame)
+    rows = np.arange(np.count_nonzero(fine))
+    return Cloud(frame.number, points[fine], reach[fine], detections[fine], rows, frame)
 
 
 def _supported(
