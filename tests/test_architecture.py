@@ -96,6 +96,7 @@ MAY_IMPORT["calibration"] = GROUND | {
     "session",
     "runner",
 }
+MAY_IMPORT["learning"] = GROUND | {"sensors", "body", "search", "calibration", "session"}
 EDGE = {"cli", "__init__", "__main__"}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import command, mixpose
 
-from mixpose.cli.calibrate import _watched
+from mixpose.cli.watching import watched
 from mixpose.rigid import from_rotation_vector, inverse, rotation_angle_deg
 from mixpose.session import load_session
 
@@ -98,7 +98,7 @@ def test_what_was_searched_before_does_not_count_in_the_time_to_expect(
 ) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    with _watched() as progress:
+    with watched() as progress:
         for done in range(41):
             now[0] += 1e-4 if done <= 20 else 1.5
             progress("searching in left", done, 40)

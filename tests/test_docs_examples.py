@@ -144,6 +144,7 @@ def test_the_page_about_markers_can_be_followed_from_a_checkout(
         ("clouds", "markers.trc"),
         ("smoothing", "smooth.jsonl"),
         ("tips-and-floors", "aligned.toml"),
+        ("learn", "poses.jsonl"),
     ],
 )
 def test_pages_that_need_no_data_can_be_followed_in_an_empty_folder(

@@ -9,6 +9,7 @@ import typer
 
 from mixpose.cli.app_calibrate import calibrate
 from mixpose.cli.app_design import design
+from mixpose.cli.app_learn import learn
 from mixpose.cli.app_simulate import simulate
 from mixpose.cli.app_trajectories import align, pivot, smooth
 from mixpose.cli.words import (
@@ -376,3 +377,4 @@ app.command()(design)
 app.command()(pivot)
 app.command()(align)
 app.command()(smooth)
+app.command()(learn)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -25,6 +24,7 @@ from mixpose.calibration.writing import MARK, calibrated_text
 from mixpose.cli.notices import say, warn
 from mixpose.cli.output import refuse_to_overwrite_but
 from mixpose.cli.run import named_sources
+from mixpose.cli.watching import watched
 from mixpose.cli.written import write_text
 from mixpose.errors import RecordingError, SessionError
 from mixpose.fit import free_mask
@@ -33,9 +33,6 @@ from mixpose.records import Floats
 from mixpose.report.calibration import MARK as REPORT_MARK
 from mixpose.report.calibration import render_calibration
 from mixpose.session import Session, load_session
-
-_TIMED = 4  # frames by which it is told how long the search takes
-_FOUND_BEFORE_S = 2e-3  # what takes less was found by a search that was cut off
 
 
 @dataclass(frozen=True)
@@ -110,7 +107,7 @@ def _calibrated(
     """Calibrate, for as long as what comes of it is written."""
     rules = CalibrationRules()
     with ExitStack() as kept:
-        with _watched() as progress:
+        with watched() as progress:
             task = task_of(session, request, rules, progress)
             say(f"free: {words_of(task.rig.names, task.free, task.body_free)}")
             saved = None
@@ -237,49 +234,6 @@ def _warn(found: Calibration, unit: str) -> None:
     if found.bad:
         numbers = ", ".join(map(str, found.bad[:8])) + (", ..." if len(found.bad) > 8 else "")
         warn(f"{len(found.bad)} frames left out, most of their features are not met: {numbers}")
-
-
-@contextmanager
-def _watched() -> Iterator[Progress]:
-    """Progress: a bar on a terminal; and how long the search will take, before it does."""
-    last: dict[str, float] = {}
-    took: dict[str, list[float]] = {}
-
-    def expect(stage: str, done: int, total: int) -> None:
-        if not stage.startswith("searching") or total <= 20:
-            return
-        now = time.perf_counter()
-        step, last[stage] = now - last.get(stage, now), now
-        steps = took.setdefault(stage, [])
-        if step < _FOUND_BEFORE_S or len(steps) == _TIMED:
-            return
-        steps.append(step)
-        if len(steps) == _TIMED:
-            left, each = total - done, sum(steps) / _TIMED
-            say(f"{left} frames of cameras left to search, about {_duration(each * left)}")
-
-    if not sys.stderr.isatty():
-        yield expect
-        return
-    from rich.console import Console  # noqa: PLC0415 - only where it is shown
-    from rich.progress import Progress as Bar  # noqa: PLC0415
-
-    with Bar(console=Console(stderr=True), transient=True) as bar:
-        tasks: dict[str, object] = {}
-
-        def show(stage: str, done: int, total: int) -> None:
-            expect(stage, done, total)
-            if stage not in tasks:
-                for other in tasks.values():
-                    bar.update(other, visible=False)  # type: ignore[arg-type]
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)  # type: ignore[arg-type]
-
-        yield show
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def parse_free(words: Sequence[str]) -> tuple[str, ...]:

@@ -1,6 +1,10 @@
 """Search: the first pose from nothing, over all orientations and positions."""
 
 from mixpose.search.copies import Copy as Copy, search_copies as search_copies
+from mixpose.search.from_points import (
+    TriangulatedPoints as TriangulatedPoints,
+    triangulate as triangulate,
+)
 from mixpose.search.poses import Descent as Descent, Stage as Stage, spread_turns as spread_turns
 from mixpose.search.problem import (
     LIVE as LIVE,

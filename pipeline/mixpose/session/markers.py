@@ -18,6 +18,9 @@ from mixpose.session.text_files import as_text, read_bytes
 _HEADER = ["name", "x", "y", "z"]
 _SIGMA_COLUMNS = (0, 1, 3, 9)
 
+LEARNT_COLUMNS = ("deviation_x", "deviation_y", "deviation_z", "frames")
+"""Columns of a table that `mixpose learn` wrote: how well markers are known, for people."""
+
 
 @dataclass(frozen=True)
 class Markers:
@@ -48,7 +51,8 @@ def read_markers(path: Path) -> Markers:
     ----------
     path : Path
         CSV with the header ``name,x,y,z``, followed by no column, one (σ), three (σ along x, y
-        and z) or nine (the covariance, row by row).
+        and z) or nine (the covariance, row by row).  The columns in which ``mixpose learn``
+        says how well markers are known may stand there, too.
 
     Raises
     ------
@@ -67,6 +71,7 @@ def read_markers(path: Path) -> Markers:
         header = [cell.strip() for cell in rows[0][1]]
         _check_header(header)
         values = np.array([_numbers_of(row, line, header) for line, row in rows[1:]])
+        values = values[:, : len(header) - 1 - _learnt(header)] if len(values) else values
     if not len(values):
         raise BadKeyError(f"{path.name}: found no markers below the header")
     names = tuple(row[0].strip() for _, row in rows[1:])
@@ -75,11 +80,16 @@ def read_markers(path: Path) -> Markers:
 
 def _check_header(header: list[str]) -> None:
     names = [name.lower() for name in header]
-    if names[:4] != _HEADER or len(names) - 4 not in _SIGMA_COLUMNS:
+    if names[:4] != _HEADER or len(names) - 4 - _learnt(header) not in _SIGMA_COLUMNS:
         raise BadKeyError(
             f"line 1: {found(','.join(header), 'name,x,y,z and then no, one, three or nine')} "
             "columns of sigma"
         )
+
+
+def _learnt(header: list[str]) -> int:
+    """How many columns at the end are those of a body that was learnt."""
+    return len(LEARNT_COLUMNS) if tuple(header[-len(LEARNT_COLUMNS) :]) == LEARNT_COLUMNS else 0
 
 
 def _numbers_of(row: list[str], line: int, header: list[str]) -> list[float]:

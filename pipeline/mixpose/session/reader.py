@@ -23,6 +23,27 @@ from mixpose.session.text_files import as_text, read_bytes
 from mixpose.session.toml_text import parse_toml
 from mixpose.session.validation import validate
 
+_STAND_IN = {"name": "body", "points": [[0, 0, 0], [1, 0, 0], [0, 1, 0]]}
+
+
+def load_scene(path: str | Path, *, allow_code: bool = False) -> Session:
+    """Read what a session file says of sensors and recordings, whatever it says of bodies.
+
+    Its body is a stand-in: `[object]` may be missing, or name a file that is still to be made.
+
+    Parameters
+    ----------
+    path : str or Path
+    allow_code : bool
+        As for `load_session`.
+
+    Raises
+    ------
+    SessionError
+        As `load_session`, but for `[object]`, `[start]` and `[estimator]`.
+    """
+    return _loaded(Path(path), allow_code=allow_code, bodies=False)
+
 
 def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
     """Read a session file and the calibration and marker files that it names.
@@ -48,11 +69,17 @@ def load_session(path: str | Path, *, allow_code: bool = False) -> Session:
         If a file is missing or anything in it is wrong: one line with the file, the key, what
         was found and what is allowed.
     """
-    path = Path(path)
+    return _loaded(Path(path), allow_code=allow_code, bodies=True)
+
+
+def _loaded(path: Path, *, allow_code: bool, bodies: bool) -> Session:
     data: dict[str, Any] = {}
     try:
         content = read_bytes(path)
         data = parse_toml(as_text(content))
+        if not bodies:
+            rest = {key: one for key, one in data.items() if key not in ("start", "estimator")}
+            data = {**rest, "object": _STAND_IN}
         session = _build(path, hashlib.sha256(content).hexdigest(), data)
         return replace(session, allow_code=allow_code)
     except BadKeyError as problem:

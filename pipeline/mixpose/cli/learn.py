@@ -1,0 +1,150 @@
+"""``mixpose learn``: tables of markers from a recording in which bodies move."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mixpose.cli.notices import say, warn
+from mixpose.cli.output import refuse_to_overwrite_but
+from mixpose.cli.run import named_sources
+from mixpose.cli.watching import watched
+from mixpose.errors import RecordingError, SessionError
+from mixpose.learning import LearningRules, Learnt, Lesson, by_markers, learn, like
+from mixpose.learning.telling import doubts_of, lines_of, look_alikes
+from mixpose.learning.writing import MARK, table_text
+from mixpose.session import Session, load_scene
+from mixpose.session.marker_files import read_marker_file
+from mixpose.session.markers import Markers
+from mixpose.session.messages import BadKeyError
+from mixpose.whole_files import appearing_whole
+
+
+@dataclass(frozen=True)
+class LearnRequest:
+    """What was asked for.
+
+    Attributes
+    ----------
+    output : Path
+    axes : str or None
+        ``ORIGIN,X,Y``: markers by name.
+    like : Path or None
+        An older table of the same markers.
+    sources : tuple of str
+        ``NAME=PATH``.
+    allow_code : bool
+    """
+
+    output: Path
+    axes: str | None = None
+    like: Path | None = None
+    sources: tuple[str, ...] = ()
+    allow_code: bool = False
+
+
+def learn_session(path: Path, request: LearnRequest) -> None:
+    """Learn the bodies of a recording and write a table of each.
+
+    Raises
+    ------
+    SessionError
+        If the session or an option is wrong, or the output would overwrite something else.
+    RecordingError
+        If the recording cannot be read, or no body is seen to move.
+    """
+    session = load_scene(path, allow_code=request.allow_code)
+    inputs = [path] if request.like is None else [path, request.like]
+    refuse_to_overwrite_but(request.output, inputs, MARK)
+    older = None if request.like is None else _older(request.like, session)
+    _warn_of_late(session)
+    rules = LearningRules()
+    with watched() as progress:
+        lesson = learn(session, named_sources(request.sources), rules, progress)
+    bodies = _in_frames(lesson, request, older)
+    files = [_file(request.output, k) for k in range(len(bodies))]
+    for file, body in zip(files, bodies, strict=True):
+        refuse_to_overwrite_but(file, inputs, MARK)
+        _write(file, table_text(body))
+    _tell(lesson, bodies, files, session, rules)
+
+
+def _older(path: Path, session: Session) -> Markers:
+    try:
+        return read_marker_file(path, session.unit)
+    except BadKeyError as problem:
+        raise SessionError(f"--like {path}: {problem.text}") from problem
+
+
+def _in_frames(lesson: Lesson, request: LearnRequest, older: Markers | None) -> list[Learnt]:
+    """Bodies in the frame that was asked for; the one that is like an older one first."""
+    bodies = list(lesson.bodies)
+    if older is not None:
+        found = [(like(each, older.points, older.names), k) for k, each in enumerate(bodies)]
+        alike = [(-one.shared, one.off, k, one) for one, k in found if one is not None]
+        if not alike:
+            raise RecordingError(
+                f"--like {request.like}: found bodies of "
+                f"{', '.join(str(len(each.points)) for each in bodies)} markers that move, none "
+                "of which has those of the table; see without --like what they are"
+            )
+        _, off, k, best = min(alike, key=lambda each: each[:3])
+        say(f"like {request.like}: {best.shared} markers in both, {off:.3g} off at most")
+        if best.others:
+            warn(
+                f"--like {request.like}: the markers can be laid on it in {best.others} other "
+                f"way{'s' * (best.others > 1)} with as many of them; the closest is taken"
+            )
+        bodies = [best.learnt, *(each for n, each in enumerate(bodies) if n != k)]
+    if request.axes is not None:
+        bodies[0] = by_markers(bodies[0], request.axes)
+    return bodies
+
+
+def _file(output: Path, index: int) -> Path:
+    return output if not index else output.with_name(f"{output.stem}-{index + 1}{output.suffix}")
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with appearing_whole(path) as part:
+            part.write_text(text, encoding="utf-8", newline="\n")
+    except OSError as error:
+        raise SessionError(f"-o {path}: cannot be written: {error.strerror}") from error
+
+
+def _tell(
+    lesson: Lesson,
+    bodies: Sequence[Learnt],
+    files: Sequence[Path],
+    session: Session,
+    rules: LearningRules,
+) -> None:
+    lines = list[str]()
+    for file, body in zip(files, bodies, strict=True):
+        lines += lines_of(body, file.name, session.unit)
+    if len(bodies) > 1 or bodies[0].count > 1:
+        lines.append("in the session:")
+        for file, body in zip(files, bodies, strict=True):
+            lines += ["", "[[object]]", f'name = "{file.stem}"', f'file = "{file.name}"']
+            lines += [f"count = {body.count}"] if body.count > 1 else []
+    sys.stdout.write("\n".join(lines) + "\n")
+    names = [file.name for file in files]
+    for body, name in zip(bodies, names, strict=True):
+        for doubt in doubts_of(body, name, session.unit, rules):
+            warn(doubt)
+    for doubt in look_alikes(bodies, names):
+        warn(doubt)
+    others = f"; {lesson.still} other points stood still" if lesson.still else ""
+    say(f"learnt from {lesson.frames} frames -> {', '.join(map(str, files))}{others}")
+
+
+def _warn_of_late(session: Session) -> None:
+    late = [one.name for one in session.sensors if one.delay or one.readout]
+    if late:
+        warn(
+            f"{', '.join(late)}: delay and readout are not looked at here; move slowly, or learn "
+            "and then let mixpose calibrate --free body adjust what was learnt"
+        )

@@ -1,0 +1,233 @@
+"""Markers of a body and its poses adjusted together, by what calibrates sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.calibration import CalibrationRules, Rig, SeenFrame
+from mixpose.calibration.adjust import Adjusted, adjust
+from mixpose.calibration.bundle import Bundle
+from mixpose.calibration.choice import informative
+from mixpose.calibration.gauge import Freedom, gauge_rows
+from mixpose.calibration.interpolation import neighbours
+from mixpose.calibration.matching import clock_of
+from mixpose.calibration.rig import blocks_of
+from mixpose.learning.growing import Found, only_once
+from mixpose.learning.placing import FEWEST
+from mixpose.learning.points import Cloud
+from mixpose.learning.rules import LearningRules
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import inverse, transform
+from mixpose.sensors import Sensor
+
+_MET = 0.2  # weight of a pair that counts as seen: within 2.5 deviations
+
+
+@dataclass(frozen=True, eq=False)
+class Eyes:
+    """The sensors of a recording.
+
+    Attributes
+    ----------
+    names : tuple of str
+    sensors : tuple of Sensor
+    sigmas : (L,) float64
+        σ_ε of each.
+    """
+
+    names: tuple[str, ...]
+    sensors: tuple[Sensor, ...]
+    sigmas: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A body as its recording shows it.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the markers.
+    points : (N, 3) float64
+    covariances : (N, 3, 3) float64
+        Of each marker, the body's frame being where its markers are on average.
+    frames : (N,) int
+        Frames in which two sensors or more saw it.
+    poses : (K, 4, 4) float64
+        T_world_object in the frames that were adjusted.
+    numbers : (K,) int
+        Of these frames; of congruent bodies each has its own pose.
+    count : int
+        Congruent bodies that were seen at a time.
+    residual : float
+        Deviation of detections, as a share of σ_ε.
+    spread : float
+        Standard deviation of markers about their places on the body, along an axis, beyond what
+        errors of detections explain; 0 of a rigid body.
+    """
+
+    names: tuple[str, ...]
+    points: Floats
+    covariances: Floats
+    frames: Indices
+    poses: Floats
+    numbers: Indices
+    count: int
+    residual: float
+    spread: float
+
+    @property
+    def deviations(self) -> Floats:
+        """Standard deviations (N, 3) of the coordinates.
+
+        Three markers are in one plane whatever they are, which is exact.
+        """
+        variances = np.diagonal(self.covariances, axis1=1, axis2=2)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+    def within(self, T_new_old: Floats, order: Indices | None = None) -> Learnt:
+        """The body in another frame, its markers in another order."""
+        R = T_new_old[:3, :3]
+        k = np.arange(len(self.points)) if order is None else order
+        return replace(
+            self,
+            names=tuple(self.names[n] for n in k.tolist()),
+            points=transform(T_new_old, self.points[k]),
+            covariances=R @ self.covariances[k] @ R.T,
+            frames=self.frames[k],
+            poses=self.poses @ inverse(T_new_old),
+        )
+
+
+def adjusted(
+    bodies: Sequence[Found], clouds: Sequence[Cloud], eyes: Eyes, rules: LearningRules
+) -> list[Learnt]:
+    """Adjust bodies one by one, each by the detections that belong to no other.
+
+    Markers of which too few frames are left are dropped; bodies with fewer than three, too.
+    """
+    learnt = []
+    for body in bodies:
+        frames, poses = _frames_of(body, bodies, clouds, eyes, rules)
+        points = body.shape.points
+        while len(points) >= FEWEST:
+            found = _adjusted(points, frames, poses, eyes)
+            seen = _seen(found, len(points), len(frames))
+            kept = seen >= max(rules.least_frames, rules.least_share * len(frames))
+            kept &= _are_single(found.rig.points, seen, body, clouds, rules)
+            if kept.all():
+                learnt.append(_learnt(body, found, frames, seen, clouds, eyes))
+                break
+            points = points[kept]
+    return learnt
+
+
+def _are_single(
+    points: Floats,
+    seen: Indices,
+    body: Found,
+    clouds: Sequence[Cloud],
+    rules: LearningRules,
+) -> Mask:
+    """Which markers (N,) are not what another one is, once adjusted."""
+    reach = np.median([clouds[k].reach[one.met[one.met >= 0]].mean() for k, one in body.places])
+    near = np.full(len(points), rules.alike * rules.gate * float(reach))
+    return only_once(points, seen, near)
+
+
+def _frames_of(
+    body: Found,
+    bodies: Sequence[Found],
+    clouds: Sequence[Cloud],
+    eyes: Eyes,
+    rules: LearningRules,
+) -> tuple[tuple[SeenFrame, ...], Floats]:
+    """What sensors saw of a body in the frames that tell most of it; and its poses there."""
+    taken: dict[int, list[tuple[object, Indices]]] = {}
+    for each in bodies:
+        for k, one in each.places:
+            own = clouds[k].detections[one.met[one.met >= 0]]
+            taken.setdefault(k, []).append((one, own))
+    frames, poses = list[SeenFrame](), dict[int, Floats]()
+    for k, one in body.places:
+        others = [own for owner, own in taken[k] if owner is not one]
+        frame = _left(clouds[k].seen, others)
+        frames.append(frame)
+        poses[id(frame)] = one.T_world_shape
+    chosen = informative(frames, len(eyes.sensors), rules.adjusted, runs=False)
+    return chosen, np.array([poses[id(frame)] for frame in chosen])
+
+
+def _left(seen: SeenFrame, others: Sequence[Indices]) -> SeenFrame:
+    """A frame without the detections (n, L) of other bodies, and out of time."""
+    points = {}
+    for sensor, pixels in seen.points.items():
+        left = np.ones(len(pixels), dtype=np.bool_)
+        for own in others:
+            left[own[own[:, sensor] >= 0, sensor]] = False
+        points[sensor] = pixels[left]
+    return SeenFrame(seen.number, None, points, {})
+
+
+def _adjusted(points: Floats, frames: tuple[SeenFrame, ...], poses: Floats, eyes: Eyes) -> Adjusted:
+    rules, sensors = CalibrationRules(), len(eyes.sensors)
+    none = np.zeros(sensors)
+    labels = tuple(str(k + 1) for k in range(len(points)))
+    rig = Rig(eyes.names, eyes.sensors, points, None, none, none, labels)
+    blocks = blocks_of(rig, {}, body=True, length=1.0, interval=1.0)
+    clock = clock_of(frames, neighbours([None] * len(frames), rules.gap), sensors)
+    free = np.ones(6, dtype=np.bool_)
+    bundle = Bundle(frames, clock, blocks, free, rules.undetermined)
+    gauge, _ = gauge_rows(rig, blocks, Freedom(free, poses))
+    return adjust(bundle, rig, poses, lambda _: gauge, eyes.sigmas, rules)
+
+
+def _seen(found: Adjusted, markers: int, frames: int) -> Indices:
+    """Frames (N,) in which two sensors or more met a marker."""
+    met = np.zeros((frames, markers), dtype=np.intp)
+    for pairs, _, weight in found.weighted:
+        good = pairs.nearest & (weight > _MET)
+        np.add.at(met, (pairs.frame[good], pairs.feature[good]), 1)
+    return np.asarray((met >= 2).sum(axis=0))
+
+
+def _learnt(
+    body: Found,
+    found: Adjusted,
+    frames: Sequence[SeenFrame],
+    seen: Indices,
+    clouds: Sequence[Cloud],
+    eyes: Eyes,
+) -> Learnt:
+    count = len(found.rig.points)
+    blocks = found.covariance.reshape(count, 3, count, 3)
+    residual = float(np.sqrt(np.mean((found.noise / eyes.sigmas) ** 2)))
+    return Learnt(
+        names=found.rig.labels,
+        points=found.rig.points,
+        covariances=np.array([blocks[k, :, k] for k in range(count)]),
+        frames=seen,
+        poses=found.poses,
+        numbers=np.array([frame.number for frame in frames]),
+        count=body.count,
+        residual=residual,
+        spread=_spread(body, clouds),
+    )
+
+
+def _spread(body: Found, clouds: Sequence[Cloud]) -> float:
+    """How far markers of a loose body are off along an axis, but for errors of triangulation."""
+    if body.loose <= 1:
+        return 0.0
+    squared, expected, count = 0.0, 0.0, 0
+    for k, one in body.places:
+        own = np.flatnonzero(one.met >= 0)
+        there = clouds[k].points[one.met[own]]
+        away = there - transform(one.T_world_shape, body.shape.points[own])
+        squared += float((away**2).sum())
+        expected += float((clouds[k].reach[one.met[own]] ** 2).sum())
+        count += 3 * len(own) - 6
+    return float(np.sqrt(max(squared - expected, 0.0) / max(count, 1)))

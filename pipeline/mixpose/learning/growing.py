@@ -1,0 +1,205 @@
+"""From a few points of one frame to a whole body: found in all frames, and all that goes along.
+
+Frames in which a body is where it was before tell nothing new of what belongs to it: whatever rests
+beside it would.  What counts are poses apart from each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from mixpose.learning.placing import (
+    FEWEST,
+    Placement,
+    Shape,
+    apart,
+    placements,
+    wide_triples,
+)
+from mixpose.learning.points import Cloud
+from mixpose.learning.rules import LearningRules
+from mixpose.learning.still import gathered_places
+from mixpose.records import Floats, Indices, Mask
+from mixpose.rigid import inverse, transform
+
+Places: TypeAlias = Sequence[tuple[int, Placement]]
+"""Placements with the index of the cloud that each is in."""
+
+_SURER = 0.15  # of a point's reach: errors that many frames have in common
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A body, and where it is in which frames.
+
+    Attributes
+    ----------
+    shape : Shape
+        In a frame of its own.
+    places : tuple of (int, Placement)
+        With the index of the cloud; of congruent bodies several of one.
+    apart : (K,) int
+        Numbers of the placements' poses, the same where the body is at the same place.
+    count : int
+        Congruent bodies that are seen at a time.
+    loose : float
+        Times the error of triangulation that its points may be off.
+    """
+
+    shape: Shape
+    places: tuple[tuple[int, Placement], ...]
+    apart: Indices
+    count: int = 1
+    loose: float = 1.0
+
+    @property
+    def met(self) -> int:
+        """Points that are met, all frames together."""
+        return sum(one.count for _, one in self.places)
+
+    @property
+    def different(self) -> int:
+        """Poses that are apart from each other."""
+        return int(self.apart.max(initial=-1)) + 1
+
+    @property
+    def poses(self) -> Floats:
+        """Poses (K, 4, 4) of all placements."""
+        return np.array([one.T_world_shape for _, one in self.places]).reshape(-1, 4, 4)
+
+
+def least_met(points: int) -> int:
+    """Points of a shape that must be met, so that no other points lie like them by chance."""
+    return FEWEST if points <= FEWEST + 1 else FEWEST + 1
+
+
+def placed(
+    shape: Shape,
+    clouds: Sequence[Cloud],
+    rules: LearningRules,
+    most: int = 1,
+    least: int | None = None,
+) -> list[tuple[int, Placement]]:
+    """Where a shape is in all clouds, at most so many times in each."""
+    bases = wide_triples(shape.points, shape.reach, rules.bases)
+    fewest = least_met(len(shape)) if least is None else least
+    return [
+        (k, one)
+        for k, cloud in enumerate(clouds)
+        for one in placements(shape, bases, cloud, rules, most, fewest)
+    ]
+
+
+def grown(shape: Shape, clouds: Sequence[Cloud], rules: LearningRules) -> Found | None:
+    """Find a shape in all frames, and in these all that goes along; None where it does not recur.
+
+    Parameters
+    ----------
+    shape : Shape
+        Three points or more.
+    clouds : sequence of Cloud
+    rules : LearningRules
+    """
+    for turn in range(rules.rounds):
+        places = placed(shape, clouds, rules)
+        if len(places) < rules.least_frames:
+            return None
+        shape = averaged(shape, places, clouds, rules)
+        if len(shape) < FEWEST:
+            return None
+        if turn + 1 == rules.rounds:
+            break
+        before = len(shape)
+        shape = with_hidden(shape, places, clouds, rules)
+        if len(shape) == before and turn:
+            break
+    if not len(wide_triples(shape.points, shape.reach, 1)):
+        return None
+    places = placed(shape, clouds, rules)
+    found = Found(shape, tuple(places), poses_apart(shape, places, clouds, rules))
+    return found if found.different >= rules.least_frames else None
+
+
+def poses_apart(
+    shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
+) -> Indices:
+    """Numbers (K,) of the poses of placements, the same where the body is at the same place."""
+    if not places:
+        return np.zeros(0, dtype=np.intp)
+    poses = np.array([one.T_world_shape for _, one in places])
+    reach = np.median([clouds[k].reach[one.met[one.met >= 0]].mean() for k, one in places])
+    return apart(transform(poses, shape.points), rules.apart * rules.gate * float(reach))
+
+
+def averaged(shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules) -> Shape:
+    """The shape as its frames show it on average, without points that few of them show."""
+    weight, total = np.zeros(len(shape)), np.zeros((len(shape), 3))
+    counts, reach = np.zeros(len(shape)), np.zeros(len(shape))
+    number = poses_apart(shape, places, clouds, rules)
+    seen = np.zeros((len(shape), int(number.max(initial=-1)) + 1), dtype=np.bool_)
+    for n, (k, one) in zip(number.tolist(), places, strict=True):
+        own = np.flatnonzero(one.met >= 0)
+        there = one.met[own]
+        w = 1 / clouds[k].reach[there] ** 2
+        total[own] += w[:, None] * transform(inverse(one.T_world_shape), clouds[k].points[there])
+        weight[own] += w
+        counts[own] += 1
+        reach[own] += clouds[k].reach[there]
+        seen[own, n] = True
+    kept = seen.sum(axis=1) >= max(rules.least_frames, rules.least_share * seen.shape[1])
+    near = rules.alike * rules.gate * reach / np.maximum(counts, 1)
+    kept &= only_once(shape.points, counts, near)
+    middle = total[kept] / weight[kept, None]
+    return Shape(middle, _reach_of(reach[kept] / counts[kept], counts[kept]))
+
+
+def only_once(points: Floats, counts: Floats | Indices, near: Floats) -> Mask:
+    """Which points (N,) are not beside one that is seen more often: that is the same one."""
+    kept = np.ones(len(points), dtype=np.bool_)
+    for k in np.argsort(-counts, kind="stable"):
+        if kept[k]:
+            beside = np.linalg.norm(points - points[k], axis=1) < near[k]
+            kept[beside] = False
+            kept[k] = True
+    return kept
+
+
+def _reach_of(reach: Floats, counts: Floats) -> Floats:
+    return np.asarray(reach * np.maximum(1 / np.sqrt(counts), _SURER))
+
+
+def with_hidden(
+    shape: Shape, places: Places, clouds: Sequence[Cloud], rules: LearningRules
+) -> Shape:
+    """The shape with points that are at one place of it at many poses."""
+    points, reach, frame = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, dtype=np.intp)]
+    number = poses_apart(shape, places, clouds, rules)
+    for n, (k, one) in zip(number.tolist(), places, strict=True):
+        free = clouds[k].without(clouds[k].detections[one.met[one.met >= 0]])
+        own = transform(inverse(one.T_world_shape), free.points)
+        points.append(own)
+        reach.append(rules.gate * free.reach * _lever(shape, own, one.count))
+        frame.append(np.full(len(own), n))
+    least = max(rules.least_frames, rules.least_share * (int(number.max(initial=-1)) + 1))
+    reaches = np.concatenate(reach)
+    more = gathered_places(np.concatenate(points), reaches, np.concatenate(frame), least, rules)
+    if not more:
+        return shape
+    added = np.array([np.median(reaches[there]) / rules.gate for _, there in more])
+    counts = np.array([len(there) for _, there in more], dtype=np.float64)
+    return Shape(
+        np.concatenate([shape.points, [place for place, _ in more]]),
+        np.concatenate([shape.reach, _reach_of(added, counts)]),
+    )
+
+
+def _lever(shape: Shape, points: Floats, met: int) -> Floats:
+    """By how much errors of a pose make points (n, 3) err more than by themselves."""
+    middle = shape.points.mean(axis=0)
+    radius = np.sqrt(((shape.points - middle) ** 2).sum(axis=1).mean())
+    away = np.linalg.norm(points - middle, axis=1) / radius
+    return np.asarray(np.sqrt(1 + (1 + away**2) / met))

@@ -1,0 +1,185 @@
+"""Bodies from a recording in which they move: what is called from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.calibration import CalibrationRules, SeenFrame
+from mixpose.calibration.recorded import read_frames
+from mixpose.calibration.task import Progress, silent
+from mixpose.errors import RecordingError, SessionError
+from mixpose.learning.adjusting import Eyes, Learnt, adjusted
+from mixpose.learning.axes import in_principal_axes
+from mixpose.learning.bodies import find_bodies
+from mixpose.learning.points import Cloud, clouds_of
+from mixpose.learning.rules import LearningRules
+from mixpose.learning.still import without_still
+from mixpose.records import Floats
+from mixpose.session import Session
+from mixpose.threads import one_blas_thread
+
+
+@dataclass(frozen=True, eq=False)
+class Lesson:
+    """What a recording told.
+
+    Attributes
+    ----------
+    bodies : tuple of Learnt
+        In their principal axes, those of which most was seen first.
+    still : int
+        Other things that were seen and stood still all the time.
+    frames : int
+        That were read.
+    noise : float
+        Deviation of detections as a share of σ_ε, by how closely lines of sight meet.
+    """
+
+    bodies: tuple[Learnt, ...]
+    still: int
+    frames: int
+    noise: float
+
+
+def eyes_of(session: Session) -> Eyes:
+    """The sensors of a session.
+
+    Raises
+    ------
+    SessionError
+        If fewer than two of them have lines of sight.
+    """
+    setups = session.sensors
+    seeing = [one.name for one in setups if one.sensor.dimension == 2]
+    if len(seeing) < 2:
+        raise SessionError(
+            f"{session.path}: learn: found {len(seeing)} camera{'s' * (len(seeing) != 1)}; "
+            "allowed: two or more that see the body at the same time. With one, put a rough guess "
+            "of the markers into [object] and let mixpose calibrate --free body adjust it"
+        )
+    return Eyes(
+        tuple(one.name for one in setups),
+        tuple(one.sensor for one in setups),
+        np.array([one.extract.sigma for one in setups]),
+    )
+
+
+def learn(
+    session: Session,
+    sources: dict[str, str] | None = None,
+    rules: LearningRules = LearningRules(),
+    progress: Progress = silent,
+) -> Lesson:
+    """Learn the bodies that move in a session's recording.
+
+    Parameters
+    ----------
+    session : Session
+        Its own bodies are not looked at.
+    sources : dict of str to str or None
+        Recordings in place of the session's, by sensor.
+    rules : LearningRules
+    progress : callable
+
+    Raises
+    ------
+    SessionError
+        If there are fewer than two cameras.
+    RecordingError
+        If the recording cannot be read, or shows no body that moves.
+    """
+    eyes = eyes_of(session)
+    read = replace(
+        CalibrationRules(), most_read=rules.most_frames, most_candidates=rules.most_frames
+    )
+    frames = read_frames(session, sources or {}, read, progress, runs=False, known=None)
+    return learn_from(frames, eyes, rules, progress, name=str(session.path))
+
+
+@one_blas_thread()
+def learn_from(
+    frames: Sequence[SeenFrame],
+    eyes: Eyes,
+    rules: LearningRules = LearningRules(),
+    progress: Progress = silent,
+    *,
+    name: str = "recording",
+) -> Lesson:
+    """Learn bodies from detections.
+
+    Parameters
+    ----------
+    frames : sequence of SeenFrame
+    eyes : Eyes
+    rules : LearningRules
+    progress : callable
+    name : str
+        What messages call the recording.
+
+    Raises
+    ------
+    RecordingError
+        If no body is seen to move.
+    """
+    progress("triangulating", 0, 1)
+    clouds, noise = clouds_of(frames, eyes.sensors, eyes.sigmas, rules)
+    if not any(len(cloud) for cloud in clouds):
+        raise RecordingError(_seen_by_one(frames, eyes, name))
+    moving, still = without_still(clouds, rules)
+    found = find_bodies(moving, rules, np.random.default_rng(0), progress)
+    progress("adjusting", 0, 1)
+    bodies = adjusted(found, clouds, eyes, rules)
+    if not bodies:
+        raise RecordingError(_nothing_moves(clouds, moving, still, rules, name))
+    return Lesson(tuple(map(in_principal_axes, bodies)), len(still), len(frames), noise)
+
+
+def _seen_by_one(frames: Sequence[SeenFrame], eyes: Eyes, name: str) -> str:
+    """Why there is no point in space."""
+    shared = sum(sum(len(points) > 0 for points in f.points.values()) > 1 for f in frames)
+    seen = sorted({eyes.names[s] for f in frames for s, points in f.points.items() if len(points)})
+    if not shared:
+        return (
+            f"{name}: learn: found no frame in which two cameras see anything; {', '.join(seen)} "
+            f"saw something in {len(frames)} frames; allowed: frames of two cameras or more with "
+            "one number, with the body in view of both"
+        )
+    return (
+        f"{name}: learn: found no lines of sight of two cameras that meet, in {shared} frames in "
+        "which two see something; see that T_sensor_world is right and frames are of one moment"
+    )
+
+
+def _nothing_moves(
+    clouds: Sequence[Cloud],
+    moving: Sequence[Cloud],
+    still: Sequence[Floats],
+    rules: LearningRules,
+    name: str,
+) -> str:
+    """Why no body was found, and which motion would tell."""
+    left = float(np.median([len(cloud) for cloud in moving]))
+    seen = float(np.median([len(cloud) for cloud in clouds]))
+    far = rules.apart * rules.gate * float(np.median(np.concatenate([c.reach for c in clouds])))
+    wanted = (
+        "move the body by about its own size along each axis and turn it by 30 degrees or more "
+        "about each, in view of two cameras"
+    )
+    if left < 3 <= seen or (still and left < len(still)):
+        return (
+            f"{name}: learn: found {seen:.0f} points in space in most frames, {len(still)} of "
+            f"which never move; what moves and turns is missing: {wanted}"
+        )
+    if seen < 3:
+        return (
+            f"{name}: learn: found {seen:.0f} points in space in most frames; allowed: three "
+            "markers of the body or more that two cameras see at the same time"
+        )
+    return (
+        f"{name}: learn: found {left:.0f} points in space in most frames, but no three that keep "
+        f"their distances while they move by {far:.2g} or more, {rules.least_frames} times; "
+        f"{wanted}"
+    )

@@ -1,0 +1,245 @@
+"""Points in space of each frame, where lines of sight of two sensors or more meet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.special import erf
+
+from mixpose.calibration import SeenFrame
+from mixpose.learning.rules import LearningRules
+from mixpose.records import Floats, Indices, Mask
+from mixpose.search import triangulate
+from mixpose.sensors import Rays, Sensor
+
+_STEPS = 3  # of Gauss-Newton, from the middle between two rays
+_SHARES = np.logspace(-2.5, 0.3, 60)  # deviations that are tried, by the gate
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points in space that one frame shows, some of which are ghosts: rays that meet by chance.
+
+    Attributes
+    ----------
+    number : int
+        Of the frame.
+    points : (P, 3) float64
+        In the world.
+    reach : (P,) float64
+        Standard deviation of a point along the axis in which it is known worst.
+    detections : (P, L) int
+        Of each sensor the detection that it is seen as, or -1.
+    rows : (P,) int
+        Which points these are of all that the frame shows.
+    seen : SeenFrame
+        All detections of the frame.
+    """
+
+    number: int
+    points: Floats
+    reach: Floats
+    detections: Indices
+    rows: Indices
+    seen: SeenFrame
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def only(self, chosen: Any) -> Cloud:
+        """Some of the points."""
+        return Cloud(
+            self.number,
+            self.points[chosen],
+            self.reach[chosen],
+            self.detections[chosen],
+            self.rows[chosen],
+            self.seen,
+        )
+
+    def loosened(self, times: float) -> Cloud:
+        """The cloud with points that are known less well."""
+        return replace(self, reach=times * self.reach)
+
+    def without(self, detections: Indices) -> Cloud:
+        """What is left where detections (n, L) are taken by something else."""
+        left = np.ones(len(self), dtype=np.bool_)
+        for sensor in range(self.detections.shape[1]):
+            taken = detections[:, sensor]
+            left &= ~np.isin(self.detections[:, sensor], taken[taken >= 0])
+        return self.only(left)
+
+
+def clouds_of(
+    frames: Sequence[SeenFrame], sensors: Sequence[Sensor], sigmas: Floats, rules: LearningRules
+) -> tuple[list[Cloud], float]:
+    """Triangulate every frame.
+
+    Parameters
+    ----------
+    frames : sequence of SeenFrame
+    sensors : sequence of Sensor
+    sigmas : (L,) array
+        Largest error σ_ε of detections by sensor.
+    rules : LearningRules
+
+    Returns
+    -------
+    list of Cloud
+    float
+        Standard deviation of detections, as a share of σ_ε.
+    """
+    told = [_seen(frame, sensors) for frame in frames]
+    wide = rules.widest * sigmas
+    some = np.linspace(0, len(told) - 1, min(len(told), rules.probes)).astype(int)
+    gaps = [np.zeros(0)]
+    for k in np.unique(some):
+        gaps.append(_meetings(told[k][1], wide, rules)[2])
+    noise = max(rules.widest * _deviation(np.concatenate(gaps)), rules.quietest)
+    gates = min(rules.gate * noise, rules.widest) * sigmas
+    return [_cloud(*each, sensors, noise * sigmas, gates, rules) for each in told], noise
+
+
+def _seen(frame: SeenFrame, sensors: Sequence[Sensor]) -> tuple[SeenFrame, dict[int, Rays]]:
+    """The frame with those detections that have a line of sight, and these."""
+    rays: dict[int, Rays] = {}
+    for sensor, points in sorted(frame.points.items()):
+        found = sensors[sensor].rays(points) if len(points) else None
+        if found is not None and len(found):
+            rays[sensor] = found
+    pixels = {sensor: found.pixels for sensor, found in rays.items()}
+    return SeenFrame(frame.number, frame.time_s, pixels, frame.times), rays
+
+
+def _meetings(
+    rays: dict[int, Rays], gates: Floats, rules: LearningRules
+) -> tuple[Floats, Indices, Floats]:
+    """Points (P, 3) where two rays meet, their detections (P, L), and how closely they meet."""
+    lines = [rays[k] for k in sorted(rays)]
+    index = np.array(sorted(rays), dtype=np.intp)
+    if len(lines) < 2:
+        return np.zeros((0, 3)), np.zeros((0, len(gates)), dtype=np.intp), np.zeros(0)
+    met = triangulate(lines, gates[index].tolist(), rules.min_sine)
+    detections = np.full((len(met.points), len(gates)), -1, dtype=np.intp)
+    rows = np.arange(len(met.points))
+    for side in (0, 1):
+        detections[rows, index[met.sensors[:, side]]] = met.rays[:, side]
+    return met.points, detections, met.gap
+
+
+def _deviation(gaps: Floats) -> float:
+    """Standard deviation of gaps (n,) between rays that belong together, among others.
+
+    Gaps are shares of a gate.  Those of rays that meet by chance are spread evenly from 0 to 1,
+    the others are half a Gaussian, cut at 1; the likeliest mixture is taken.
+    """
+    if not len(gaps):
+        return 0.0
+    best, found = -np.inf, 1.0
+    for deviation in _SHARES:
+        within = erf(1 / (np.sqrt(2) * deviation))
+        density = np.exp(-(gaps**2) / (2 * deviation**2)) / (deviation * np.sqrt(np.pi / 2))
+        density /= within
+        share = 0.5
+        for _ in range(20):
+            share = float(np.mean(share * density / (share * density + 1 - share)))
+        likely = float(np.log(share * density + 1 - share).sum())
+        if likely > best:
+            best, found = likely, float(deviation)
+    return found
+
+
+def _cloud(
+    frame: SeenFrame,
+    rays: dict[int, Rays],
+    sensors: Sequence[Sensor],
+    noise: Floats,
+    gates: Floats,
+    rules: LearningRules,
+) -> Cloud:
+    points, detections, gaps = _meetings(rays, gates, rules)
+    if len(rays) > 2 and len(points):
+        detections = _supported(points, detections, gaps, frame, sensors, gates)
+        points = points[(detections >= 0).any(axis=1)]
+        detections = detections[(detections >= 0).any(axis=1)]
+    points, reach = _refined(points, detections, frame, sensors, noise)
+    fine = np.isfinite(np.column_stack([points, reach])).all(axis=1)
+    rows = np.arange(np.count_nonzero(fine))
+    return Cloud(frame.number, points[fine], reach[fine], detections[fine], rows, frame)
+
+
+def _supported(
+    points: Floats,
+    detections: Indices,
+    gaps: Floats,
+    frame: SeenFrame,
+    sensors: Sequence[Sensor],
+    gates: Floats,
+) -> Indices:
+    """Detections (P, L) of all sensors that see the points; -1 throughout for those left out.
+
+    Of points that share detections the one that most sensors confirm stays; what only two sensors
+    see is a ghost where one of its detections belongs to a point of three or more.
+    """
+    off = gaps.copy()
+    for sensor, pixels in frame.points.items():
+        y, visible = sensors[sensor].project(points)
+        away, nearest = cKDTree(pixels).query(y)
+        found = visible & (away < gates[sensor]) & (detections[:, sensor] < 0)
+        detections[found, sensor] = nearest[found]
+        off[found] += away[found] / gates[sensor]
+    views = (detections >= 0).sum(axis=1)
+    taken = [set[int]() for _ in sensors]
+    kept = np.zeros(len(points), dtype=np.bool_)
+    for k in np.lexsort((off / views, -views)):
+        own = [(s, d) for s, d in enumerate(detections[k].tolist()) if d >= 0]
+        shared = sum(d in taken[s] for s, d in own)
+        if shared > max(len(own) - 3, 0):
+            continue
+        kept[k] = True
+        if len(own) > 2:
+            for s, d in own:
+                taken[s].add(d)
+    return np.where(kept[:, None], detections, -1)
+
+
+def _refined(
+    points: Floats,
+    detections: Indices,
+    frame: SeenFrame,
+    sensors: Sequence[Sensor],
+    noise: Floats,
+) -> tuple[Floats, Floats]:
+    """Points (P, 3) by least squares over all their detections, and their deviations (P,)."""
+    information = np.zeros((len(points), 3, 3))
+    for _ in range(_STEPS if len(points) else 0):
+        information, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+        for sensor, pixels in frame.points.items():
+            seen = detections[:, sensor] >= 0
+            if not seen.any():
+                continue
+            y, J, visible = sensors[sensor].linearise(points[seen])
+            J = J * visible[:, None, None] / noise[sensor]
+            r = np.where(visible[:, None], pixels[detections[seen, sensor]] - y, 0.0)
+            information[seen] += np.swapaxes(J, 1, 2) @ J
+            pull[seen] += np.einsum("nmk,nm->nk", J, r / noise[sensor])
+        fixed = _are_fixed(information)
+        information[~fixed] = np.nan
+        step = np.full(points.shape, np.nan)
+        step[fixed] = np.linalg.solve(information[fixed], pull[fixed][..., None])[..., 0]
+        points = points + step
+    known = np.isfinite(points).all(axis=1)
+    reach = np.full(len(points), np.nan)
+    reach[known] = 1 / np.sqrt(np.linalg.eigvalsh(information[known])[:, 0])
+    return points, reach
+
+
+def _are_fixed(information: Floats) -> Mask:
+    """Whether a point (P,) is known in all directions."""
+    finite: Mask = np.asarray(np.isfinite(information).all(axis=(1, 2)))
+    values = np.linalg.eigvalsh(np.where(finite[:, None, None], information, 0.0))
+    return np.asarray(values[:, 0] > 1e-12 * values[:, 2])

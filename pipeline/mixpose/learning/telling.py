@@ -1,0 +1,107 @@
+"""What was learnt, for people: a table of each body, and what to know of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mixpose.body import congruent_parts, tolerance_of
+from mixpose.learning.adjusting import Learnt
+from mixpose.learning.axes import body_of
+from mixpose.learning.rules import LearningRules
+from mixpose.records import Floats
+
+_ALIKE = 0.03  # of the radius: markers nearer are in one place to those who tell poses apart
+_ONE_AXIS = 0.2  # of the turn about the main axis that there is about any other
+
+
+def digits_of(learnt: Learnt) -> int:
+    """Decimals that tell a tenth of the smallest deviation of a marker."""
+    least = float(np.linalg.norm(learnt.deviations, axis=1).min())
+    return int(np.clip(1 - np.floor(np.log10(max(least, 1e-12))), 0, 12))
+
+
+def lines_of(learnt: Learnt, name: str, unit: str) -> list[str]:
+    """A table of markers."""
+    turns = _turns(learnt)
+    digits = digits_of(learnt)
+    width = max(10, digits + 7)
+    head = "".join(f"{word:>{width}}" for word in ("x", "y", "z", "deviation"))
+    alike = f", {learnt.count} alike at a time" if learnt.count > 1 else ""
+    rows = [
+        f"{name}: {len(learnt.points)} markers{alike}, adjusted in {len(set(learnt.numbers))} "
+        f"frames, turned by up to {np.degrees(np.linalg.norm(turns, axis=1).max()):.0f} deg; "
+        f"lengths in {unit}",
+        f"{'marker':<8}{head}{'frames':>8}",
+    ]
+    for label, point, deviation, frames in zip(
+        learnt.names, learnt.points, learnt.deviations, learnt.frames, strict=True
+    ):
+        size = float(np.sqrt((deviation**2).mean()))
+        numbers = "".join(f"{value + 0.0:>{width}.{digits}f}" for value in (*point, size))
+        rows.append(f"{label:<8}{numbers}{frames:>8}")
+    return rows
+
+
+def doubts_of(learnt: Learnt, name: str, unit: str, rules: LearningRules) -> list[str]:
+    """What the recording does not tell, and what cannot be told from what."""
+    told = _doubts_of_motion(learnt, name, rules)
+    body = body_of(name, learnt.points)
+    turns = len(body.symmetries)
+    if turns > 1:
+        told.append(
+            f"{name}: its markers map onto themselves in {turns - 1} other "
+            f"way{'s' * (turns > 2)}: such poses cannot be told apart; move or add a marker"
+        )
+    if learnt.spread > 0:
+        told.append(
+            f"{name}: its markers move on it by {learnt.spread:.2g} {unit}: write "
+            f"sigma = {learnt.spread:.2g} into its [object]"
+        )
+    return told
+
+
+def _doubts_of_motion(learnt: Learnt, name: str, rules: LearningRules) -> list[str]:
+    turns = np.degrees(_turns(learnt))
+    most = float(np.linalg.norm(turns, axis=1).max())
+    if most < rules.turned_deg:
+        return [
+            f"{name}: turned by {most:.1f} deg at most; missing: turns of 30 deg or more about "
+            "each axis, without which sides that no camera saw have no markers, and things that "
+            "move along are not told apart"
+        ]
+    _, sizes, axes = np.linalg.svd(turns - np.median(turns, axis=0), full_matrices=False)
+    if sizes[1] < _ONE_AXIS * sizes[0]:
+        axis = ", ".join(f"{value:.2f}" for value in axes[0])
+        return [
+            f"{name}: turned about one axis only, ({axis}) of the world; missing: turns about "
+            "another, without which what lies along this axis is not told apart"
+        ]
+    return []
+
+
+def _turns(learnt: Learnt) -> Floats:
+    """Rotation vectors (K, 3) in the world from the middle one of all poses."""
+    turns = Rotation.from_matrix(learnt.poses[:, :3, :3])
+    if learnt.count > 1:  # poses of several bodies are no motion of one
+        return np.asarray((turns * turns[0].inv()).as_rotvec())
+    return np.asarray((turns * turns.mean().inv()).as_rotvec())
+
+
+def look_alikes(bodies: Sequence[Learnt], names: Sequence[str]) -> list[str]:
+    """Bodies that share three markers or more, which may be mistaken for each other."""
+    told = []
+    models = [body_of(name, one.points) for name, one in zip(names, bodies, strict=True)]
+    for k, first in enumerate(models):
+        for other, second in enumerate(models[:k]):
+            parts = congruent_parts(first, second, tolerance_of(first, second, _ALIKE))
+            if parts:
+                a = ", ".join(bodies[k].names[n] for n in parts[0].features)
+                b = ", ".join(bodies[other].names[n] for n in parts[0].partners)
+                told.append(
+                    f"markers {a} of {names[k]} lie like {b} of {names[other]}: where no others "
+                    "are seen the two cannot be told apart"
+                )
+    return told

@@ -1,0 +1,194 @@
+"""Bodies that are learnt from a recording in which they move."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from moving_bodies import (
+    CAMERA_MATRIX,
+    RESOLUTION,
+    Array,
+    Scene,
+    aligned_errors,
+    body,
+    camera,
+    detections,
+    motion,
+    write_recording,
+)
+
+from mixpose.calibration import SeenFrame
+from mixpose.errors import RecordingError, SessionError
+from mixpose.learning import Eyes, Lesson, by_markers, learn, learn_from, like
+from mixpose.learning.rules import LearningRules
+from mixpose.learning.telling import doubts_of
+from mixpose.sensors import PinholeCamera
+from mixpose.session import load_scene, load_session
+
+CAMERAS = [camera(20.0), camera(85.0)]
+EYES = Eyes(
+    ("a", "b"),
+    tuple(PinholeCamera(CAMERA_MATRIX, np.zeros(0), RESOLUTION, T) for T in CAMERAS),
+    np.ones(2),
+)
+SHORT = Scene(frames=40)
+
+
+def lesson_of(bodies: list[tuple[Array, Array]], scene: Scene = SHORT, seed: int = 1) -> Lesson:
+    frames = detections(bodies, CAMERAS, scene, seed)
+    seen = [SeenFrame(k, None, dict(enumerate(views)), {}) for k, views in enumerate(frames)]
+    return learn_from(seen, EYES)
+
+
+def moving(markers: int, seed: int, scene: Scene = SHORT) -> tuple[Array, Array]:
+    rng = np.random.default_rng(seed)
+    return body(markers, rng), motion(scene, rng)
+
+
+@pytest.fixture(scope="module")
+def five() -> tuple[Array, Lesson]:
+    """Five markers with hidden ones, false detections and four others that stand still."""
+    points, poses = moving(5, 3)
+    return points, lesson_of([(points, poses)])
+
+
+def test_a_body_among_clutter_is_learnt_within_its_deviations(five: tuple[Array, Lesson]) -> None:
+    points, lesson = five
+    (found,) = lesson.bodies
+    errors = aligned_errors(found.points, points)
+    # 0.15 px at 1 m and a focal length of 1200 px are 0.13 mm, of 40 frames 0.03 mm
+    assert np.linalg.norm(errors, axis=1).max() < 0.1
+    deviations = np.linalg.norm(found.deviations, axis=1)
+    assert (np.linalg.norm(errors, axis=1) < 3 * deviations).all()
+    assert 0.01 < deviations.mean() < 0.05
+
+
+def test_what_stands_still_is_counted_and_is_no_body(five: tuple[Array, Lesson]) -> None:
+    assert five[1].still == SHORT.still
+    assert [one.count for one in five[1].bodies] == [1]
+
+
+def test_the_noise_of_detections_is_told_by_how_closely_rays_meet(
+    five: tuple[Array, Lesson],
+) -> None:
+    # of about 200 gaps between rays, whose deviation errs by 5 %; false meetings make it worse
+    assert five[1].noise == pytest.approx(SHORT.noise, rel=0.25)
+
+
+def test_the_frame_is_that_of_the_principal_axes(five: tuple[Array, Lesson]) -> None:
+    found = five[1].bodies[0].points
+    second = found.T @ found
+    assert np.abs(found.mean(axis=0)).max() < 1e-9
+    assert np.abs(second - np.diag(np.diag(second))).max() < 1e-6 * second.max()
+    assert (np.diff(np.diag(second)) < 0).all()
+    assert (np.diff(found[:, 0]) < 0).all()
+
+
+def test_axes_by_markers_put_them_there(five: tuple[Array, Lesson]) -> None:
+    found = by_markers(five[1].bodies[0], "2,5,1")
+    at = dict(zip(found.names, found.points, strict=True))
+    assert np.abs(at["2"]).max() < 1e-9
+    assert np.abs(at["5"][1:]).max() < 1e-9 < at["5"][0]
+    assert abs(at["1"][2]) < 1e-9 < at["1"][1]
+    with pytest.raises(SessionError, match="allowed: ORIGIN,X,Y, three of the markers 1, 2, 3"):
+        by_markers(five[1].bodies[0], "1,2,9")
+
+
+def test_an_older_table_gives_axes_names_and_order(five: tuple[Array, Lesson]) -> None:
+    points, lesson = five
+    ruler = points.round()  # measured to a millimetre, one marker not at all
+    names = ["tip", "left", "right", "top"]
+    likeness = like(lesson.bodies[0], ruler[:4], names)
+    assert likeness is not None
+    assert likeness.learnt.names == (*names, "5")
+    # the ruler's errors of 0.5 mm turn and shift the frame by as much at most
+    assert np.abs(likeness.learnt.points - points).max() < 1.5
+    assert like(lesson.bodies[0], 1.5 * ruler, []) is None
+
+
+def test_two_bodies_are_told_apart() -> None:
+    first, second = moving(5, 3), moving(4, 8)
+    lesson = lesson_of([first, (second[0], second[1])])
+    assert [len(one.points) for one in lesson.bodies] == [5, 4]
+    assert np.abs(aligned_errors(lesson.bodies[0].points, first[0])).max() < 0.1
+    assert np.abs(aligned_errors(lesson.bodies[1].points, second[0])).max() < 0.1
+    # each of them in its own frames: a body takes no detections from the other
+    assert min(one.frames.min() for one in lesson.bodies) > 0.6 * SHORT.frames
+    assert [one.spread for one in lesson.bodies] == [0.0, 0.0]
+
+
+def test_two_congruent_bodies_are_one_of_which_there_are_two() -> None:
+    points, poses = moving(4, 3)
+    rng = np.random.default_rng(9)
+    lesson = lesson_of([(points, poses), (points, motion(SHORT, rng))])
+    assert [(len(one.points), one.count) for one in lesson.bodies] == [(4, 2)]
+
+
+def test_a_body_that_never_moves_is_refused_with_what_is_missing() -> None:
+    points, poses = moving(5, 3)
+    with pytest.raises(RecordingError, match=r"9 of which never move; .*turn it by 30 degrees"):
+        lesson_of([(points, np.repeat(poses[:1], SHORT.frames, axis=0))])
+
+
+def test_a_body_that_is_only_shifted_is_learnt_and_turns_are_missed() -> None:
+    points, poses = moving(5, 3)
+    poses[:, :3, :3] = np.eye(3)
+    (found,) = lesson_of([(points, poses)]).bodies
+    assert len(found.points) == 5
+    (doubt,) = doubts_of(found, "body.csv", "mm", LearningRules())
+    assert "turned by 0." in doubt
+    assert "missing: turns of 30 deg or more about each axis" in doubt
+
+
+def test_a_recording_of_which_each_frame_is_of_one_camera_is_refused() -> None:
+    views = detections([moving(5, 3)], CAMERAS, SHORT, 1)
+    alone = [SeenFrame(k, None, {k % 2: one[k % 2]}, {}) for k, one in enumerate(views)]
+    with pytest.raises(RecordingError, match="no frame in which two cameras see anything; a, b"):
+        learn_from(alone, EYES)
+
+
+def test_one_camera_is_refused_with_what_to_do_instead(tmp_path: Path) -> None:
+    frames = detections([moving(5, 3)], CAMERAS[:1], SHORT, 1)
+    session = load_scene(write_recording(tmp_path, frames, CAMERAS[:1]))
+    with pytest.raises(SessionError, match=r"found 1 camera; .*mixpose calibrate --free body"):
+        learn(session)
+
+
+def test_the_command_writes_a_table_that_the_same_session_reads(tmp_path: Path) -> None:
+    points, poses = moving(4, 5)
+    path = write_recording(tmp_path, detections([(points, poses)], CAMERAS, SHORT, 1), CAMERAS)
+    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "body.csv: 4 markers" in done.stdout
+    assert "4 other points stood still" in done.stderr
+    means = load_session(path).body.means
+    assert np.abs(aligned_errors(means, points)).max() < 0.1
+    table = (tmp_path / "body.csv").read_text(encoding="utf-8")
+    assert table.startswith("name,x,y,z,deviation_x,deviation_y,deviation_z,frames\n1,")
+
+
+def test_a_table_of_somebody_else_is_not_overwritten(tmp_path: Path) -> None:
+    path = write_recording(tmp_path, [[np.zeros((0, 2))] * 2], CAMERAS)
+    (tmp_path / "body.csv").write_text("name,x,y,z\na,0,0,0\n", encoding="utf-8")
+    command = [sys.executable, "-m", "mixpose", "learn", str(path), "-o", "body.csv"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "holds something that mixpose did not write" in done.stderr
+
+
+def test_a_board_before_web_cams_is_learnt_from_tables_without_identities(
+    recordings: Path,
+) -> None:
+    (found,) = learn(load_scene(recordings / "webcams4_a" / "session_reference.toml")).bodies
+    grid = np.array([[x, y, 0.0] for x in range(3) for y in range(4)]) * 0.054
+    likeness = like(found, grid, [])
+    assert likeness is not None
+    assert likeness.shared == len(found.points) == 12
+    # cameras out of step by up to 20 ms, and a printed board
+    assert likeness.off < 1e-3
+    assert np.linalg.norm(likeness.learnt.points - grid, axis=1).max() < 1e-3
