@@ -130,22 +130,24 @@ def noise_of(
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
     J, fields = rows[:, chosen], fields_of_sensors(found, shares, met)
-    markers, kinds = _by_marker(found, rows[:, :3]), _kinds(*shares.shape)
+    markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
     inverse, q = inverted(J.T @ J), fields.shape[1]
-    by_markers = _of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
+    by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
     taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
     # by how much fields move the pose, and what it leaves of those of sensors, which may last
     left = fields - J @ (drawn := inverse @ taken)[:, :q]
     lasting = left / (sizes := noise.repeat(q // len(noise)))
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
-    by_markers = _of_each(r[:, None], found).swapaxes(1, 2) @ markers
+    by_markers = of_each(r[:, None], found).swapaxes(1, 2) @ markers
     pulls, moved = np.append(rest @ fields, by_markers), drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
     spare = float(met @ found.dimensions) - count
     own = np.zeros((4, 5))
     if spare > 0:
-        own[:, :4] = _expected(fields, left, _of_each(left, found), markers, taken, drawn, kinds)
+        own[:, :4] = expected_squares(
+            fields, left, of_each(left, found), markers, taken, drawn, kinds
+        )
         own[0, 0], own[0, 4], own[1:, 4] = spare, rest @ rest, pulls**2 @ kinds[:, 1:]
     moments = model.memory * before.moments + own
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
@@ -200,7 +202,7 @@ def _level(
     return variances, scale, told, degrees, ratio
 
 
-def _of_each(rows: Floats, found: Matches) -> Floats:
+def of_each(rows: Floats, found: Matches) -> Floats:
     """Rows (R, k) of all sensors by marker (N, 2 L, k)."""
     L, N = found.shares.shape
     return rows.reshape(L, N, 2, -1).swapaxes(0, 1).reshape(N, 2 * L, -1)
@@ -214,7 +216,7 @@ def _by_marker(found: Matches, by_place: Floats) -> Floats:
     # in units of how features move with the body, the root mean square of those in view
     counts = 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
     moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
-    return _of_each(by_place, found) / max(moved, 1e-6)
+    return of_each(by_place, found) / max(moved, 1e-6)
 
 
 def fields_of_sensors(found: Matches, shares: Floats, met: Floats) -> Floats:
@@ -244,7 +246,7 @@ def _of_sensors(dimensions: tuple[int, ...]) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _kinds(sensors: int, markers: int) -> Floats:
+def kinds_of(sensors: int, markers: int) -> Floats:
     """The kinds (q + 3 N, 4) of all fields, as ones: those of sensors, then those of markers."""
     return np.eye(4)[[1, 2, 2] * (2 * sensors) + [3] * (3 * markers)]
 
@@ -274,7 +276,7 @@ def _lasting(
     return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
-def _expected(
+def expected_squares(
     fields: Floats,
     left: Floats,
     left_by_marker: Floats,

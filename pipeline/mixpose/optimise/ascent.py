@@ -149,9 +149,8 @@ class _Climb:
     def take(self, tried: Any, there: Quadratic, asked: list[int], going: list[int]) -> list[int]:
         """Go to states that are better, and damp the other steps: those that are not stuck."""
         options, values, better = self._options, self._here.value.tolist(), there.value.tolist()
-        there = there if options.unchecked or there.hessian is not None else self._as_shown(
-            there, asked
-        )
+        if not options.unchecked and there.hessian is None:
+            there = self._as_shown(there, asked)
         count, ease = len(values), 1 if options.unchecked else 10
         damping = [max(self._damping[k] / ease, _NO_DAMPING) for k in asked]
         steps, gains = _steps(there, self._free, damping, options)
@@ -179,7 +178,7 @@ class _Climb:
         return left
 
     def _as_shown(self, there: Quadratic, asked: list[int]) -> Quadratic:
-        """Models at states that were tried, with what gradients show of the curvature."""
+        """Models at states that were tried, with what gradients show along the last six steps."""
         curvature, falls = there.curvature.copy(), self._here.gradient[asked] - there.gradient
         for row, (k, fall) in enumerate(zip(asked, falls * self._free, strict=True)):
             self._shown[k] = [*self._shown[k][-5:], (self.steps[k], fall)]

@@ -25,7 +25,6 @@ from mixpose.optimise import NewtonOptions, Quadratic, Sum, ascend, squares_of
 from mixpose.records import Floats, Indices, Mask
 from mixpose.rigid import from_parts, perturb, transform
 from mixpose.search.problem import SearchBudget, SearchProblem, SensorDetections
-from mixpose.search.three_points import sparse
 from mixpose.sensors import Rays
 
 
@@ -189,10 +188,7 @@ Stage: TypeAlias = tuple[tuple[float, ...], int, int]
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Refines poses on the blurred observations of all sensors, which are drawn once per blur.
-
-    Of a body of many features some that are far from one another stand for all.
-    """
+    """Refines poses on the blurred observations of all sensors, which are drawn once per blur."""
 
     views: Sequence[View]
     body: Body
@@ -205,8 +201,7 @@ class Descent:
         key = factors or (1.0,) * len(self.views)
         if key not in self._objectives:
             sigmas = [f * one.observation.sigma for f, one in zip(key, self.views, strict=True)]
-            few = sparse(self.body, 4 * self.budget.sample)
-            self._objectives[key] = matched_objective(self.views, few, sigmas)
+            self._objectives[key] = matched_objective(self.views, self.body, sigmas)
         return self._objectives[key]
 
     def refine(self, poses: Floats, stages: Sequence[Stage]) -> Floats:

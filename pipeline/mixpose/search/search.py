@@ -107,7 +107,9 @@ class _Search:
             one.rays is not None for one in problem.detections
         )
         self._confirm = self._by_evidence and len(cameras) > 1  # cameras each other
-        self._descent = Descent(views, self._body, problem.free, self._budget)
+        self._descent = Descent(
+            views, sparse(self._body, 4 * self._budget.sample), problem.free, self._budget
+        )
         # to σ_ε with others than cameras
         plan = self._budget.descent_plan if self._by_evidence else self._budget.wide_plan
         self._stages = [((blur,) * len(views), n, self._budget.shortlist) for blur, n in plan]

@@ -255,7 +255,7 @@ def _perspective(
     if body.normals is None:
         return poses
     outward = np.einsum("kij,cjk->cik", poses[:, :3, :3], gathered(body.normals, corners))
-    return poses[((outward * away).sum(axis=1) < 0).all(axis=0)]
+    return np.asarray(poses[((outward * away).sum(axis=1) < 0).all(axis=0)])
 
 
 def _orthographic(

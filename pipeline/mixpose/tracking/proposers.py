@@ -24,7 +24,7 @@ from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
+from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import Likelihood
 
@@ -77,7 +77,8 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(first.T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    descent = Descent(frame.views, frame.body, frame.free, frame.rules.search)
+    few = sparse(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
+    descent = Descent(frame.views, few, frame.free, frame.rules.search)
     poses = np.concatenate([first.T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, rules.kept), *stages])
     values = descent.objective().value(poses)
