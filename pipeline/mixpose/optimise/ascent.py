@@ -78,6 +78,11 @@ class NewtonOptions:
     least_curvature: float = constant(
         0.3, "of the curvature: where a Hessian is flatter, its step would lead too far"
     )
+    shown_from: float = constant(
+        2.5e-3,
+        "of the value, that a step gains at most before its gradients are believed: r²/4σ² of a "
+        "tenth of the blur; farther away longer steps lead to another maximum",
+    )
     least_seen: float = constant(
         0.1, "the same of what gradients show along a step (Powell, Math. Program. 14 (1978) 224)"
     )
@@ -181,6 +186,8 @@ class _Climb:
         """Models at states that were tried, with what gradients show along the last six steps."""
         curvature, falls = there.curvature.copy(), self._here.gradient[asked] - there.gradient
         for row, (k, fall) in enumerate(zip(asked, falls * self._free, strict=True)):
+            if self.gains[k] > self._options.shown_from * abs(float(self._here.value[k])):
+                continue
             self._shown[k] = [*self._shown[k][-5:], (self.steps[k], fall)]
             for step, change in self._shown[k]:
                 expected = curvature[row] @ step
