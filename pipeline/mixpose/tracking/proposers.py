@@ -136,11 +136,11 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    kinds, best = frame.rules.look_alikes.kinds, None
-    # once more, where what is moved is better and meets more
-    while "congruent" in kinds and ranked and ranked[0] is not best:
-        best = ranked[0]
-        yield from _as_evident(frame, best)
+    kinds, most = frame.rules.look_alikes.kinds, -np.inf
+    # once more, where what is moved is better: two that are as good would take turns for ever
+    while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
+        most = ranked[0].log_evidence + 0.01
+        yield from _as_evident(frame, ranked[0])
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
