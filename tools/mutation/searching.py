@@ -10,14 +10,6 @@ _STARTS = "test_tracking_starts.py"
 
 _PROPOSALS = (
     Mutant(
-        "tracking-look-alikes-of-as-good-a-pose-again",
-        "tracking/proposers.py",
-        "most = ranked[0].log_evidence + 0.01",
-        "most = ranked[0].log_evidence - 0.01",
-        "two poses that are as evident take turns, and a frame never ends",
-        (_STARTS,),
-    ),
-    Mutant(
         "tracking-other-tilt-never-tried",
         "tracking/proposers.py",
         "yield from _tilted(frame, ranked[0])",
