@@ -382,3 +382,17 @@ def test_pages_of_many_sensors_lie_in_an_array_that_can_be_looked_up() -> None:
     # fifteen cameras whose detections are far apart; cv2.remap takes less than 32767 a side
     far_apart = np.array([[0.0, 0.0], [11_900.0, 11_900.0]])
     assert max(Pages(far_apart, [], TILE, 17.0, 15).values.shape) < 32767
+
+
+def test_more_places_than_pages_of_a_wide_blur_are_looked_up_on_pages() -> None:
+    # 300 places on a plane of about 6 by 6 pages; tiles of their own would be drawn for each
+    rng = np.random.default_rng(4)
+    points, y = rng.uniform(0, 25 * SIGMA, (2, 300, 2))
+    atlas, few = points_only(points, STEPS_PER_SIGMA), points_only(points, STEPS_PER_SIGMA)
+    values, _ = looked_up(atlas, y)
+    assert "pages" in vars(atlas)
+    own, _ = looked_up(few, y[:10])
+    assert "pages" not in vars(few)
+    # both cut Gaussians where their tiles end
+    np.testing.assert_allclose(values[:10], own, atol=300 * CUT * peak(300))
+    np.testing.assert_allclose(values, exact(points, y)[0], rtol=0.01)

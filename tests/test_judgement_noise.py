@@ -11,7 +11,7 @@ from matches import Seen, matches_of
 from numpy.typing import NDArray
 from scipy.special import fdtri
 
-from mixpose.judgement import NoiseModel, RememberedNoise
+from mixpose.judgement import NoiseModel, RememberedNoise, noise
 from mixpose.judgement.noise import noise_of
 from mixpose.matching import ErrorRules
 
@@ -213,3 +213,23 @@ def test_what_features_of_a_sensor_are_off_by_in_common_is_told_from_their_noise
             made = [rng.normal(0, common, 2) + rng.normal(0, 0.1, (12, 2)) for _ in found]
             _, residuals = judged(fitted(found, made)[0], residuals)
         assert least <= residuals.fields < most
+
+
+def test_sums_over_markers_are_those_over_pairs_of_markers() -> None:
+    # all fields written down as columns of one matrix P, and what a pose leaves of each pair
+    rng = np.random.default_rng(3)
+    L, N, count, q = 2, 9, 6, 12
+    J, fields, by_place = (rng.normal(0, 1, (2 * L * N, k)) for k in (count, q, 3))
+    seen = matches_of(sensor("0", rng, np.zeros((N, 2))), sensor("1", rng, np.zeros((N, 2))))
+    P = np.zeros((L, N, 2, N, 3))
+    for i in range(N):
+        P[:, i, :, i] = by_place.reshape(L, N, 2, 3)[:, i]
+    P = np.concatenate([fields, P.reshape(2 * L * N, 3 * N)], axis=1)
+    A, kinds = J.T @ J, noise.kinds_of(L, N)
+    gram = P.T @ P - P.T @ J @ np.linalg.inv(A) @ J.T @ P
+    exact = kinds.T @ gram**2 @ kinds
+    exact[0] = exact[:, 0] = gram.diagonal() @ kinds
+    left = fields - J @ np.linalg.inv(A) @ J.T @ fields
+    markers, taken = noise.of_each(by_place, seen), J.T @ P
+    given = fields, left, noise.of_each(left, seen), markers, taken, np.linalg.inv(A) @ taken
+    np.testing.assert_allclose(noise.expected_squares(*given, kinds), exact, rtol=1e-9, atol=1e-9)

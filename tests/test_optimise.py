@@ -216,14 +216,46 @@ def test_a_definite_hessian_is_used_in_place_of_a_curvature_that_is_too_large() 
     def with_hessian(x: Floats) -> tuple[float, Floats, Floats, Floats]:
         return *bowl(300.0)(x), np.array([[100.0]])
 
-    start, options = np.array([0.3]), NewtonOptions(iterations=12)
-    slow, fast = Function(bowl(300.0)), Function(with_hessian)
-    climbed(slow, start, free=ONE, options=options)
-    ascent = climbed(fast, start, free=ONE, options=options)
-    # steps of a third of the way leave (2/3)^11 = 0.01 of it, Newton's leave the damping's 1e-4
-    assert len(slow.asked) == 12
-    assert len(fast.asked) <= 4
-    assert ascent.states[0, 0] == pytest.approx(0.0, abs=1e-6)
+    start, options = np.array([0.3]), NewtonOptions(iterations=1, unchecked=True)
+    slow = climbed(bowl(300.0), start, free=ONE, options=options)
+    fast = climbed(Function(with_hessian), start, free=ONE, options=options)
+    # a step of a third of the way leaves 0.2, Newton's the damping's 1e-4 of 0.3
+    assert slow.states[0, 0] == pytest.approx(0.2, abs=1e-4)
+    assert fast.states[0, 0] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_curvature_that_is_too_large_is_corrected_by_what_gradients_show() -> None:
+    # nine times too large along one direction, right along the other: nine steps by it alone would
+    # leave (8/9)^9 = 0.35 of the way
+    def ridge(x: Floats) -> tuple[float, Floats, Floats]:
+        bent = np.array([100.0, 4.0])
+        return 10 - 0.5 * float(bent @ x**2), -bent * x, np.diag([900.0, 4.0])
+
+    term = Function(ridge)
+    ascent = climbed(term, np.array([0.03, 0.05]), options=NewtonOptions(tolerance=1e-8))
+    assert len(term.asked) <= 10
+    # where 1e-8 of the value is left to be gained, √(2e-7 / 4) of the way along the flat one is
+    np.testing.assert_allclose(ascent.states[0], 0.0, atol=3e-4)
+
+
+def test_a_gradient_that_hardly_falls_lengthens_steps_tenfold_at_most() -> None:
+    # of a curvature of 100 gradients show 1: the second step is ten times as long, not a hundred
+    def flat(x: Floats) -> tuple[float, Floats, Floats]:
+        return 10 - 0.5 * float(x @ x), -x, np.array([[100.0]])
+
+    seen = list[float]()
+
+    def noted(x: Floats) -> tuple[float, Floats, Floats]:
+        seen.append(float(x[0]))
+        return flat(x)
+
+    options = NewtonOptions(iterations=3, damping=1e-6)
+    climbed(noted, np.array([1.0]), free=ONE, options=options)
+    assert seen == pytest.approx([1.0, 0.99, 0.891], abs=1e-4)
+    # a first step that gains 0.8 % of the value is not near the top: the next is no longer for it
+    seen.clear()
+    climbed(noted, np.array([3.0]), free=ONE, options=options)
+    assert seen == pytest.approx([3.0, 2.97, 2.9403], abs=1e-4)
 
 
 def test_a_hessian_that_is_not_definite_does_not_lead_to_the_valley_between_two_hills() -> None:

@@ -93,3 +93,27 @@ def test_five_detections_of_a_body_of_36_features_are_enough_for_all_draws() -> 
     # one chunk of those far apart, and four that are drawn, the last among all five
     assert len(found) == 5
     assert rotation_angle_deg(T, np.concatenate(found)).min() < 0.1
+
+
+def test_guesses_of_one_camera_face_it() -> None:
+    # two squares back to back: of a triple on one of them, half of the poses show its back
+    square = np.array([[-30.0, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0]])
+    points = np.concatenate([square, np.add(square, [0.0, 0.0, 40.0])])
+    normals = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 4, axis=0)
+    body = Body("box", tuple(PointFeature(z) for z in points), normals)
+    bare = Body("box", body.features)
+    camera = PinholeCamera(np.array([[1500.0, 0, 640], [0, 1500, 512], [0, 0, 1]]))
+    truth = from_rotation_vector(np.array([0.3, -0.2, 0.1]), np.array([10.0, -20.0, 600.0]))
+    rays = camera.rays(camera.project(transform(truth, square))[0])
+
+    def guesses(one: Body) -> np.ndarray:
+        problem = SearchProblem([], one, ALL_FREE, np.eye(4), budget=SearchBudget())
+        return np.concatenate([make() for make in from_three_rays(problem, 4.5, rays)])
+
+    facing = guesses(body)
+    away = transform(facing, points)
+    outward = facing[:, :3, :3] @ normals.T
+    seen = np.count_nonzero((outward.swapaxes(1, 2) * away).sum(axis=2) < 0, axis=1)
+    assert seen.min() >= 3
+    assert len(facing) < len(guesses(bare)) / 2
+    assert np.abs(facing - truth).max(axis=(1, 2)).min() < 1e-6

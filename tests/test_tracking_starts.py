@@ -100,6 +100,20 @@ def test_a_grid_that_has_slipped_is_put_back_along_its_own_axes(
     assert not list(look_alikes(data, [judged_here(data, TRUTH)]))
 
 
+def test_poses_that_are_as_evident_do_not_take_turns_for_ever(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    board = grid(7, 5)
+    data = data_of(
+        Tracker.create(board, EstimatorOptions(), TRUTH), detect(pinhole_cameras, board, TRUTH)
+    )
+    slipped = judged_here(data, shifted(TRUTH, np.array([20.0, 0.0, 0.0])))
+    once, ranked = len(list(look_alikes(data, [slipped]))), [slipped]
+    for count, _ in enumerate(look_alikes(data, ranked), 1):
+        ranked[0] = replace(ranked[0])  # another record that says the same
+        assert count <= once
+
+
 def test_a_board_with_a_row_more_than_there_is_stays_ambiguous_however_it_moves(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

@@ -114,6 +114,20 @@ _BODY = (
 
 _OPTIMISE = (
     Mutant(
+        "optimise-curvature-as-told",
+        "optimise/ascent.py",
+        "for step, change in self._shown[k]:",
+        "for step, change in self._shown[k][:0]:",
+        "where offsets are as large as the blur, steps get ever smaller",
+    ),
+    Mutant(
+        "optimise-as-flat-as-gradients-show",
+        "optimise/ascent.py",
+        "share = min((1 - self._options.least_seen) * along / max(along - seen, _TINY), 1.0)",
+        "share = 1.0",
+        "where a gradient hardly falls the next step leads anywhere",
+    ),
+    Mutant(
         "optimise-accepts-what-is-worse",
         "optimise/ascent.py",
         "is_better = better[row] > values[k] or",

@@ -6,6 +6,13 @@ from mutation.mutant import Mutant
 
 _ATLAS = (
     Mutant(
+        "density-a-tile-for-each-of-many-places",
+        "density/atlas.py",
+        "places > planes * self._most_pages",
+        "places < 0",
+        "a sheet of hundreds of dots takes ten times as long at wide blurs",
+    ),
+    Mutant(
         "density-second-detection-of-a-tile-lost",
         "density/atlas.py",
         "place = np.arange(len(of)) - of.searchsorted(of)",

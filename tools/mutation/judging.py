@@ -44,6 +44,13 @@ _NOISE = (
 
 _FIELDS = (
     Mutant(
+        "judgement-pairs-of-markers-forgotten",
+        "judgement/noise.py",
+        "max(float(pairs - np.vdot(both, both)), 0.0)",
+        "0.0",
+        "markers that are off seem to be seen more surely than they are",
+    ),
+    Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
         "by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T",

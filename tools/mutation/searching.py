@@ -372,6 +372,14 @@ _SEARCH = (
         "guesses from three points are turned the wrong way",
     ),
     Mutant(
+        "search-guesses-seen-from-behind",
+        "search/three_points.py",
+        "poses[((outward * away).sum(axis=1) < 0).all(axis=0)]",
+        "poses[((outward * away).sum(axis=1) < 0).any(axis=0)]",
+        "a search of one camera counts ten times as many guesses as can be",
+        ("test_search_p3p.py",),
+    ),
+    Mutant(
         "search-every-pose-a-candidate",
         "search/search.py",
         "if ranks[k] > least]",

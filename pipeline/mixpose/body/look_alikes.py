@@ -18,6 +18,7 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from mixpose.body.features import PointFeature
@@ -203,6 +204,12 @@ def _spacing(body: Body) -> float:
     return float(apart.min())
 
 
+@lru_cache(maxsize=256)
+def _tree(body: Body) -> cKDTree:
+    """The features, for their neighbours."""
+    return cKDTree(body.means)
+
+
 def _bases(points: Floats, tolerance: float) -> list[list[int]]:
     """Wide triples of points (n, 3), such that each point is missing in one where there are more.
 
@@ -273,9 +280,9 @@ def _partners(
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Nearest partners (K, n) of features moved by motions (K, 4, 4), and whether they will do."""
     moved = transform(T_other_body, body.means[chosen])
-    away = cdist(moved.reshape(-1, 3), other.means).reshape(*moved.shape[:2], len(other))
-    partners = away.argmin(axis=2)
-    near = away.min(axis=2) <= reach
+    away, partners = _tree(other).query(moved, distance_upper_bound=reach)
+    near = np.isfinite(away)
+    partners[~near] = 0
     if body.normals is not None and other.normals is not None:
         turned = _unit(body.normals[chosen]) @ np.swapaxes(T_other_body[:, :3, :3], 1, 2)
         near &= (turned * _unit(other.normals)[partners]).sum(axis=2) > SAME_NORMAL

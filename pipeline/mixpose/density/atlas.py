@@ -29,6 +29,7 @@ from mixpose.records import Floats, GridPattern, Indices, Mask, Pattern, Singles
 
 # tiles that are drawn at once: they have room for as many detections each
 _TOGETHER = math.isqrt(DRAWING.few_pairs)
+_BESIDE = 5  # pages along a box of no size
 
 
 def remap(values: Singles, u: Singles, v: Singles) -> Any:
@@ -86,7 +87,7 @@ class Atlas:
     def look_up(self, y: Floats) -> Floats:
         """Densities and gradients (L, H, n, 3) at places (L, H, n, 2)."""
         index = y * self.per_unit
-        if self._grids or index.size > 2 * DRAWING.own_tiles:
+        if self._grids or index.size > 2 * DRAWING.own_tiles or self._are_more_than_pages(index):
             self.pages.find(index, self._drawn_pages)
             self.values = self.pages.values
         else:
@@ -114,6 +115,16 @@ class Atlas:
             self._own = around, shifts, values
         index += shifts
         self.values = values
+
+    def _are_more_than_pages(self, index: Floats) -> bool:
+        """Whether there are more places than all pages of their planes, as at wide blurs."""
+        places, planes = index.size / 2, len(index)
+        return places > planes * _BESIDE**2 and places > planes * self._most_pages
+
+    @cached_property
+    def _most_pages(self) -> float:
+        """Pages of a plane that holds all that is seen, about."""
+        return _count(self._q.min(axis=0), self._q.max(axis=0), self.tile)
 
     @cached_property
     def pages(self) -> Pages:
@@ -328,5 +339,5 @@ def _middles_of_drawn(count: int, side: int) -> Floats:
 
 
 def _count(lower: Floats, upper: Floats, page: int) -> float:
-    """Pages of a box in cells, about."""
-    return float(((upper - lower) / page + 5).prod())
+    """Pages of a box in cells, about, with those that reach beside it."""
+    return float(((upper - lower) / page + _BESIDE).prod())

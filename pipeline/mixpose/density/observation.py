@@ -201,7 +201,8 @@ def close_pairs(places: Floats, variances: Floats) -> Indices:
     """Pairs i < j (P, 2) of n points that overlap in one of K pictures (K, n, m), each blurred."""
     reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
     each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
-    return np.unique(np.concatenate(each), axis=0).astype(np.intp)
+    n = places.shape[1]
+    return np.stack(np.divmod(np.unique(np.concatenate(each) @ [n, 1]), n), axis=1)
 
 
 @lru_cache

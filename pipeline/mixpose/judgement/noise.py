@@ -129,17 +129,26 @@ def noise_of(
     # residuals, Jacobian and fields, weighted
     roots = (np.sqrt(shares) / noise[:, None]).ravel().repeat(2)
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
-    J, (fields, kinds) = rows[:, chosen], fields_of(found, shares, met, rows)
-    inverse = inverted(J.T @ J)
-    # by how much fields move the pose, and what it leaves of them
-    left = fields - J @ (drawn := inverse @ (J.T @ fields))
-    q = fields.shape[1] - 3 * shares.shape[1]  # those of the sensors may last
-    lasting = left[:, :q] / (sizes := noise.repeat(q // len(noise)))
+    J, fields = rows[:, chosen], fields_of_sensors(found, shares, met)
+    markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
+    inverse, q = inverted(J.T @ J), fields.shape[1]
+    by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
+    taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
+    # by how much fields move the pose, and what it leaves of those of sensors, which may last
+    left = fields - J @ (drawn := inverse @ taken)[:, :q]
+    lasting = left / (sizes := noise.repeat(q // len(noise)))
     biases, mean, second = _lasting(before.biases, found.names, lasting, r, model)
     rest, (covariance, steady) = r - lasting @ mean, np.zeros((2, 6, 6))
-    pulls, moved = np.append(rest @ fields[:, :q], r @ fields[:, q:]), drawn[:, :q] / sizes
+    by_markers = of_each(r[:, None], found).swapaxes(1, 2) @ markers
+    pulls, moved = np.append(rest @ fields, by_markers), drawn[:, :q] / sizes
     steady[inner] = moved @ second @ moved.T
-    own = _normal_equations(rest, float(met @ found.dimensions) - count, fields, left, pulls, kinds)
+    spare = float(met @ found.dimensions) - count
+    own = np.zeros((4, 5))
+    if spare > 0:
+        own[:, :4] = expected_squares(
+            fields, left, of_each(left, found), markers, taken, drawn, kinds
+        )
+        own[0, 0], own[0, 4], own[1:, 4] = spare, rest @ rest, pulls**2 @ kinds[:, 1:]
     moments = model.memory * before.moments + own
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
@@ -193,19 +202,21 @@ def _level(
     return variances, scale, told, degrees, ratio
 
 
-def fields_of(found: Matches, shares: Floats, met: Floats, J: Floats) -> tuple[Floats, Floats]:
-    """Fields (R, q + 3 N) of sensors and markers; (q + 3 N, 4) is 1 for the kind of each.
+def of_each(rows: Floats, found: Matches) -> Floats:
+    """Rows (R, k) of all sensors by marker (N, 2 L, k)."""
+    L, N = found.shares.shape
+    return rows.reshape(L, N, 2, -1).swapaxes(0, 1).reshape(N, 2 * L, -1)
 
-    Those of sensors first, then of each marker what it is off by along the axes of the world (3).
+
+def _by_marker(found: Matches, by_place: Floats) -> Floats:
+    """Fields (N, 2 L, 3) of each marker: what it is off by along the axes of the world.
+
+    Of weighted Jacobians (R, 3) by its place; a field is nothing in the rows of other markers.
     """
-    L, N = shares.shape
     # in units of how features move with the body, the root mean square of those in view
-    by_place, counts = J[:, :3], 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
+    counts = 3 * (found.weights > 0).sum(axis=1) @ found.dimensions
     moved = math.sqrt(float(np.vdot(by_place, by_place)) / max(float(counts), 1.0))
-    own, kinds = _of_markers(L, N)
-    of_markers = (by_place / max(moved, 1e-6)).reshape(L, N, 2, 1, 3) * own
-    both = fields_of_sensors(found, shares, met), of_markers.reshape(len(J), -1)
-    return np.concatenate(both, axis=1), kinds
+    return of_each(by_place, found) / max(moved, 1e-6)
 
 
 def fields_of_sensors(found: Matches, shares: Floats, met: Floats) -> Floats:
@@ -235,10 +246,9 @@ def _of_sensors(dimensions: tuple[int, ...]) -> Floats:
 
 
 @lru_cache(maxsize=64)
-def _of_markers(sensors: int, markers: int) -> tuple[Floats, Floats]:
-    """Which rows the columns of markers are of, and the kinds of all fields."""
-    kinds = np.eye(4)[[1, 2, 2] * (2 * sensors) + [3] * (3 * markers)]
-    return np.eye(markers)[:, None, :, None], kinds
+def kinds_of(sensors: int, markers: int) -> Floats:
+    """The kinds (q + 3 N, 4) of all fields, as ones: those of sensors, then those of markers."""
+    return np.eye(4)[[1, 2, 2] * (2 * sensors) + [3] * (3 * markers)]
 
 
 def _lasting(
@@ -266,21 +276,34 @@ def _lasting(
     return biases, np.zeros(len(v)), np.zeros(A.shape)
 
 
-def _normal_equations(
-    r: Floats, redundancy: float, fields: Floats, left: Floats, pulls: Floats, kinds: Floats
+def expected_squares(
+    fields: Floats,
+    left: Floats,
+    left_by_marker: Floats,
+    markers: Floats,
+    taken: Floats,
+    drawn: Floats,
+    kinds: Floats,
 ) -> Floats:
-    """Moments (4, 5), [expected | seen], of independent errors and fields of each kind.
+    """What independent errors and fields of each kind add to squares, (4, 4), but for tr R.
 
-    `left` is what a pose leaves of fields, `pulls` how these pull at residuals, `redundancy` tr R.
+    `left` (R, q) is what a pose leaves of `fields` of sensors, also by marker (N, 2 L, q); A⁻¹ of
+    `taken` = JᵀWP (k, q + 3 N) is `drawn`.  What a pose leaves of two markers' fields is of the
+    rank of the pose: sums over pairs of markers are sums over markers.
     """
-    moments = np.zeros((4, 5))
-    if redundancy > 0:
-        gram = fields.T @ left
-        moments[:, :4] = kinds.T @ gram**2 @ kinds
-        moments[0, :4] = moments[:, 0] = gram.diagonal() @ kinds
-        moments[0, 0], moments[0, 4] = redundancy, r @ r
-        moments[1:, 4] = pulls**2 @ kinds[:, 1:]
-    return moments
+    q, count, N = fields.shape[1], len(taken), len(markers)
+    beside = (left_by_marker.swapaxes(1, 2) @ markers).swapaxes(0, 1).reshape(q, 3 * N)
+    gram = np.concatenate([fields.T @ left, beside], axis=1)
+    U, W = (one[:, q:].reshape(count, N, 3).transpose(1, 0, 2) for one in (taken, drawn))
+    both = U.swapaxes(1, 2) @ W
+    own = markers.swapaxes(1, 2) @ markers - both
+    pairs = np.vdot(taken[:, q:] @ taken[:, q:].T, drawn[:, q:] @ drawn[:, q:].T)
+    expected = kinds[:q].T @ gram**2 @ kinds
+    expected[3, 3] = np.vdot(own, own) + max(float(pairs - np.vdot(both, both)), 0.0)
+    expected[3, :3] = expected[:3, 3]
+    diagonals = gram.diagonal(), own.diagonal(axis1=1, axis2=2).ravel()
+    expected[0] = expected[:, 0] = np.concatenate(diagonals) @ kinds
+    return np.asarray(expected)
 
 
 def _variances(

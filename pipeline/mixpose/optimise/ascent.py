@@ -2,6 +2,9 @@
 
 Knows neither images nor poses: a term gives second-order models, and the caller says how steps
 move states.  Each state has its damping and its end; those that ended are evaluated no further.
+What gradients showed along its last steps corrects the curvature of the terms (limited-memory BFGS,
+Nocedal, Math. Comp. 35 (1980) 773): one that is too large along some direction, as that of
+mean-shift where offsets are as large as the blur, would lead there in ever smaller steps.
 """
 
 from __future__ import annotations
@@ -75,6 +78,14 @@ class NewtonOptions:
     least_curvature: float = constant(
         0.3, "of the curvature: where a Hessian is flatter, its step would lead too far"
     )
+    shown_from: float = constant(
+        2.5e-3,
+        "of the value, that a step gains at most before its gradients are believed: r²/4σ² of a "
+        "tenth of the blur; farther away longer steps lead to another maximum",
+    )
+    least_seen: float = constant(
+        0.1, "the same of what gradients show along a step (Powell, Math. Program. 14 (1978) 224)"
+    )
 
 
 class Ascent(NamedTuple):
@@ -121,6 +132,7 @@ class _Climb:
         self._damping = [options.damping] * count
         self.steps, self.gains = _steps(here, self._free, self._damping, options)
         self._before = [0.0] * count  # gains of the steps before these
+        self._shown: list[list[tuple[Floats, Floats]]] = [[] for _ in range(count)]
         self._is_taken = [options.unchecked] * count  # whether the step is taken unseen
 
     def unfinished(self, going: list[int]) -> list[int]:
@@ -142,6 +154,8 @@ class _Climb:
     def take(self, tried: Any, there: Quadratic, asked: list[int], going: list[int]) -> list[int]:
         """Go to states that are better, and damp the other steps: those that are not stuck."""
         options, values, better = self._options, self._here.value.tolist(), there.value.tolist()
+        if not options.unchecked and there.hessian is None:
+            there = self._as_shown(there, asked)
         count, ease = len(values), 1 if options.unchecked else 10
         damping = [max(self._damping[k] / ease, _NO_DAMPING) for k in asked]
         steps, gains = _steps(there, self._free, damping, options)
@@ -167,6 +181,24 @@ class _Climb:
         self._here = Quadratic._make(both).of(chosen)
         self.steps, self.gains = _steps(self._here, self._free, self._damping, options)
         return left
+
+    def _as_shown(self, there: Quadratic, asked: list[int]) -> Quadratic:
+        """Models at states that were tried, with what gradients show along the last six steps."""
+        curvature, falls = there.curvature.copy(), self._here.gradient[asked] - there.gradient
+        for row, (k, fall) in enumerate(zip(asked, falls * self._free, strict=True)):
+            if self.gains[k] > self._options.shown_from * abs(float(self._here.value[k])):
+                continue
+            self._shown[k] = [*self._shown[k][-5:], (self.steps[k], fall)]
+            for step, change in self._shown[k]:
+                expected = curvature[row] @ step
+                along, seen = float(step @ expected), float(step @ change)
+                if along <= 0:
+                    continue
+                share = min((1 - self._options.least_seen) * along / max(along - seen, _TINY), 1.0)
+                blend = share * change + (1 - share) * expected
+                curvature[row] += np.outer(blend, blend / (step @ blend))
+                curvature[row] -= np.outer(expected, expected / along)
+        return there._replace(curvature=curvature)
 
     def ended(self, move: Callable[[Any, Floats], Any]) -> Ascent:
         """Where all states are, once the last steps are taken."""

@@ -169,7 +169,7 @@ def from_three_rays(problem: SearchProblem, reach: float, rays: Rays) -> Guesses
     """Poses from triples of one camera's rays, whose detections err by `reach` px at most."""
     solve = _perspective if rays.central else _orthographic
     for triples in ray_triples(problem, rays) if min(len(rays), len(problem.body)) > 2 else ():
-        yield partial(solve, problem.body.means, reach, rays, *triples)
+        yield partial(solve, problem.body, reach, rays, *triples)
 
 
 def far_apart(points: Floats, count: int) -> Indices:
@@ -239,29 +239,35 @@ def _drawn(nearest: Indices, crowd: int, count: int, rng: np.random.Generator) -
 
 
 def _perspective(
-    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+    body: Body, reach: float, rays: Rays, detections: Indices, corners: Indices
 ) -> Floats:
     """Three rays that meet in one centre."""
+    features = body.means
     between = rays.directions @ rays.directions.T
     squared = ((features[corners[FIRST]] - features[corners[SECOND]]) ** 2).sum(axis=-1)
     distances, which = depths(between[detections[FIRST], detections[SECOND]], squared)
     # smaller than the error in the image, nothing is told apart
     near = np.sqrt(squared.max(axis=0))[which] > reach * rays.slope * distances.min(axis=0)
-    distances, which = distances[:, near], which[near]
-    away = gathered(rays.directions, detections[:, which]) * distances[:, None]
-    return align_triples(gathered(features, corners[:, which]), rays.origins[0][:, None] + away)
+    distances, corners, detections = distances[:, near], corners[:, which], detections[:, which]
+    corners, detections = corners[:, near], detections[:, near]
+    away = gathered(rays.directions, detections) * distances[:, None]
+    poses = align_triples(gathered(features, corners), rays.origins[0][:, None] + away)
+    if body.normals is None:
+        return poses
+    outward = np.einsum("kij,cjk->cik", poses[:, :3, :3], gathered(body.normals, corners))
+    return np.asarray(poses[((outward * away).sum(axis=1) < 0).all(axis=0)])
 
 
 def _orthographic(
-    features: Floats, reach: float, rays: Rays, detections: Indices, corners: Indices
+    body: Body, reach: float, rays: Rays, detections: Indices, corners: Indices
 ) -> Floats:
     """Three parallel rays: the sides' lengths give depth differences, which must add up.
 
     The depth of the whole is not seen; the middle is put on the sensor's plane.
     """
-    body, seen = gathered(features, corners), gathered(rays.origins, detections)
+    features, seen = gathered(body.means, corners), gathered(rays.origins, detections)
     tolerance = 2 * reach * rays.offset
-    length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (body, seen))
+    length, flat = (np.linalg.norm(p[SECOND] - p[FIRST], axis=1) for p in (features, seen))
     rise = np.sqrt(np.maximum(length**2 - flat**2, 0.0))
     rise[flat > length + tolerance] = np.nan
     poses = []
@@ -269,5 +275,5 @@ def _orthographic(
         good = np.abs(np.abs(rise[1] - sign * rise[0]) - rise[2]) <= tolerance
         depth = mirror * np.array([0 * rise[0], sign * rise[0], rise[1]])[:, None, good]
         world = seen[..., good] + (depth - depth.mean(axis=0)) * rays.directions[0][:, None]
-        poses.append(align_triples(body[..., good], world))
+        poses.append(align_triples(features[..., good], world))
     return np.concatenate(poses)

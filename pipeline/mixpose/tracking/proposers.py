@@ -24,7 +24,7 @@ from mixpose.matching import LEAST_VARIANCE, Matches, welsch
 from mixpose.optimise import LinearResiduals, least_squares
 from mixpose.records import Floats
 from mixpose.rigid import perturb, transform
-from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame
+from mixpose.search import Candidate, Descent, SearchReport, SearchState, search_frame, sparse
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import Likelihood
 
@@ -77,7 +77,8 @@ def multistart(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     cube = np.random.default_rng(frame.options.seed).random((rules.drawn, 6))
     # uniform within √3 standard deviations each way
     drawn = perturb(first.T_world_object, (2 * cube - 1) * np.sqrt(3) * wide)
-    descent = Descent(frame.views, frame.body, frame.free, frame.rules.search)
+    few = sparse(frame.body, 8 * frame.rules.search.sample)  # of many, those far from one another
+    descent = Descent(frame.views, few, frame.free, frame.rules.search)
     poses = np.concatenate([first.T_world_object[None], drawn])
     poses = descent.refine(poses, [(stages[0][0], 0, rules.kept), *stages])
     values = descent.objective().value(poses)
@@ -135,11 +136,11 @@ def look_alikes(frame: Frame, ranked: list[ScoredPose]) -> Iterable[Start]:
     What is met may lie like other features, as a step of its grid off on a chessboard; a flat body
     that is small in an image looks almost the same tilted the other way.
     """
-    kinds, best = frame.rules.look_alikes.kinds, None
-    # once more, where what is moved is better and meets more
-    while "congruent" in kinds and ranked and ranked[0] is not best:
-        best = ranked[0]
-        yield from _as_evident(frame, best)
+    kinds, most = frame.rules.look_alikes.kinds, -np.inf
+    # once more, where what is moved is better: two that are as good would take turns for ever
+    while "congruent" in kinds and ranked and ranked[0].log_evidence > most:
+        most = ranked[0].log_evidence + 0.01
+        yield from _as_evident(frame, ranked[0])
     if ranked and "tilted" in kinds:
         yield from _tilted(frame, ranked[0])
 
