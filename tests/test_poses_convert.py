@@ -302,8 +302,8 @@ def test_several_objects_are_no_trajectory(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ([], "--format: found none, and no -o does not tell"),
-        (["-o", "poses.txt"], "--format: found none, and -o poses.txt does not tell"),
+        ([], "--format: missing, where there is no -o whose suffix tells the format"),
+        (["-o", "poses.txt"], "-o poses.txt: no format has this suffix; add --format"),
         (["--format", "tum", "--scene-id", "3"], "--scene-id: belongs to --format bop, found"),
         (["--format", "tum", "--object", "b"], "--object b: "),
         (["--format", "tum", "--unit", "m"], "says that its unit is mm"),

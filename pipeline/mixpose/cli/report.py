@@ -26,15 +26,15 @@ def write_report(poses_path: Path, truth_path: Path | None, output: Path) -> Non
     RecordingError
         If the poses or the truth cannot be read or compared.
     """
+    poses, cut = read_unfinished_poses(poses_path)
+    truth = None if truth_path is None else read_poses(truth_path)
+    inputs = (poses_path, truth_path, find_session(poses).path)
+    refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
     if output.suffix and output.suffix.casefold() not in _PAGES:
         raise SessionError(
             f"-o {output}: found the suffix {output.suffix}; a report is a page for a browser: "
             f"name it {output.with_suffix('.html').name}, and print that for a PDF"
         )
-    poses, cut = read_unfinished_poses(poses_path)
-    truth = None if truth_path is None else read_poses(truth_path)
-    inputs = (poses_path, truth_path, find_session(poses).path)
-    refuse_to_overwrite_but(output, [path for path in inputs if path is not None], MARK)
     page = render(poses, truth, cut=cut, version=__version__)
     try:
         with appearing_whole(output) as part:
