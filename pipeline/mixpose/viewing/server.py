@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -14,6 +16,8 @@ from websockets.http11 import Request, Response
 
 from mixpose.viewing.address import LOOPBACK, Place
 from mixpose.viewing.guard import ASKED_FOR, Answer, Guard
+
+_MADE_S = 0.01  # between two looks at whether the server is made
 
 
 class _Server(viser.ViserServer):  # type: ignore[misc]
@@ -35,7 +39,8 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
     """
     # a browser that breaks off, or one that is refused, is nothing to report
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
-    with _behind(place):
+    ready = threading.Event()
+    with _behind(place, ready):
         server = _Server(host=LOOPBACK, port=0, verbose=False)
 
     def count(_: viser.ClientHandle) -> None:
@@ -43,6 +48,7 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 
     server.on_client_connect(count)
     server.on_client_disconnect(count)
+    ready.set()
     try:
         yield server
     finally:
@@ -50,10 +56,11 @@ def started(place: Place, on_viewers: Callable[[int], None]) -> Iterator[viser.V
 
 
 @contextmanager
-def _behind(place: Place) -> Iterator[None]:
+def _behind(place: Place, ready: threading.Event) -> Iterator[None]:
     """Let a server that begins here use the socket of a place, and ask its guard first.
 
-    viser offers neither, so what it serves with is replaced while it begins.
+    viser offers neither, so what it serves with is replaced while it begins.  The socket takes
+    browsers from the start, viser only once it is made: they are held until it is `ready`.
 
     Raises
     ------
@@ -76,8 +83,13 @@ def _behind(place: Place) -> Iterator[None]:
             response: Response | None = process_request(connection, request)
             return response
 
+        async def handle(connection: Any) -> None:
+            while not ready.is_set():
+                await asyncio.sleep(_MADE_S)
+            await handler(connection)
+
         guarded.append(True)
-        return usual(handler, sock=place.socket, process_request=process, **options)
+        return usual(handle, sock=place.socket, process_request=process, **options)
 
     websockets.asyncio.server.serve = serve
     try:
