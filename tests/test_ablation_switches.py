@@ -74,7 +74,7 @@ SHOWN_BY = {
     "noise: no offsets before they are seen": "two_cameras",
     "noise: nothing lasts": "a camera slightly turned",
     "blurs end at σ_ε": "fast",
-    "no F enlargement": "two_cameras",
+    "noise of few residuals as of many": "two_cameras",
     "late sensors taken as in time": "real_room",
     "features equally bright": "range_profiles",
     "misfit taken for noise": DEFORMED,

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 FREE = np.ones(6, dtype=np.bool_)
 MODEL = NoiseModel()
-ALONE = replace(MODEL, confidence=0.0, lasting=0.0, errors=ErrorRules(cut=0.0))
+ALONE = replace(MODEL, fewest_degrees=1e12, lasting=0.0, errors=ErrorRules(chances=(0.0, 0.0)))
 """Nothing is enlarged or cut, and nothing believed to last before it is seen."""
 
 
@@ -61,10 +61,14 @@ def fitted(found: list[Seen], errors: list[Floats]) -> tuple[list[Seen], Floats]
     return left, off
 
 
-def test_the_ellipsoid_of_few_residuals_is_that_of_the_f_distribution() -> None:
-    # tables: F of 6 and 10 degrees is 3.217 at 95 %, χ² of 6 is 12.592
-    assert MODEL.enlargement(6, 10.0) == pytest.approx(6 * 3.217 / 12.592, rel=1e-3)
-    assert MODEL.enlargement(6, 1e6) == pytest.approx(1.0, rel=1e-4)
+def test_the_variance_by_few_residuals_is_that_of_students_distribution() -> None:
+    # ν / (ν − 2), for ν = 10; errors drawn with a variance that ten residuals tell agree
+    assert MODEL.enlargement(np.array([10.0, 1e6])) == pytest.approx([1.25, 1.0], rel=1e-4)
+    rng = np.random.default_rng(0)
+    told = (rng.normal(size=(100_000, 10)) ** 2).mean(axis=1)
+    squared = (rng.normal(size=100_000) ** 2 / told).mean()
+    # by chance off by 0.8 %
+    assert squared == pytest.approx(float(MODEL.enlargement(np.array([10.0]))[0]), rel=0.03)
 
 
 def test_a_pose_uses_up_six_of_the_coordinates_met() -> None:

@@ -128,7 +128,7 @@ SWITCHES = (
     Switch("noise: no offsets before they are seen", ruled("judgement.noise", lasting=0.0)),
     Switch("noise: nothing lasts", ruled("judgement.noise", bias=0.0)),
     Switch("blurs end at σ_ε", ruled("judgement.noise.errors", narrowest=1.0)),
-    Switch("no F enlargement", ruled("judgement.noise", confidence=0.0)),
+    Switch("noise of few residuals as of many", ruled("judgement.noise", fewest_degrees=1e12)),
     Switch("late sensors taken as in time", at_one_moment),
     Switch("features equally bright", ruled("fit", unlike=0.0)),
     Switch("misfit taken for noise", ruled("fit", believed=1.0)),

@@ -261,7 +261,7 @@ _RANGE_POSTERIOR = (
     Mutant(
         "tracking-ranges-covariance-not-enlarged",
         "tracking/likelihood.py",
-        "covariance *= model.noise.enlargement(count, degrees)",
+        "covariance *= model.noise.enlargement(degrees)",
         "covariance *= 1.0",
         "covariances of ranges are too small at first",
         (_RANGES,),

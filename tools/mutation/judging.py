@@ -8,7 +8,7 @@ _NOISE = (
     Mutant(
         "judgement-few-residuals-are-as-good-as-many",
         "judgement/noise.py",
-        "return np.asarray(directions * tail / chdtri(directions, 1 - self.confidence))",
+        "return np.asarray(known / (known - 2))",
         "return np.ones(np.shape(degrees))",
         "covariances of few features are too small",
     ),
@@ -106,17 +106,17 @@ _CUT = (
     Mutant(
         "judgement-nothing-is-cut",
         "judgement/cut.py",
-        "chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < outside",
-        "chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < 1",
+        "np.where(v > 1, np.array([*errors.chances, 0.0])[:, None], 0.0)",
+        "np.zeros(v.shape)",
         "a pose of few spots is as sure as if none of them could be cut",
         ("test_judgement_cut.py",),
     ),
     Mutant(
-        "judgement-cut-as-told-along-rows",
+        "judgement-cut-moves-no-pose",
         "judgement/cut.py",
-        "np.linalg.eigvalsh(J @ C @ J.swapaxes(1, 2))",
-        "(J @ C @ J.swapaxes(1, 2))[:, 0, 0]",
-        "that nothing else tells of a spot along a slant is not seen",
+        "np.vecdot(wider, own) + np.vecdot(pulled, along)",
+        "np.vecdot(wider, own)",
+        "that a cut spot has pulled the pose aside does not count beyond the ellipsoid",
         ("test_judgement_cut.py",),
     ),
     Mutant(

@@ -4,10 +4,12 @@ Without feature i, of Jacobian J_i, a pose of covariance C moves by −C J_iᵀ 
 M r that the others leave, M = (1 − J_i C J_iᵀ)⁻¹, all in units of the noise.  If i is as wide as v
 of these, the others expect e with the covariance P = M + v − 1, and the pose has then
 
-    C + (v − 1) C J_iᵀ M P⁻¹ J_i C,    moved by −(v − 1) C J_iᵀ P⁻¹ e.
+    Σ = C + (v − 1) C J_iᵀ M P⁻¹ J_i C,    moved by μ = −(v − 1) C J_iᵀ P⁻¹ e.
 
 The covariance of all cases together, as probable as each is, is that of the pose; and it is larger
-by as much as it takes to have all but few truths inside its ellipsoid.
+by as much as it takes to have all but few truths inside its ellipsoid.  By an inverse covariance B
+squared distances of one case have the mean tr BΣ + μᵀBμ and the variance 2 tr (BΣ)² + 4 μᵀBΣBμ,
+and are taken for a multiple of χ² with as much.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from scipy.special import chdtrc, chdtri
 
 from mixpose.matching import ErrorRules, Matches
 from mixpose.records import Floats
+
+LARGER = np.geomspace(1.0, 30.0, 40)  # a step is 9 % of a variance
 
 
 def with_cut_spots(
@@ -33,22 +37,19 @@ def with_cut_spots(
 ) -> tuple[Floats, float]:
     """What a covariance (k, k) is larger by as one detection may be cut, and a factor for both."""
     is_spot = (found.detections >= 0) & (found.dimensions == 2)[:, None]
-    met, chance = (is_spot & (found.shares > 0)).nonzero(), errors.cut
-    J, r = J.reshape(*found.shares.shape, 2, len(C))[met], r.reshape(*found.shares.shape, 2)[met]
-    # a cut that moves the pose out of its ellipsoid shows in what others tell as well
-    shares = np.linalg.eigvalsh(J @ C @ J.swapaxes(1, 2))
-    leverage, limit = max(float(shares.max(initial=0.0)), 1e-9), float(chdtri(len(C), outside))
-    if chance * math.exp(-0.5 * limit * max(1 / leverage - 1, 0.0)) < outside:
+    met, k = (is_spot & (found.shares > 0)).nonzero(), len(C)
+    if not (len(met[0]) and k and any(errors.chances)):
         return np.zeros(C.shape), 1.0
+    J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = np.linalg.pinv(np.linalg.pinv(C, hermitian=True) + np.diag(1 / known**2), hermitian=True)
     G = J @ C
     values, axes = np.linalg.eigh(G @ J.swapaxes(1, 2))
     M, axes = 1 / np.maximum(1 - values, 1e-9), axes.swapaxes(1, 2)
     G, r = axes @ G, (axes @ r[..., None])[..., 0]
     m, s2 = found.dimensions[met[0]], variances[met]
-    v = np.maximum(np.array([errors.typical**2, 1.0, 1e9])[:, None] / s2, 1.0)
+    v = np.maximum(np.array([*np.square(errors.cuts), 1e9])[:, None] / s2, 1.0)
     # a little or much; what is somebody else's may be anywhere
-    prior = np.where(v > 1, chance / 2 / (1 - chance), 0.0)
+    prior = np.where(v > 1, np.array([*errors.chances, 0.0])[:, None], 0.0)
     prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1]) ** (m / 2)
     P = M + (v - 1)[..., None]
     shares = (v - 1)[..., None] / P
@@ -57,16 +58,38 @@ def with_cut_spots(
     top = max(float(logs.max()), 0.0)
     chances = np.exp(logs - top)
     chances /= math.exp(-top) + chances.sum()
-    moves, wider = -((M * r * shares)[..., None] * G).sum(axis=2), M * shares
-    rows, weights = G.reshape(-1, len(C)), np.vecdot(chances.T[:, None], wider.transpose(1, 2, 0))
-    by_case = moves.reshape(-1, len(C))
+    along, wider = -(M * r * shares), M * shares  # μ and Σ − C by rows of G
+    by_case = (along[..., None] * G).sum(axis=2).reshape(-1, k)
+    rows, weights = G.reshape(-1, k), np.vecdot(chances.T[:, None], wider.transpose(1, 2, 0))
     spread = rows.T @ (weights.reshape(-1, 1) * rows)
     spread += by_case.T @ (chances.reshape(-1, 1) * by_case)
-    inverse = np.linalg.pinv(C + spread, hermitian=True)
-    mean = np.vdot(C, inverse) + np.vecdot(moves @ inverse, moves)
-    mean += (wider * np.vecdot(G @ inverse, G)).sum(axis=2)
-    # of squares of two normal directions, in which a detection moves it, with such a mean
-    larger = np.geomspace(1.0, 30.0, 12)
-    limits = 2 * limit * larger / np.maximum(mean, 1e-9)[..., None]
-    beyond = np.tensordot(chances, chdtrc(2, limits))
-    return spread, float(larger[int((beyond > outside)[:-1].sum())])
+    whole = 1 - float(chances.sum())
+    return spread, _larger(C, spread, G, along, wider, chances, whole, outside)
+
+
+def _larger(
+    C: Floats,
+    spread: Floats,
+    G: Floats,  # (n, 2, k)
+    along: Floats,  # (V, n, 2)
+    wider: Floats,  # (V, n, 2)
+    chances: Floats,  # (V, n)
+    whole: float,  # chance that nothing is cut
+    outside: float,
+) -> float:
+    """The factor by which an ellipsoid (k, k) has all but some truths inside."""
+    B = np.linalg.pinv(C + spread, hermitian=True)
+    BC = B @ C
+    H, K = G @ B @ G.swapaxes(1, 2), G @ BC @ B @ G.swapaxes(1, 2)
+    own, beside = (one.diagonal(axis1=1, axis2=2) for one in (H, K))
+    pulled = (along[..., None, :] @ H)[..., 0, :]
+    mean = np.trace(BC) + np.vecdot(wider, own) + np.vecdot(pulled, along)
+    variance = np.vdot(BC, BC.T) + 2 * np.vecdot(wider, beside)
+    variance += np.vecdot((wider[..., None, :] @ H**2)[..., 0, :], wider)
+    variance += 2 * np.vecdot((along[..., None, :] @ K)[..., 0, :], along)
+    variance += 2 * np.vecdot(pulled**2, wider)
+    # of half the variances: a multiple of χ² with as many degrees of freedom
+    means, halves = np.append(mean, np.trace(BC)), np.append(variance, np.vdot(BC, BC.T))
+    limits = float(chdtri(len(C), outside)) * LARGER[:, None] * means / halves
+    beyond = chdtrc(means**2 / halves, limits) @ np.append(chances, whole)
+    return float(LARGER[int((beyond > outside)[:-1].sum())])

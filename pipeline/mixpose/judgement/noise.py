@@ -7,7 +7,7 @@ all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, field
     rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
 is expected of residuals r (C. R. Henderson's method of moments), and the covariance of a pose is
-s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as the F distribution says.
+s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, variances enlarged as by Student.
 
 Fields of a sensor that last, of sizes γ in σ_ε, show in fading sums A of PᵀWRP and v of PᵀWr.  With
 γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance
@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from scipy.linalg.lapack import dposv
 from scipy.optimize import nnls
-from scipy.special import chdtri, fdtri
+from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
@@ -55,22 +55,17 @@ class NoiseModel:
         10.0, "detections that tell a change of noise from something that cuts every second spot"
     )
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
-    confidence: float = constant(0.95, "of the F distribution's ellipsoid; 0 enlarges nothing")
+    fewest_degrees: float = constant(3.0, "of freedom that a variance has at least: thrice as wide")
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
     turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
     shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
     bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
-    def enlargement(self, directions: int, degrees: Floats | float) -> Floats:
-        """Factors that make the Gaussian ellipsoid as large as that of the F distribution.
-
-        Of a pose that is free in so many directions; variances have degrees (n,) of freedom.
-        """
-        if directions == 0 or self.confidence == 0:
-            return np.ones(np.shape(degrees))
-        tail = fdtri(directions, np.maximum(degrees, 1.0), self.confidence)
-        return np.asarray(directions * tail / chdtri(directions, 1 - self.confidence))
+    def enlargement(self, degrees: Floats) -> Floats:
+        """Factors by which errors of variances of degrees (n,) of freedom are larger: Student's."""
+        known = np.maximum(degrees, self.fewest_degrees)
+        return np.asarray(known / (known - 2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +148,7 @@ def noise_of(
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
     # fields last: a further frame shows no more of them
-    by_kind *= model.enlargement(count, np.array([degrees, *of_fields]))
+    by_kind *= model.enlargement(np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
     given = found, J, r, inverse, known[chosen], wide, model.errors, 1 - model.by_chance
     spread, larger = with_cut_spots(*given)

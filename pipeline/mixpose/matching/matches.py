@@ -170,7 +170,13 @@ class ErrorRules:
         "of the noise is that of all sensors, at least: half of it costs 10 % beside ranges, and "
         "none of it 20 % where a body is off",
     )
-    cut: float = constant(0.01, "chance that a detection is off by more than it shows: 18 of 2500")
+    cuts: tuple[float, float] = constant(
+        (0.1, 1.0), "σ_ε that a detection may be off by beyond what it shows: a little, or much"
+    )
+    chances: tuple[float, float] = constant(
+        (0.01, 0.003),
+        "of each: of 13,400 spots before a hand 1.0, 0.5, 0.1 % are 0.14, 0.22, 2.8 px off",
+    )
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")
 
     def counted(self, variances: Floats, fields: float = 0.0) -> Floats:

@@ -264,7 +264,7 @@ class AssociationLikelihood:
         covariance[inner] = np.linalg.inv(information)
         volume = 0.5 * np.linalg.slogdet(2 * np.pi * covariance[inner])[1]
         degrees = rules.ranges.stated_degrees + float(before.total[1])
-        covariance *= model.noise.enlargement(count, degrees)
+        covariance *= model.noise.enlargement(degrees)
         return replace(
             judge(frame.finest, T, free, model),
             covariance=covariance,
