@@ -34,7 +34,7 @@ def met(features: int, rng: np.random.Generator, errors: Floats) -> tuple[Matche
     """One camera's matches at the pose of the least squares of errors (n, 2), and its error."""
     J = rng.normal(size=(features, 2, 6))
     off = np.linalg.lstsq(J.reshape(-1, 6), errors.ravel(), rcond=None)[0].astype(np.float64)
-    return matches_of(Seen(J, offsets=errors - J @ off, crowd=1e-3)), off
+    return matches_of(Seen(J, offsets=errors - J @ off, crowd=1e-6)), off
 
 
 def test_what_many_others_tell_as_well_makes_a_pose_hardly_wider() -> None:
