@@ -112,14 +112,6 @@ _CUT = (
         ("test_judgement_cut.py",),
     ),
     Mutant(
-        "judgement-cut-moves-no-pose",
-        "judgement/cut.py",
-        "np.vecdot(wider, own) + np.vecdot(pulled, along)",
-        "np.vecdot(wider, own)",
-        "that a cut spot has pulled the pose aside does not count beyond the ellipsoid",
-        ("test_judgement_cut.py",),
-    ),
-    Mutant(
         "judgement-cut-not-beyond-the-ellipsoid",
         "judgement/cut.py",
         "(beyond > outside)[:-1].sum()",
