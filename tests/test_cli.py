@@ -26,6 +26,10 @@ from command_line import (
     wait_until,
 )
 from long_recordings import RANGE_FRAMES, long_ranges
+from typer.main import get_command
+
+from mixpose.cli.app import app
+from mixpose.cli.help import EXAMPLES, GROUPS
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 
@@ -284,3 +288,28 @@ def test_help_lists_the_commands() -> None:
     assert result.returncode == 0
     for name in ("run", "check", "simulate", "evaluate"):
         assert name in result.stdout
+    # whole sentences, in groups
+    assert "..." not in result.stdout.split("Before poses:")[1]
+    assert re.findall(r"^(\w[\w ]+):$", result.stdout, re.M) == ["Options", *GROUPS]
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_help_of_a_command_has_two_examples_whose_options_exist_and_no_types(name: str) -> None:
+    text = mixpose(name, "--help").stdout
+    for example in EXAMPLES[name]:
+        assert f"  {example}\n" in text
+        for option in re.findall(r"--[a-z-]+", example):
+            assert f"{option} " in text.split("Examples:")[0]
+    assert not re.search(r"<(path|int|float|str|list)", text)
+
+
+def test_every_command_is_in_one_group_and_has_examples() -> None:
+    commands: Any = getattr(get_command(app), "commands")  # noqa: B009
+    grouped = [name for names in GROUPS.values() for name in names]
+    assert sorted(grouped) == sorted(EXAMPLES) == sorted(commands)
+
+
+def test_help_of_simulate_has_its_options_in_groups() -> None:
+    text = mixpose("simulate", "--help").stdout
+    found = [len(part.split("\n  -")) - 1 for part in re.split(r"^\w[\w ,]+:$", text, flags=re.M)]
+    assert max(found) < 10

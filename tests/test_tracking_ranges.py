@@ -144,8 +144,8 @@ def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:
             View(f"anchor{k}", anchor, Observation(PointPattern(found, np.ones(1)), SIGMA))
         )
     variances = []
-    for confidence in (0.0, 0.95):
-        rules = Rules(judgement=JudgementRules(noise=NoiseModel(confidence=confidence)))
+    for fewest in (1e12, 3.0):
+        rules = Rules(judgement=JudgementRules(noise=NoiseModel(fewest_degrees=fewest)))
         options = EstimatorOptions(free=("x", "y", "rz"))
         tracker = Tracker.create(body, options, np.eye(4), rules=rules)
         data = tracker.data(tracker.begin(), 0, None, views)
@@ -154,8 +154,8 @@ def test_a_turn_that_ranges_leave_open_is_as_uncertain_as_anywhere() -> None:
     assert np.sqrt(variances[0][2]) == pytest.approx(np.pi, rel=1e-6)
     # eight anchors all around: σ / √4 along each axis where all are detections of the tag
     assert (np.sqrt(variances[0][:2]) < 2 * SIGMA / 2).all()
-    # σ_ε counts as known from 20 residuals: tables have 3.098 for F of 3 and 20, 7.815 for χ² of 3
-    assert variances[1] / variances[0] == pytest.approx([3 * 3.098 / 7.815] * 3, rel=1e-3)
+    # σ_ε counts as known from 20 residuals: 20 / 18 by Student's distribution
+    assert variances[1] / variances[0] == pytest.approx([20 / 18] * 3, rel=1e-6)
 
 
 def test_the_gradient_of_the_likelihood_is_its_slope() -> None:

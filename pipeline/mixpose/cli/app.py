@@ -12,6 +12,7 @@ from mixpose.cli.app_design import design
 from mixpose.cli.app_learn import learn
 from mixpose.cli.app_simulate import simulate
 from mixpose.cli.app_trajectories import align, pivot, smooth
+from mixpose.cli.help import Command, Commands
 from mixpose.cli.words import (
     AllowCode,
     ConvertFormat,
@@ -26,6 +27,7 @@ from mixpose.cli.words import (
 
 app = typer.Typer(
     name="mixpose",
+    cls=Commands,
     help="6-D poses of a known rigid body from frames of calibrated sensors, "
     "without matching markers. --debug after any command shows tracebacks.",
     add_completion=True,
@@ -132,7 +134,7 @@ Predict = Annotated[
 ]
 
 
-@app.command()
+@app.command(cls=Command)
 def run(
     context: typer.Context,
     sessions: Sessions,
@@ -197,7 +199,7 @@ def run(
     run_session(Path(sessions[0]), request)
 
 
-@app.command()
+@app.command(cls=Command)
 def check(
     session: SessionFile,
     quick: Annotated[
@@ -212,7 +214,7 @@ def check(
     check_session(session, quick=quick, sources=tuple(source or ()), allow_code=allow_code)
 
 
-@app.command()
+@app.command(cls=Command)
 def inspect(
     session: SessionFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder for the pictures.")],
@@ -244,7 +246,7 @@ def inspect(
     )
 
 
-@app.command("import")
+@app.command("import", cls=Command)
 def import_(
     files: Annotated[
         list[Path],
@@ -271,10 +273,10 @@ def import_(
     import_files(files, output, unit=unit.value, lengths=None if lengths is None else lengths.value)
 
 
-app.command()(simulate)
+app.command(cls=Command)(simulate)
 
 
-@app.command()
+@app.command(cls=Command)
 def evaluate(
     poses: PosesFile,
     truth: Annotated[Path, typer.Argument(metavar="TRUTH.jsonl", help="True poses.")],
@@ -286,7 +288,7 @@ def evaluate(
     evaluate_poses(poses, truth, as_json=json)
 
 
-@app.command()
+@app.command(cls=Command)
 def convert(
     poses: Annotated[Path, typer.Argument(metavar="POSES.jsonl", help="Poses or true poses.")],
     output: Annotated[
@@ -352,7 +354,7 @@ def convert(
     convert_poses(poses, request)
 
 
-@app.command()
+@app.command(cls=Command)
 def schema() -> None:
     """Print the JSON Schema of pose lines."""
     from mixpose.poses.schema import schema_text  # noqa: PLC0415
@@ -360,7 +362,7 @@ def schema() -> None:
     typer.echo(schema_text(), nl=False)
 
 
-@app.command()
+@app.command(cls=Command)
 def report(
     poses: PosesFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The page, as report.html.")],
@@ -372,9 +374,9 @@ def report(
     write_report(poses, truth, output)
 
 
-app.command()(calibrate)
-app.command()(design)
-app.command()(pivot)
-app.command()(align)
-app.command()(smooth)
-app.command()(learn)
+app.command(cls=Command)(calibrate)
+app.command(cls=Command)(design)
+app.command(cls=Command)(pivot)
+app.command(cls=Command)(align)
+app.command(cls=Command)(smooth)
+app.command(cls=Command)(learn)

@@ -10,67 +10,142 @@ import typer
 
 from mixpose.cli.words import SessionFile
 
+MOTION, IMAGES, TABLES = "Motion of the body", "Images", "Profiles and tables"
+IN_VIEW, TIME = "What else is in view", "Time, and sensors that are not as told"
+
 Output = Annotated[Path, typer.Option("-o", "--output", help="New folder for the recording.")]
 Frames = Annotated[int, typer.Option(min=1, help="Number of frames.")]
 Seed = Annotated[int, typer.Option(min=0, help="Same seed, same recording.")]
 Fps = Annotated[
     float | None,
-    typer.Option(help="Frames per second; for poses with times put fps into the session."),
+    typer.Option(
+        rich_help_panel=TIME,
+        help="Frames per second; for poses with times put fps into the session.",
+    ),
 ]
-Noise = Annotated[float, typer.Option(help="Camera noise, grey levels.")]
-Clutter = Annotated[float, typer.Option(help="False features per frame and sensor.")]
-Hidden = Annotated[float, typer.Option(help="Chance that a feature is hidden.")]
-Missing = Annotated[float, typer.Option(help="Chance that a sensor has no frame.")]
-Brightness = Annotated[float, typer.Option(help="Peak of a spot, grey levels.")]
+Noise = Annotated[float, typer.Option(rich_help_panel=IMAGES, help="Camera noise, grey levels.")]
+Clutter = Annotated[
+    float, typer.Option(rich_help_panel=IN_VIEW, help="False features per frame and sensor.")
+]
+Hidden = Annotated[
+    float, typer.Option(rich_help_panel=IN_VIEW, help="Chance that a feature is hidden.")
+]
+Missing = Annotated[
+    float, typer.Option(rich_help_panel=TIME, help="Chance that a sensor has no frame.")
+]
+Brightness = Annotated[
+    float, typer.Option(rich_help_panel=IMAGES, help="Peak of a spot, grey levels.")
+]
 BrightnessSpread = Annotated[
-    float, typer.Option(help="Spread of the brightness over the features, as a share.")
+    float,
+    typer.Option(
+        rich_help_panel=IMAGES, help="Spread of the brightness over the features, as a share."
+    ),
 ]
 Translation = Annotated[
     float | None,
-    typer.Option("--translation", help="Largest displacement along each axis, length units."),
+    typer.Option(
+        "--translation",
+        rich_help_panel=MOTION,
+        help="Largest displacement along each axis, length units.",
+    ),
 ]
 Rotation = Annotated[
-    float, typer.Option("--rotation", help="Largest turn about each axis, degrees.")
+    float,
+    typer.Option(
+        "--rotation", rich_help_panel=MOTION, help="Largest turn about each axis, degrees."
+    ),
 ]
-Period = Annotated[float, typer.Option("--period", help="Seconds in which the motion comes round.")]
-PixelNoise = Annotated[float, typer.Option(help="Error of detections in a camera's table, px.")]
+Period = Annotated[
+    float,
+    typer.Option(
+        "--period", rich_help_panel=MOTION, help="Seconds in which the motion comes round."
+    ),
+]
+PixelNoise = Annotated[
+    float, typer.Option(rich_help_panel=TABLES, help="Error of detections in a camera's table, px.")
+]
 RangeNoise = Annotated[
     float | None,
-    typer.Option(help="Error of detections in tables of ranges and of clouds, length units."),
+    typer.Option(
+        rich_help_panel=TABLES,
+        help="Error of detections in tables of ranges and of clouds, length units.",
+    ),
 ]
-RangeSnr = Annotated[float, typer.Option(help="Height of a profile's peak over its noise.")]
+RangeSnr = Annotated[
+    float, typer.Option(rich_help_panel=TABLES, help="Height of a profile's peak over its noise.")
+]
 Deform = Annotated[
-    bool, typer.Option("--deform", help="Displace features by the spread the object states.")
+    bool,
+    typer.Option(
+        "--deform",
+        rich_help_panel=IN_VIEW,
+        help="Displace features by the spread the object states.",
+    ),
 ]
 Readout = Annotated[
     float | None,
-    typer.Option(help="Seconds from a camera's first row to its last; else the session's."),
+    typer.Option(
+        rich_help_panel=TIME,
+        help="Seconds from a camera's first row to its last; else the session's.",
+    ),
 ]
 Exposure = Annotated[
-    float | None, typer.Option(help="Seconds for which a row is lit; else the session's.")
+    float | None,
+    typer.Option(rich_help_panel=TIME, help="Seconds for which a row is lit; else the session's."),
 ]
 Delay = Annotated[
     list[str] | None,
-    typer.Option(metavar="NAME=SECONDS", help="A sensor that is late; else the session's."),
+    typer.Option(
+        metavar="NAME=SECONDS",
+        rich_help_panel=TIME,
+        help="A sensor that is late; else the session's.",
+    ),
 ]
 OutOfStep = Annotated[
-    float, typer.Option(help="Seconds from the first sensor to the last, in their times.")
+    float,
+    typer.Option(
+        rich_help_panel=TIME, help="Seconds from the first sensor to the last, in their times."
+    ),
 ]
-Lamps = Annotated[int, typer.Option(min=0, help="Lamps behind the body.")]
+Lamps = Annotated[int, typer.Option(min=0, rich_help_panel=IN_VIEW, help="Lamps behind the body.")]
 Mirror = Annotated[
-    float, typer.Option(help="Brightness of mirror images in a table below, as a share.")
+    float,
+    typer.Option(
+        rich_help_panel=IN_VIEW, help="Brightness of mirror images in a table below, as a share."
+    ),
 ]
 Others = Annotated[
-    int, typer.Option(min=0, help="Other bodies with as many markers, beside this one.")
+    int,
+    typer.Option(
+        min=0, rich_help_panel=IN_VIEW, help="Other bodies with as many markers, beside this one."
+    ),
 ]
-Occluder = Annotated[int, typer.Option(min=0, help="Dark bars that swing before it.")]
-Jpeg = Annotated[int | None, typer.Option(min=1, max=100, help="Quality of lossy compression.")]
-Bayer = Annotated[bool, typer.Option("--bayer", help="Images of a colour sensor, interpolated.")]
+Occluder = Annotated[
+    int, typer.Option(min=0, rich_help_panel=IN_VIEW, help="Dark bars that swing before it.")
+]
+Jpeg = Annotated[
+    int | None,
+    typer.Option(min=1, max=100, rich_help_panel=IMAGES, help="Quality of lossy compression."),
+]
+Bayer = Annotated[
+    bool,
+    typer.Option(
+        "--bayer", rich_help_panel=IMAGES, help="Images of a colour sensor, interpolated."
+    ),
+]
 TurnedCamera = Annotated[
     float,
-    typer.Option("--turned-camera", help="Degrees by which the last camera was turned meanwhile."),
+    typer.Option(
+        "--turned-camera",
+        rich_help_panel=TIME,
+        help="Degrees by which the last camera was turned meanwhile.",
+    ),
 ]
-AwayFrom = Annotated[int | None, typer.Option(min=0, help="Frames after which the body is gone.")]
+AwayFrom = Annotated[
+    int | None,
+    typer.Option(min=0, rich_help_panel=MOTION, help="Frames after which the body is gone."),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace a recording in the folder.")]
 
 

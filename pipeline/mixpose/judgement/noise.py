@@ -62,7 +62,7 @@ class NoiseModel:
     shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
     bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
-    def enlargement(self, degrees: Floats) -> Floats:
+    def enlargement(self, degrees: Floats | float) -> Floats:
         """Factors by which errors of variances of degrees (n,) of freedom are larger: Student's."""
         known = np.maximum(degrees, self.fewest_degrees)
         return np.asarray(known / (known - 2))
