@@ -14,7 +14,6 @@ from scipy.stats import t as student
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import (
-    AcceptanceRules,
     DetectionModel,
     flat_prior,
     is_possible,
@@ -124,7 +123,7 @@ def test_one_detection_where_a_feature_is_predicted_is_no_pose(
     judged = judge(matched_objective(views, EIGHT, [1.5]), TRUTH, ALL_FREE, prior=prior)
     # one is met, for at most ln(P_D σ_crowd⁻¹), and seven are missed, each for ln(1/4)
     assert judged.log_evidence < 7 * np.log(0.25) + 10
-    assert not is_possible(judged, ALL_FREE, AcceptanceRules())
+    assert not is_possible(judged, ALL_FREE)
 
 
 def test_a_symmetric_body_is_where_it_was_predicted_whichever_way_it_is_turned() -> None:

@@ -25,7 +25,6 @@ class AcceptanceRules:
     """When a pose is believed."""
 
     confidence: float = constant(0.999, "that a pose is right, to be ok: one of 1000 may err")
-    told: float = constant(0.2, "that it is no clutter, to tell it: one feature more makes it even")
     mistaken: float = constant(
         2e-4, "of sessions, each: a body mirrored or of another size, a sensor elsewhere"
     )
@@ -98,9 +97,9 @@ def is_fixed(pose: ScoredPose, free: Mask) -> bool:
     return bool(pose.measurements >= np.count_nonzero(free))
 
 
-def is_possible(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
-    """Whether a pose is worth telling."""
-    return is_fixed(pose, free) and pose.log_evidence > logit(rules.told)
+def is_possible(pose: ScoredPose, free: Mask) -> bool:
+    """Whether a pose is worth telling: if one feature that it misses would make it even."""
+    return is_fixed(pose, free) and pose.log_evidence > pose.log_missed
 
 
 def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
@@ -124,7 +123,7 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
     Against the best there is clutter, then the others: what is not possible by itself still casts
     doubt.
     """
-    told = [one for one in ranked if is_possible(one, free, rules)]
+    told = [one for one in ranked if is_possible(one, free)]
     if not told:
         return Verdict(None, [])
     best, weights = told[0], beliefs(ranked)

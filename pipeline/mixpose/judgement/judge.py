@@ -75,6 +75,7 @@ class ScoredPose:
     covariance: Floats  # (6, 6) zero in directions that are not estimated
     log_evidence: float  # logarithm of the odds for this pose against mere clutter
     noise: RememberedNoise = RememberedNoise()  # of this frame and those before it, for the next
+    log_missed: float = DetectionModel().log_missed  # what a feature costs that is not met
     left_out: Mapping[str, str] = field(default_factory=dict)  # sensors not fitted to, and why
     persistent: Floats = field(default_factory=lambda: np.zeros((6, 6)))  # of it, what lasts
     # (L,) of the noise, of those used
@@ -178,6 +179,7 @@ def judge_together(
             covariance,
             float(evidence[k]),
             noise=remembered,
+            log_missed=rules.detection.log_missed,
             left_out=left_out,
             persistent=persistent,
             residual_ratio=ratio,

@@ -169,12 +169,15 @@ class Sharing:
         values = data.finest.value(start.T_world_object[None])
         return bool(values[0] >= data.rules.fit.near * len(data.views))
 
+    def _is_possible(self, k: int) -> bool:
+        """Whether the most evident pose of a body is worth telling."""
+        free = self.found[k].frame.free
+        return any(is_possible(best, free) for best in self.found[k].ranked[:1])
+
     def _on_the_rest(self, waiting: list[int]) -> None:
         """Bodies that are not where they are expected, on what is left, the most evident first."""
         self._look(waiting)
-        while possible := [
-            k for k in waiting if self.found[k].frame.first_is(is_possible, self.found[k].ranked)
-        ]:
+        while possible := [k for k in waiting if self._is_possible(k)]:
             winner = max(possible, key=lambda k: self.found[k].ranked[0].log_evidence)
             self.claimed.append(winner)
             waiting = [k for k in waiting if k != winner]
