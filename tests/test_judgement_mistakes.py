@@ -15,10 +15,10 @@ from scipy.stats import multivariate_normal
 from mixpose.body import Body, PointFeature
 from mixpose.fit import EstimatorOptions
 from mixpose.judgement import APART, NoiseModel, ScoredPose, possible_mistakes
-from mixpose.judgement.mistakes import SIZE, evidence_of
+from mixpose.judgement.mistakes import LENS, SIZE, evidence_of
 from mixpose.records import Estimate
 from mixpose.rigid import from_rotation_vector
-from mixpose.sensors import PinholeCamera
+from mixpose.sensors import ParallelBeam, PinholeCamera
 from mixpose.tracking import Tracker
 
 Floats = NDArray[np.float64]
@@ -79,6 +79,28 @@ def test_cameras_of_which_one_is_turned_contradict_each_other(
     assert (found.status, found.doubt) == ("ambiguous", APART)
 
 
+def test_cameras_whose_distortion_was_forgotten_are_not_ok_and_said_to_have_other_lenses(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    lenses = [
+        replace(one, distortion=np.array([-0.25, 0.1, 0.0, 0.0])) for one in pinhole_cameras[:2]
+    ]
+    found = estimate(body(), lenses, pinhole_cameras[:2], 0.1)
+    assert (found.status, found.doubt) == ("ambiguous", LENS)
+    assert estimate(body(), lenses, lenses, 0.1).status == "ok"
+
+
+def test_what_two_cameras_showed_to_be_wrong_is_wrong_where_one_alone_sees_the_body(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = detect(pinhole_cameras[:2], body(), TRUTH, noise=0.1)
+    for size, expected in ((1.02, ["ambiguous", "ambiguous"]), (1.0, ["ok", "ok"])):
+        tracker = Tracker.create(body(size), EstimatorOptions())
+        track, both = tracker.advance(tracker.begin(), 0, None, views)
+        _, alone = tracker.advance(track, 1, None, views[:1])
+        assert [both.status, alone.status] == expected
+
+
 def test_evidence_is_the_marginal_likelihood_over_sizes_and_noise() -> None:
     rng = np.random.default_rng(2)
     X, r = rng.normal(size=(2, 9, 3)), rng.normal(size=9)
@@ -106,8 +128,13 @@ def seen_from(*twists: Floats, noise: float) -> ScoredPose:
     return replace(pose, variances=np.full(len(sensors), max(noise**2, 1e-4)))
 
 
+# what one sees is not asked here
+SENSORS = {str(k): ParallelBeam(1.0, np.zeros(2)) for k in range(2)}
+
+
 def mistakes_in(pose: ScoredPose) -> dict[str, float]:
-    return dict(possible_mistakes(pose, body(), ALL_FREE, NoiseModel()))
+    found = possible_mistakes(pose, body(), ALL_FREE, NoiseModel(), SENSORS, {})
+    return {one.what: one.log_odds for one in found if one.moves}
 
 
 def test_sensors_that_see_the_body_at_two_poses_contradict_each_other_and_at_one_do_not() -> None:

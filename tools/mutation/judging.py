@@ -163,6 +163,22 @@ _MISTAKES = (
         ("test_judgement_mistakes.py",),
     ),
     Mutant(
+        "judgement-lenses-are-those-that-are-told",
+        "judgement/mistakes.py",
+        "/ found.sigmas[k]\n",
+        "* 1e-9\n",
+        "poses are ok whose cameras were given without their distortion",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
+        "judgement-what-frames-told-of-a-session-is-forgotten",
+        "judgement/mistakes.py",
+        "before.get(name, 0.0)",
+        "0.0 * before.get(name, 0.0)",
+        "a body known to be too large is ok where one camera alone sees it",
+        ("test_judgement_mistakes.py",),
+    ),
+    Mutant(
         "judgement-mistakes-cost-nothing",
         "judgement/mistakes.py",
         "np.log(wide / s2).sum(axis=1)",

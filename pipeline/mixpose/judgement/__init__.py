@@ -33,6 +33,7 @@ from mixpose.judgement.expected import (
 )
 from mixpose.judgement.mistakes import (
     APART as APART,
+    Mistake as Mistake,
     possible_mistakes as possible_mistakes,
 )
 from mixpose.judgement.noise import (

@@ -1,4 +1,4 @@
-"""How likely a frame makes it that a sensor stands otherwise than told, or a body is larger.
+"""How likely frames make it that sensors or a body are otherwise than the session tells.
 
 Residuals r that a pose leaves are noise of a variance s² that nobody knows, fields of sensors and
 markers that are usual, of the deviation d, and, by the mistake in question, columns C of known
@@ -10,12 +10,17 @@ and z = UᵀXᵀr, in ν directions,
 of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts where
 the pose, with its noise, is then outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes γ
 that residuals tell.
+
+What one frame tells of a session holds in those that follow, which may not tell it themselves: log
+odds add up from frame to frame, and never fall below those of a session of which nothing is known
+(E. S. Page, Continuous inspection schemes, Biometrika 41, 1954).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -23,20 +28,43 @@ from scipy.special import chdtri
 from mixpose.body import Body
 from mixpose.judgement.judge import ScoredPose
 from mixpose.judgement.noise import NoiseModel, fields_of_sensors, inverted
+from mixpose.matching import Matches
 from mixpose.records import Floats, Mask
+from mixpose.rigid import transform
+from mixpose.sensors import Sensor, by_calibration, with_another_lens
 
 APART = "sensors contradict each other"
 SIZE = "the body seems to be of another size"
+LENS = "lenses seem to be others than the session tells"
+
+
+class Mistake(NamedTuple):
+    """Something in the session that may be wrong."""
+
+    name: str  # what tells it from others
+    what: str  # in words
+    log_odds: float  # by how much likelier frames so far make it
+    moves: bool  # whether it would put the pose of this frame outside its ellipsoid
 
 
 def possible_mistakes(
-    pose: ScoredPose, body: Body, free: Mask, model: NoiseModel
-) -> Iterator[tuple[str, float]]:
-    """What a frame of several sensors may show as wrong, and the log of how much likelier it is."""
+    pose: ScoredPose,
+    body: Body,
+    free: Mask,
+    model: NoiseModel,
+    sensors: Mapping[str, Sensor],
+    before: Mapping[str, float],
+) -> Iterator[Mistake]:
+    """What of the session frames show as wrong, likelier than before any of them.
+
+    `sensors` by name, as they stand still; `before` are log odds by `Mistake.name`, above zero.
+    """
     found, (chosen,) = pose.used, free.nonzero()
     # one sensor has the world stand as it does, and bodies as large as they are far
-    if len(found.names) < 2 or not len(chosen):
+    if not len(chosen) or (len(found.names) < 2 and not before):
         return
+    for name in before.keys() - {SIZE, *found.names, LENS}:
+        yield Mistake(name, APART, before[name], moves=False)
     noise = pose.variances[:, None]
     shares = found.shares * noise / (noise + found.extra)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
@@ -48,27 +76,30 @@ def possible_mistakes(
     s2 = np.asarray(1e-4 * 1.6 ** np.arange(24))
     given = r, float(met @ found.dimensions) - len(chosen), s2
     columns, stated = _columns(pose, body, rows, met, model), _stated(pose, body, roots, rows)
+    lenses = roots * _by_lenses(pose, body, model, sensors)
+    columns = _widened(columns, lenses)
     moves = drawn @ columns
     left, stated = columns - J @ moves, stated - J @ (drawn @ stated)
     told, *odds = evidence_of(_beside(left, stated), *given)[0].tolist()
+    names = [SIZE, *found.names, LENS]
+    known = [before.get(name, 0.0) for name in names]
     # what is not likelier by itself is not likelier beside fields
-    likelier = [k for k, one in enumerate(odds, 1) if one > told]
+    likelier = [k for k, one in enumerate(odds) if one + known[k] > told]
     if not likelier:
         return
-    # that markers err by 1 σ_ε makes a size, too
-    fields = fields_of_sensors(found, shares, met)
-    size = columns[1, :, :1]
-    fields = np.hstack([fields, size * math.sqrt(len(met) / max(float(np.vdot(size, size)), 1e-9))])
-    sizes = np.reshape([0.0, model.bias / 4, model.bias, 2 * model.bias], (-1, 1, 1))
-    usual = _beside(sizes * (fields - J @ (drawn @ fields)), stated)
+    fields = _fields(found, shares, columns[1, :, :1])
+    fields = fields - J @ (drawn @ fields)
+    usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = np.logaddexp.reduce(evidence_of(usual, *given)[0])
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
     limit = float(chdtri(len(chosen), 1 - model.by_chance)) - len(chosen)  # besides noise
     for k in likelier:
-        cases, second = evidence_of(_beside(usual, left[k]), *given)
-        by_mistake = moves[k] @ second[cases.argmax(), -6:, -6:] @ moves[k].T
-        if np.vdot(own, by_mistake) > limit:
-            yield SIZE if k == 1 else APART, float(np.logaddexp.reduce(cases) - others)
+        cases, second = evidence_of(_beside(usual, left[k + 1]), *given)
+        mistaken, width = moves[k + 1], columns.shape[2]
+        by_mistake = mistaken @ second[cases.argmax(), -width:, -width:] @ mistaken.T
+        gained = float(np.logaddexp.reduce(cases) - others)
+        what = {SIZE: SIZE, LENS: LENS}.get(names[k], APART)
+        yield Mistake(names[k], what, known[k] + gained, bool(np.vdot(own, by_mistake) > limit))
 
 
 def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: NoiseModel) -> Floats:
@@ -87,6 +118,28 @@ def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: Noi
     return columns
 
 
+def _by_lenses(
+    pose: ScoredPose, body: Body, model: NoiseModel, sensors: Mapping[str, Sensor]
+) -> Floats:
+    """How residuals change with lenses of another distortion (R, L), times its deviation."""
+    found, points = pose.used, transform(pose.T_world_object, body.nodes.points)
+    columns = np.zeros((*found.offsets.shape, len(found.names)))
+    for k, name in enumerate(found.names):
+        others = with_another_lens(sensors[name], model.lens) if name in sensors else ()
+        if others:
+            shifts = by_calibration(others, points)[..., 0] / found.sigmas[k]
+            columns[k, ..., k] = shifts * (found.weights[k, :, None] > 0)
+    return columns.reshape(-1, len(found.names))
+
+
+def _widened(columns: Floats, more: Floats) -> Floats:
+    """Columns (K + 1, R, p) of K mistakes (K, R, 6) and one more (R, q), filled up with zeros."""
+    K, R, own = columns.shape
+    widened = np.zeros((K + 1, R, max(own, more.shape[1])))
+    widened[:-1, :, :own], widened[-1, :, : more.shape[1]] = columns, more
+    return widened
+
+
 def _stated(pose: ScoredPose, body: Body, roots: Floats, rows: Floats) -> Floats:
     """What the session says that may be off (R, Q): calibrations, and features of the body."""
     by_calibration, found = pose.used.by_calibration, [np.zeros((len(rows), 0))]
@@ -99,6 +152,22 @@ def _stated(pose: ScoredPose, body: Body, roots: Floats, rows: Floats) -> Floats
         own = np.eye(len(values))[:, None, :, None]
         found.append((by_feature[:, :, :, None] * own).reshape(len(rows), -1))
     return np.hstack(found)
+
+
+def _fields(found: Matches, shares: Floats, size: Floats) -> Floats:
+    """Fields (R, q) that are usual, of 1 σ_ε: of sensors, and that markers err by makes a size."""
+    L = len(shares)
+    size = size * math.sqrt(L / max(float(np.vdot(size, size)), 1e-9))
+    return np.hstack([fields_of_sensors(found, shares, shares.sum(axis=1)), size])
+
+
+def _usual(fields: Floats, lenses: Floats, model: NoiseModel) -> Floats:
+    """Columns (8, R, q + L) of what sensors and markers usually err by, as a pose leaves them.
+
+    Calibrations have lenses exactly, or at a tenth of what they are off by if they are others.
+    """
+    sizes = np.reshape([0.0, model.bias / 4, model.bias, 2 * model.bias], (-1, 1, 1))
+    return np.concatenate([_beside(sizes * fields, share * lenses) for share in (0.0, 0.1)])
 
 
 def _beside(X: Floats, others: Floats) -> Floats:

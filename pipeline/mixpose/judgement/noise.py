@@ -60,6 +60,7 @@ class NoiseModel:
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
     turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
     shifted: float = constant(20.0, "σ_ε: of a body in such a sensor: 30 px, 1 or 2°")
+    lens: float = constant(0.2, "k1 of a lens that is another than told: lenses have 0.05 to 0.4")
     bias_memory: float = constant(0.99, "per frame, of fields that last: 100 frames count")
 
     def enlargement(self, degrees: Floats | float) -> Floats:

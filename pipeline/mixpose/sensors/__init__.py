@@ -15,7 +15,7 @@ from mixpose.sensors.cloud import (
     clouds_among,
     from_planes,
 )
-from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted
+from mixpose.sensors.doubted import CalibrationError, by_calibration, doubted, with_another_lens
 from mixpose.sensors.facing import facing
 from mixpose.sensors.fisheye import FisheyeCamera
 from mixpose.sensors.lateration import RangeSensor
@@ -58,4 +58,5 @@ __all__ = [
     "in_motion",
     "moments",
     "side_by_side",
+    "with_another_lens",
 ]

@@ -76,6 +76,17 @@ def _moved(T_sensor_world: Floats, direction: int, by: float) -> Floats:
     return np.asarray(inverse(T_sensor_world) @ perturb(np.eye(4), twist) @ T_sensor_world)
 
 
+def with_another_lens(sensor: Sensor, k1: float) -> tuple[Sensor, ...]:
+    """A camera, and the same with a first radial coefficient that is larger; none of others."""
+    if not isinstance(sensor, PinholeCamera | FisheyeCamera):
+        return ()
+    given = np.ravel(sensor.distortion)
+    distortion = np.zeros(max(len(given), 4))
+    distortion[: len(given)] = given
+    distortion[0] += k1
+    return sensor, replace(sensor, distortion=distortion)
+
+
 def by_calibration(doubts: tuple[Sensor, ...], points_world: Floats) -> Floats:
     """By how much points (n, 3) are elsewhere (n, m, K) in K sensors as they might be."""
     first, *others = doubts

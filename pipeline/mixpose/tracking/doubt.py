@@ -18,6 +18,7 @@ from mixpose.body import like_features, mirror_image, thickness, tolerance_of
 from mixpose.judgement import (
     APART,
     Alternative,
+    Mistake,
     ScoredPose,
     Verdict,
     decide,
@@ -59,10 +60,19 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     # a sure pose that has rivals may have them for a reason that can be told
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
-    return verdict.doubted(_alternatives(data, best))
+    rules, sensors = data.rules, {view.name: view.sensor for view in data.still or data.views}
+    given = rules.judgement.noise, sensors, data.track.mistaken
+    mistakes = list(possible_mistakes(best, data.body, data.free, *given))
+    # however often it was seen, it is no likelier than not: one frame may tell that it is none
+    most = -math.log(rules.acceptance.mistaken)
+    mistaken = {one.name: min(one.log_odds, most) for one in mistakes if one.log_odds > 0}
+    against = _alternatives(data, best, mistakes)
+    return replace(verdict, mistaken=mistaken).doubted(against)
 
 
-def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
+def _alternatives(
+    data: Frame, best: ScoredPose, mistakes: Iterable[Mistake]
+) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
     mirrored = 0.5 if data.options.mirrors else rules.mistaken
@@ -71,8 +81,9 @@ def _alternatives(data: Frame, best: ScoredPose) -> Iterator[Alternative]:
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(ALONE, _of_one_sensor(data, best))
-    for what, odds in possible_mistakes(best, data.body, data.free, noise):
-        yield Alternative(what, math.log(rules.mistaken) + odds)
+    for one in mistakes:
+        if one.moves:
+            yield Alternative(one.what, math.log(rules.mistaken) + one.log_odds)
     if one_misses(best, track.residuals.total, track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:

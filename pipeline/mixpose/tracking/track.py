@@ -137,6 +137,8 @@ class Track:
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain
     tried: Mapping[str, int] = field(default_factory=dict)
+    # log odds of mistakes in the session, by name; of the others nothing is known
+    mistaken: Mapping[str, float] = field(default_factory=dict)
     clutter: StaticClutter = StaticClutter()  # what stayed where it was while the body was lost
     companions: Mapping[str, Companion] = field(default_factory=dict)  # by labels of other bodies
     distances: Distances | None = None  # between identical bodies, of which this is the first

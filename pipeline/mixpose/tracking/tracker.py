@@ -255,6 +255,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         believed=track.believed + is_ok,
         doubted=not is_ok,
         tried={**track.tried, **verdict.tried},
+        mistaken=track.mistaken if verdict.mistaken is None else verdict.mistaken,
     )
 
 
