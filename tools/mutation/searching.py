@@ -68,8 +68,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-a-turned-camera-is-as-told",
         "tracking/doubt.py",
-        "math.log(rules.mistaken) + one.log_odds)",
-        "math.log(rules.mistaken) - abs(one.log_odds))",
+        "math.log(rules.mistaken) + one.log_odds +",
+        "math.log(rules.mistaken) - abs(one.log_odds) +",
         "two cameras of which one was turned agree about a wrong pose",
         ("test_turned_camera.py",),
     ),

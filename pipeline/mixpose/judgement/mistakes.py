@@ -7,9 +7,10 @@ and z = UᵀXᵀr, in ν directions,
 
     ln p(r | s) = −½ ν ln s² − ½ (|r|² − Σ z² / (λ + s²)) / s² − ½ Σ ln (1 + λ / s²),
 
-of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts where
-the pose, with its noise, is then outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes γ
-that residuals tell.
+of which the sum over s, even in ln s, and over d is what a hypothesis is worth.  It counts as often
+as the pose, with its noise, is then outside its ellipsoid: it moves by δ = −(JᵀJ)⁻¹ JᵀC γ, of sizes
+γ that residuals tell, which adds E = ⟨δᵀΣ⁻¹δ⟩ to a squared error of n.  Sensors always stand a
+little otherwise than told: that counts where n + E is outside.
 
 What one frame tells of a session holds in those that follow, which may not tell it themselves: log
 odds add up from frame to frame, and never fall below those of a session of which nothing is known
@@ -23,7 +24,7 @@ from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
 from mixpose.body import Body
 from mixpose.judgement.judge import ScoredPose
@@ -44,7 +45,7 @@ class Mistake(NamedTuple):
     name: str  # what tells it from others
     what: str  # in words
     log_odds: float  # by how much likelier frames so far make it
-    moves: bool  # whether it would put the pose of this frame outside its ellipsoid
+    log_harm: float  # of the probability that it puts this pose outside its ellipsoid
 
 
 def possible_mistakes(
@@ -64,7 +65,7 @@ def possible_mistakes(
     if not len(chosen) or (len(found.names) < 2 and not before):
         return
     for name in before.keys() - {SIZE, *found.names, LENS}:
-        yield Mistake(name, APART, before[name], moves=False)
+        yield Mistake(name, APART, before[name], -math.inf)
     noise = pose.variances[:, None]
     shares = found.shares * noise / (noise + found.extra)
     roots, met = np.sqrt(shares).ravel().repeat(2)[:, None], shares.sum(axis=1)
@@ -92,14 +93,27 @@ def possible_mistakes(
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
     others = np.logaddexp.reduce(evidence_of(usual, *given)[0])
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
-    limit = float(chdtri(len(chosen), 1 - model.by_chance)) - len(chosen)  # besides noise
     for k in likelier:
         cases, second = evidence_of(_beside(usual, left[k + 1]), *given)
         mistaken, width = moves[k + 1], columns.shape[2]
         by_mistake = mistaken @ second[cases.argmax(), -width:, -width:] @ mistaken.T
         gained = float(np.logaddexp.reduce(cases) - others)
-        what = {SIZE: SIZE, LENS: LENS}.get(names[k], APART)
-        yield Mistake(names[k], what, known[k] + gained, bool(np.vdot(own, by_mistake) > limit))
+        outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
+        if names[k] in (SIZE, LENS):
+            yield Mistake(names[k], names[k], known[k] + gained, outside[0])
+        else:
+            yield Mistake(names[k], APART, known[k] + gained, outside[1])
+
+
+def _outside(squared: float, directions: int, chance: float) -> tuple[float, float]:
+    """Log probability beyond chance of a pose outside its ellipsoid; and 0 or −∞, if it is likely.
+
+    The ellipsoid holds all but `chance`, and the squared error is expected to be so much larger.
+    """
+    limit = float(chdtri(directions, chance))
+    often = float(chdtrc(directions, limit / (1 + squared / directions))) - chance
+    is_likely = squared > limit - directions
+    return math.log(max(often, 1e-300)), 0.0 if is_likely else -math.inf
 
 
 def _columns(pose: ScoredPose, body: Body, rows: Floats, met: Floats, model: NoiseModel) -> Floats:

@@ -82,8 +82,7 @@ def _alternatives(
     yield Alternative(FEW, of_other_things(data, best))
     yield Alternative(ALONE, _of_one_sensor(data, best))
     for one in mistakes:
-        if one.moves:
-            yield Alternative(one.what, math.log(rules.mistaken) + one.log_odds)
+        yield Alternative(one.what, math.log(rules.mistaken) + one.log_odds + one.log_harm)
     if one_misses(best, track.residuals.total, track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
