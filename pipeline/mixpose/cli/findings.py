@@ -19,6 +19,7 @@ from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
+from mixpose.tracking import TWICE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -252,6 +253,8 @@ class Findings:
                 line += f": {CAUSES}"
             if doubt == ASIDE:
                 line += ": is a part of it hidden, or does the session say more rows than it has?"
+            if doubt == TWICE and self._agreed_before:
+                line += ": poses before may be of its mirror image; is there a mirror?"
             lines.append(line)
         return lines
 

@@ -24,3 +24,4 @@ from mixpose.tracking.track import (
     predict as predict,
 )
 from mixpose.tracking.tracker import Tracker as Tracker, estimate_pose as estimate_pose
+from mixpose.tracking.twin import TWICE as TWICE
