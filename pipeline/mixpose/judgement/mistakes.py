@@ -91,13 +91,15 @@ def possible_mistakes(
     fields = _fields(found, shares, columns[1, :, :1])
     fields = fields - J @ (drawn @ fields)
     usual = _beside(_usual(fields, left[-1, :, : lenses.shape[1]], model), stated)
-    others = np.logaddexp.reduce(evidence_of(usual, *given)[0])
+    others = evidence_of(usual, *given)[0]
     own = inverted(pose.covariance[np.ix_(chosen, chosen)])
     for k in likelier:
-        cases, second = evidence_of(_beside(usual, left[k + 1]), *given)
+        # a sensor that stands otherwise takes up what its lens is usually off by
+        asked = slice(None) if names[k] in (SIZE, LENS) else slice(len(usual) // 2)
+        cases, second = evidence_of(_beside(usual[asked], left[k + 1]), *given)
         mistaken, width = moves[k + 1], columns.shape[2]
         by_mistake = mistaken @ second[cases.argmax(), -width:, -width:] @ mistaken.T
-        gained = float(np.logaddexp.reduce(cases) - others)
+        gained = float(np.logaddexp.reduce(cases) - np.logaddexp.reduce(others[asked]))
         outside = _outside(float(np.vdot(own, by_mistake)), len(chosen), 1 - model.by_chance)
         if names[k] in (SIZE, LENS):
             yield Mistake(names[k], names[k], known[k] + gained, outside[0])
