@@ -129,8 +129,8 @@ def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> 
     if not told:
         return Verdict(None, [])
     best, weights = told[0], beliefs(ranked)
-    rivals = [one.log_evidence for one in ranked if one is not best]
-    against = [Alternative("", odds - best.log_evidence) for odds in (0.0, *rivals)]
+    rivals = [one.log_density - best.log_density for one in ranked if one is not best]
+    against = [Alternative("", odds) for odds in (-best.log_evidence, *rivals)]
     if not is_turn_known(best, rules):
         against.append(Alternative(""))
     kept = [
@@ -184,7 +184,7 @@ def insert(
             # that residuals are larger than those before them is as rare as that a sure pose is
             # wrong, though more spots are off for smaller ones; of two as good the later says more
             more = rules.log_doubt * (int(old.residual_ratio > 1) - int(new.residual_ratio > 1))
-            is_better = new.log_evidence > old.log_evidence + more - 0.01
+            is_better = new.log_density > old.log_density + more - 0.01
             told, other = (new, old) if is_better else (old, new)
             belief = beliefs([told, other])[1]
             if told.spread is None and belief > 1 - rules.confidence:
@@ -194,7 +194,7 @@ def insert(
             break
     else:
         ranked.append(new)
-    ranked.sort(key=lambda one: -one.log_evidence)
+    ranked.sort(key=lambda one: -one.log_density)
 
 
 def _are_one(
@@ -271,6 +271,6 @@ def nearest_alike(T_world_object: Floats, body: Body, T_reference: Floats | None
 
 def beliefs(judged: Sequence[ScoredPose]) -> list[float]:
     """Share of belief of each pose among its rivals; even where none meets anything."""
-    top = max([one.log_evidence for one in judged], default=0.0)
-    odds = [math.exp(one.log_evidence - top) if top > -math.inf else 1.0 for one in judged]
+    top = max([one.log_density for one in judged], default=0.0)
+    odds = [math.exp(one.log_density - top) if top > -math.inf else 1.0 for one in judged]
     return [one / sum(odds) for one in odds]

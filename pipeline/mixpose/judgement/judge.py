@@ -84,6 +84,7 @@ class ScoredPose:
     # (6, 6) where features are off by all that the body's spreads allow
     bent: Floats = field(default_factory=lambda: np.zeros((6, 6)))
     spread: Floats | None = None  # (6,) deviations, where as large as the body's motion
+    by_count: float = 0.0  # by how much its evidence is larger as it pays by count, not by volume
     proposer: str = ""  # where the pose came from
     blurs: tuple[Mapping[str, float], ...] = ()  # by sensor, through which it was fitted
 
@@ -91,6 +92,14 @@ class ScoredPose:
     def used(self) -> Matches:
         """The matches of the sensors that took part."""
         return taken_part(self.matches, self.left_out)
+
+    @property
+    def log_density(self) -> float:
+        """Logarithm of its probability among poses of the body, but for what they have in common.
+
+        Whichever they pay by against clutter, among themselves all pay by volume.
+        """
+        return self.log_evidence - self.by_count
 
     @cached_property
     def coverage(self) -> float:
@@ -171,7 +180,7 @@ def judge_together(
         measured, variances = variances, np.ones((*variances.shape[:-1], len(used)))
         variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
-    evidence, bent = _evidence(cases, seen, variances, free, rules.detection)
+    (evidence, densities), bent = _evidence(cases, seen, variances, free, rules.detection)
     return [
         ScoredPose(
             cases[k][1],
@@ -185,6 +194,7 @@ def judge_together(
             residual_ratio=ratio,
             variances=own,
             bent=bent[k],
+            by_count=float(evidence[k] - densities[k]) if evidence[k] > -np.inf else 0.0,
         )
         for k, (own, covariance, persistent, remembered, ratio) in enumerate(noises)
     ]
@@ -193,7 +203,7 @@ def judge_together(
 def _evidence(
     cases: Sequence[Case], seen: Matches, variances: Floats, free: Mask, detection: DetectionModel
 ) -> tuple[Floats, Floats]:
-    """Log odds (K,), and the covariances (K, 6, 6) of bodies that give way."""
+    """Log odds (2, K) as in `log_evidence`, and covariances (K, 6, 6) of bodies that give way."""
     bodies = [case[0].projection.body for case in cases]
     priors = [case[3] or flat_prior(body, free, detection) for case, body in zip(cases, bodies)]
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
@@ -242,7 +252,10 @@ def log_evidence(
     information: Floats,  # (K, 6, 6)
     spreads: Floats | None = None,
 ) -> Floats:
-    """Log odds (K,) for bodies at K poses against clutter, of arguments as in `odds_of`."""
+    """Log odds (2, K) for bodies at K poses against clutter, of arguments as in `odds_of`.
+
+    As the pose pays by volume or by count, whichever is cheaper; and as it pays by volume.
+    """
     odds = odds_of(found, variances, sizes, detection, spreads)
     # a direction that the data leave open is as uncertain as before
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
@@ -250,10 +263,11 @@ def log_evidence(
     inner = information[..., chosen[:, None], chosen]
     inner = inner + np.eye(len(chosen)) / wide[:, chosen, None] ** 2
     laplace = -0.5 * np.linalg.slogdet(inner / (2 * np.pi))[1]
-    evidence = odds[0] + odds[1] + laplace + log_densities
+    by_volume = odds[0] + odds[1] + laplace + log_densities
+    evidence = by_volume
     if detection.by_count:
-        evidence = np.maximum(evidence, paid_by_count(odds, found, free))
-    return np.where(found.met.any(axis=-1), evidence, -np.inf)
+        evidence = np.maximum(by_volume, paid_by_count(odds, found, free))
+    return np.where(found.met.any(axis=-1), [evidence, by_volume], -np.inf)
 
 
 def odds_of(
