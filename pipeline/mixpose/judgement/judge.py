@@ -180,7 +180,8 @@ def judge_together(
         measured, variances = variances, np.ones((*variances.shape[:-1], len(used)))
         variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
-    (evidence, densities), bent = _evidence(cases, seen, variances, free, rules.detection)
+    odds, bent = _evidence(cases, seen, variances, free, rules.detection)
+    evidence, densities = odds + [noise[1] for noise in noises]
     return [
         ScoredPose(
             cases[k][1],
@@ -196,7 +197,7 @@ def judge_together(
             bent=bent[k],
             by_count=float(evidence[k] - densities[k]) if evidence[k] > -np.inf else 0.0,
         )
-        for k, (own, covariance, persistent, remembered, ratio) in enumerate(noises)
+        for k, (own, _, covariance, persistent, remembered, ratio) in enumerate(noises)
     ]
 
 

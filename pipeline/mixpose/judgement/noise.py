@@ -108,16 +108,16 @@ def noise_of(
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
     known: Floats = np.full(6, np.inf),  # how uncertain the pose was before
-) -> tuple[Floats, Floats, Floats, RememberedNoise, float]:
+) -> tuple[Floats, float, Floats, Floats, RememberedNoise, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
-    Variances (L,) of each sensor, σ_ε²; the covariance (6, 6), zero where the pose is not free, and
+    Variances (L,) of each sensor, σ_ε², and the log of how rare they are; the covariance (6, 6), zero where the pose is not free, and
     what of it lasts and leaves velocities alone; what is remembered; and the ratio of residuals to
     the largest that chance makes.
     """
     (chosen,) = free.nonzero()
     count, inner = len(chosen), (chosen[:, None], chosen)
-    variances, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
+    variances, rarity, scale, sums, degrees, ratio = _level(found, before, count, model, estimate)
     wide = scale[:, None] + found.extra
     # what errs by more than noise counts less
     is_off, noise = model.errors.are_off(found, wide), np.sqrt(scale)
@@ -158,7 +158,7 @@ def noise_of(
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
     after = before.followed(found.names, sums, moments, biases, share)
-    return variances, covariance + steady, steady, after, ratio
+    return variances, rarity, covariance + steady, steady, after, ratio
 
 
 def _level(
@@ -167,13 +167,13 @@ def _level(
     count: int,
     model: NoiseModel,
     estimate: NoiseEstimate | None,
-) -> tuple[Floats, Floats, Floats, float, float]:
-    """Variances (L,) as offsets show them, and those that residuals are measured in.
+) -> tuple[Floats, float, Floats, Floats, float, float]:
+    """Variances (L,) as `_of_frame` has them, and those that residuals are measured in.
 
-    As a rule these are of the frames so far.  A frame with residuals of another kind goes by its
-    own, and is remembered as one that has the largest that chance makes: sums (2, L).  Where it is
-    more likely that something in front cuts spots, it goes by the noise so far, beyond which spots
-    say nothing.  Then the degrees of freedom of all that was seen, and the ratio.
+    As a rule the latter are of the frames so far.  A frame with residuals of another kind goes by
+    its own, and is remembered as one that has the largest that chance makes: sums (2, L).  Where it
+    is more likely that something in front cuts spots, it goes by the noise so far, beyond which
+    spots say nothing.  Then the degrees of freedom of all that was seen, and the ratio.
     """
     rules, past = model.errors, before.of(matches.names)
     sums, share = model.memory * past, model.usual_degrees / len(matches.names)
@@ -182,20 +182,32 @@ def _level(
     believed = past + share * (matches.dimensions == 2) * [[model.usual**2], [1.0]]
     known = [believed, past] if sum(past[1].tolist()) >= model.known else [believed]
     ratio = residual_ratio(own, known, model.by_chance, rules)
-    told = sums + own
+    rarity, told = 0.0, sums + own
+    if believed[1].any():
+        variances, rarity = _of_frame(own, believed, rules)
     if ratio > 1:
         told[0] = sums[0] + own[0] / ratio
         if sum(matches.met.tolist()) < model.fewest and past[1].any():
-            variances, told = pooled(believed, rules, 0.0), sums
+            told = sums
         else:
             sums = np.zeros_like(past)
-            own, variances, *_ = errors_seen(matches, count, sums, rules)
+            own, *_ = errors_seen(matches, count, sums, rules)
     sums = sums + own
-    if ratio <= 1:
-        variances = pooled(sums, rules, 1.0)
     degrees = sum(sums[1].tolist())
     scale = pooled(sums, rules, 0.0 if degrees >= 1 else rules.typical_degrees)
-    return variances, scale, told, degrees, ratio
+    return variances, rarity, scale, told, degrees, ratio
+
+
+def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, float]:
+    """Variances (L,) of the noise of one frame, and the log of how rare it is, about those before.
+
+    All sensors' variances differ from those before by one factor f, as that of a scaled inverse χ²
+    distribution of ν degrees of freedom, whose density is that of 1 by −½ ν (ln f + 1/f − 1).
+    """
+    nu, at = rules.typical_degrees, pooled(before, rules, 0.0)
+    squares, degrees = own
+    factor = (nu + float((squares / at).sum())) / (nu + float(degrees.sum()))
+    return factor * at, -0.5 * nu * (math.log(factor) + 1 / factor - 1)
 
 
 def of_each(rows: Floats, found: Matches) -> Floats:
