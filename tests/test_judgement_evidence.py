@@ -39,7 +39,7 @@ def odds_at(
     matches = Matches.stacked([matches_of(*found)])
     at_S2 = information[None] / S2
     odds = log_evidence(matches, variances, FREE, [prior], sizes, model, at_S2, spreads)
-    return float(odds[0])
+    return float(odds[0, 0])
 
 
 def evidence(

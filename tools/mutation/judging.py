@@ -358,8 +358,8 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-worse-twin-kept",
         "judgement/acceptance.py",
-        "is_better = new.log_evidence > old.log_evidence + more - 0.01",
-        "is_better = new.log_evidence < old.log_evidence",
+        "is_better = new.log_density > old.log_density + more - 0.01",
+        "is_better = new.log_density < old.log_density",
         "of two fits that are one pose the worse is told",
     ),
     Mutant(
@@ -404,7 +404,7 @@ _JUDGE = (
     Mutant(
         "judgement-all-poses-believed-alike",
         "judgement/acceptance.py",
-        "math.exp(one.log_evidence - top) if",
+        "math.exp(one.log_density - top) if",
         "1.0 if",
         "evidence does not tell poses apart",
     ),

@@ -181,7 +181,7 @@ def judge_together(
         variances[..., used] = measured
         seen = replace(seen, shares=seen.shares * used[:, None])
     odds, bent = _evidence(cases, seen, variances, free, rules.detection)
-    evidence, densities = odds + [noise[1] for noise in noises]
+    evidence, densities = odds + [noise[-1] for noise in noises]
     return [
         ScoredPose(
             cases[k][1],
@@ -197,7 +197,7 @@ def judge_together(
             bent=bent[k],
             by_count=float(evidence[k] - densities[k]) if evidence[k] > -np.inf else 0.0,
         )
-        for k, (own, _, covariance, persistent, remembered, ratio) in enumerate(noises)
+        for k, (own, covariance, persistent, remembered, ratio, _) in enumerate(noises)
     ]
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, TypeAlias
 
@@ -108,12 +108,12 @@ def noise_of(
     model: NoiseModel,
     estimate: NoiseEstimate | None = None,  # as the fit has it
     known: Floats = np.full(6, np.inf),  # how uncertain the pose was before
-) -> tuple[Floats, float, Floats, Floats, RememberedNoise, float]:
+) -> tuple[Floats, Floats, Floats, RememberedNoise, float, float]:
     """The noise of a frame at one pose, from its residuals and from those before it.
 
-    Variances (L,) of each sensor, σ_ε², and the log of how rare they are; the covariance (6, 6), zero where the pose is not free, and
-    what of it lasts and leaves velocities alone; what is remembered; and the ratio of residuals to
-    the largest that chance makes.
+    Variances (L,) of each sensor, σ_ε²; the covariance (6, 6), zero where the pose is not free, and
+    what of it lasts and leaves velocities alone; what is remembered; the ratio of residuals to
+    the largest that chance makes; and the log of how rare such variances are.
     """
     (chosen,) = free.nonzero()
     count, inner = len(chosen), (chosen[:, None], chosen)
@@ -148,6 +148,10 @@ def noise_of(
     moments = model.memory * before.moments + own
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
+    # independent errors are of this frame, drawn to those of all, as in `_of_frame`
+    nu, spare = model.errors.typical_degrees, max(spare, 0.0)
+    by_kind[0] = (nu * by_kind[0] + own[0, 4]) / (nu + spare)
+    degrees = min(degrees, nu + spare)
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
@@ -158,7 +162,7 @@ def noise_of(
         pulled = inverse @ (J.T @ (roots[:, None] * found.by_calibration.reshape(len(r), -1)))
         covariance[inner] += pulled @ pulled.T
     after = before.followed(found.names, sums, moments, biases, share)
-    return variances, rarity, covariance + steady, steady, after, ratio
+    return variances, covariance + steady, steady, after, ratio, rarity
 
 
 def _level(
@@ -199,15 +203,17 @@ def _level(
 
 
 def _of_frame(own: Floats, before: Floats, rules: ErrorRules) -> tuple[Floats, float]:
-    """Variances (L,) of the noise of one frame, and the log of how rare it is, about those before.
+    """Variances (L,) of the noise of one frame, and the log of how rare they are.
 
-    All sensors' variances differ from those before by one factor f, as that of a scaled inverse χ²
-    distribution of ν degrees of freedom, whose density is that of 1 by −½ ν (ln f + 1/f − 1).
+    They are those before times a factor f, which has a scaled inverse χ² distribution of ν degrees
+    of freedom and is rarer than 1 by ½ ν (ln f + 1/f − 1), and each sensor's is drawn to it.
     """
     nu, at = rules.typical_degrees, pooled(before, rules, 0.0)
-    squares, degrees = own
-    factor = (nu + float((squares / at).sum())) / (nu + float(degrees.sum()))
-    return factor * at, -0.5 * nu * (math.log(factor) + 1 / factor - 1)
+    ratios = own / [at, np.ones(len(at))]
+    squares, degrees = ratios.sum(axis=1).tolist()
+    factor = (nu + squares) / (nu + degrees)
+    rarity = -0.5 * nu * (math.log(factor) + 1 / factor - 1)
+    return at * pooled(ratios, replace(rules, typical=1.0), nu), rarity
 
 
 def of_each(rows: Floats, found: Matches) -> Floats:
