@@ -214,6 +214,13 @@ def test_belief_goes_by_the_odds() -> None:
     assert beliefs([SURE, rival]) == pytest.approx([0.75, 0.25])
 
 
+def test_a_rival_that_pays_by_count_is_as_far_from_what_was_expected() -> None:
+    # as evident against clutter, but for the motion that it would have made: e²⁰ of odds
+    rival = replace(SURE, T_world_object=ELSEWHERE, by_count=20.0)
+    assert status(SURE, rival) == "ok"
+    assert status(SURE, replace(rival, by_count=0.0)) == "ambiguous"
+
+
 def test_two_cameras_of_which_one_sees_half_of_the_body_cover_three_quarters(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

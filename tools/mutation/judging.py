@@ -287,14 +287,14 @@ _ACCEPTANCE = (
     Mutant(
         "judgement-rivals-never-count",
         "judgement/acceptance.py",
-        "for odds in (0.0, *rivals)]",
-        "for odds in (0.0,)]",
+        "for odds in (-best.log_evidence, *rivals)]",
+        "for odds in (-best.log_evidence,)]",
         "of two poses that fit alike one is called sure",
     ),
     Mutant(
         "judgement-clutter-never-counts",
         "judgement/acceptance.py",
-        "for odds in (0.0, *rivals)]",
+        "for odds in (-best.log_evidence, *rivals)]",
         "for odds in rivals]",
         "a pose that mere clutter explains as well is ok",
     ),

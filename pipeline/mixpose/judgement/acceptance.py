@@ -112,13 +112,11 @@ def is_sure(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
 def convinces(pose: ScoredPose, free: Mask, rules: AcceptanceRules) -> bool:
     """Whether a sure pose, near its prediction, meets so much that it could not be elsewhere.
 
-    Beside two sensors that agree, others may be covered, blind or out of step.  What residuals
-    will leave in doubt convinces nobody.
+    Beside two sensors that agree, others may be covered, blind or out of step.
     """
     agreeing = [share for share in pose.matches.coverage.tolist() if share >= rules.agreeing]
     share = sum(agreeing) / len(agreeing) if len(agreeing) > 1 else pose.coverage
-    is_usual = pose.residual_ratio <= rules.changed
-    return is_usual and is_sure(pose, free, rules) and share > rules.convincing
+    return is_sure(pose, free, rules) and share > rules.convincing
 
 
 def decide(ranked: Sequence[ScoredPose], free: Mask, rules: AcceptanceRules) -> Verdict:

@@ -93,6 +93,8 @@ class MatchedLikelihood:
         (judged,) = judge_together(
             [case_of(frame, fit, start)], frame.free, frame.rules.judgement, start.left_out
         )
+        if frame.track.doubted:  # by errors that last: it tells nothing against other poses now
+            judged = replace(judged, by_count=0.0)
         return judged if motion is None else with_motion_unknown(judged, frame, motion)
 
 
