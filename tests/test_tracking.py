@@ -125,8 +125,8 @@ def test_errors_have_the_size_that_the_covariance_says(
         error = twist_between(TRUTH, estimate.T_world_object)
         squared.append(error @ np.linalg.solve(estimate.covariance, error) / 6)
     # mean of 60 · 6 squares of unit normals: standard deviation 0.075; noise estimated from 26
-    # redundant measurements adds 8 %
-    assert 0.75 < np.mean(squared) < 1.4
+    # redundant measurements adds 8 %, that one of them may be cut makes covariances a tenth larger
+    assert 0.65 < np.mean(squared) < 1.4
 
 
 def test_a_frame_without_the_body_is_lost(body: Body, pinhole_cameras: list[PinholeCamera]) -> None:
