@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -129,10 +129,42 @@ def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floa
     return deviations
 
 
+@dataclass(eq=False)
+class Part:
+    """What is connected above a level, and what is found of it.
+
+    Attributes
+    ----------
+    contour : (n, 1, 2) int32
+    area : float
+        Number of pixels that it encloses.
+    level : float
+    found : list of Blob
+        The disk that it is, or the spots where it is small.
+    whole : list of Blob
+        Itself, where it is large and no disk: taken where nothing is inside of it.
+    beside : list of Part
+        In its holes: taken beside it.
+    inner : list of list of Part
+        At higher levels: taken instead of it.
+    """
+
+    contour: Contour
+    area: float
+    level: float
+    found: list[Blob] = field(default_factory=list)
+    whole: list[Blob] = field(default_factory=list)
+    beside: list[Part] = field(default_factory=list)
+    inner: list[list[Part]] = field(default_factory=list)
+
+
 def find_blobs(
     scene: Foreground, options: ExtractOptions, rules: BlobRules = BlobRules()
 ) -> list[Blob]:
     """The blobs of a foreground.
+
+    What has no shape is taken apart at all higher levels first: then all rims are looked at
+    together, and all spots.
 
     Parameters
     ----------
@@ -141,59 +173,69 @@ def find_blobs(
         `min_area` and `max_area` matter here: pixels above the detection level, holes filled.
     rules : BlobRules
     """
-    contours = outlines(scene)
-    blobs = _search(scene, contours, scene.level, options.min_area, rules, islands=True)
+    parts = _parts(outlines(scene), scene.level, options.min_area)
+    shapeless = _without_disks(scene, parts, rules)
+    for part in shapeless:
+        _take_apart(scene, part, options.min_area, rules, islands=True)
+    below = list(_below(shapeless))
+    _without_disks(scene, below, rules)
+    _find_spots(scene, [*parts, *below], rules)
     largest = math.inf if options.max_area is None else options.max_area
-    return [blob for blob in _outside_disks(blobs) if blob.area <= largest]
+    blobs = _outside_disks(_blobs_of(scene, parts, rules))
+    return [blob for blob in blobs if blob.area <= largest]
 
 
-def _search(
-    scene: Foreground,
-    contours: Sequence[Contour],
-    level: float,
-    min_area: float,
-    rules: BlobRules,
-    *,
-    islands: bool = False,
-) -> list[Blob]:
-    """Blobs among outer contours of what is above a level.
+def _parts(contours: Sequence[Contour], level: float, min_area: float) -> list[Part]:
+    """Those of the contours that are large enough."""
+    # A contour of n pixels encloses less than n² of them: noise is soon done with.
+    some = [contour for contour in contours if len(contour) ** 2 >= min_area]
+    areas = [filled_area(contour) for contour in some]
+    both = zip(some, areas, strict=True)
+    return [Part(contour, area, level) for contour, area in both if area >= min_area]
 
-    With `islands`, contours in the holes of these are yet to be looked for.
-    """
-    blobs: list[Blob] = []
-    large: list[Contour] = []
-    small: list[Contour] = []
-    small_areas: list[float] = []
-    for contour in contours:
-        # A contour of n pixels encloses less than n² of them: noise is soon done with.
-        if len(contour) ** 2 < min_area or (area := filled_area(contour)) < min_area:
-            continue
-        if area <= rules.small_area:
-            small.append(contour)
-            small_areas.append(area)
-        else:
-            large.append(contour)
-    disks = _disks(scene, large, level, rules)
-    blobs += [disk for disk in disks if disk is not None]
-    shapeless = [contour for contour, disk in zip(large, disks, strict=True) if disk is None]
-    found = all_spots(scene, small, small_areas, level, rules.spots)
-    for contour, area, spots in zip(small, small_areas, found, strict=True):
-        length = length_by_width(contour) if len(spots) == 1 else 1.0
-        blobs += [Blob(u, v, area / len(spots), length) for u, v in spots]
-    for group in neighbours(shapeless, rules.contours):
-        parts = [np.concatenate(group)] if len(group) > 1 else []
-        whole = [disk for disk in _disks(scene, parts, level, rules) if disk is not None]
-        blobs += whole
-        if whole:
-            continue
-        for contour in group:
-            blobs += _other(scene, contour, level, min_area, rules, islands=islands)
+
+def _below(parts: Sequence[Part]) -> Iterator[Part]:
+    """All parts that others came apart into."""
+    for part in parts:
+        for layer in (part.beside, *part.inner):
+            yield from layer
+            yield from _below(layer)
+
+
+def _without_disks(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> list[Part]:
+    """The large ones that are no disks; the others know their disk."""
+    large = [part for part in parts if part.area > rules.small_area]
+    disks = _disks(scene, [part.contour for part in large], rules)
+    for part, disk in zip(large, disks, strict=True):
+        part.found = [disk] if disk else []
+    return [part for part in large if not part.found]
+
+
+def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> None:
+    small = [part for part in parts if part.area <= rules.small_area]
+    contours = [part.contour for part in small]
+    areas, levels = (np.array([getattr(one, key) for one in small]) for key in ("area", "level"))
+    found = all_spots(scene, contours, areas, levels, rules.spots)
+    for part, spots in zip(small, found, strict=True):
+        length = length_by_width(part.contour) if len(spots) == 1 else 1.0
+        part.found = [Blob(u, v, part.area / len(spots), length) for u, v in spots]
+
+
+def _blobs_of(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> list[Blob]:
+    """What is found of parts that are beside each other, and of what they came apart into."""
+    blobs = [blob for part in parts for blob in part.found]
+    shapeless = [part for part in parts if part.area > rules.small_area and not part.found]
+    for group in neighbours([part.contour for part in shapeless], rules.contours):
+        joined = [np.concatenate([shapeless[k].contour for k in group])] if len(group) > 1 else []
+        rims = [disk for disk in _disks(scene, joined, rules) if disk]
+        blobs += rims
+        for part in [shapeless[k] for k in group if not rims]:
+            inner = [blob for layer in part.inner for blob in _blobs_of(scene, layer, rules)]
+            blobs += _blobs_of(scene, part.beside, rules) + (inner or part.whole)
     return blobs
 
 
-def _disks(
-    scene: Foreground, contours: Sequence[Contour], level: float, rules: BlobRules
-) -> list[Blob | None]:
+def _disks(scene: Foreground, contours: Sequence[Contour], rules: BlobRules) -> list[Blob | None]:
     """Blobs whose rims are ellipses, even if part of them is hidden or out of the window."""
     rims = find_rims(scene.grey, contours, scene.level, rules.rims)
     return [
@@ -214,45 +256,55 @@ def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) ->
     return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)[0]
 
 
-def _other(
-    scene: Foreground,
-    contour: Contour,
-    level: float,
-    min_area: float,
-    rules: BlobRules,
-    *,
-    islands: bool,
-) -> list[Blob]:
-    """A large blob without an elliptical rim if it is compact, or else the blobs inside of it."""
+def _take_apart(
+    scene: Foreground, part: Part, min_area: float, rules: BlobRules, *, islands: bool = False
+) -> None:
+    """Find what a large part without an elliptical rim is: compact, or others inside of it.
+
+    With `islands`, what is in its holes is yet to be looked for.
+    """
+    contour, level = part.contour, part.level
     box = cv2.boundingRect(contour)
     patch, inside, corner = cut_out(scene, contour, box, 0)
     if scene.judged and cv2.minMaxLoc(patch, inside)[1] < scene.least_peak:
-        return []
-    within = [
-        piece
-        for piece in pieces(above(patch, level) & inside, corner)
-        if tuple(cv2.boundingRect(piece)) != tuple(box)
-    ]
-    found = _search(scene, within, level, min_area, rules) if islands else []
-    whole = [] if on_border(scene, box) else [_hull_blob(contour)]
-    if not scene.judged:
-        return whole + found
-    cv2.drawContours(inside, within, -1, 0, cv2.FILLED, offset=(-corner[0], -corner[1]))
-    typical, peak = _brightness(scene, patch, inside)
-    stands_out = (
-        typical >= scene.least_peak
-        and cv2.contourArea(contour) >= rules.solidity * cv2.contourArea(cv2.convexHull(contour))
-        and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
-    )
-    inner: list[Blob] = []
-    for part, higher in come_apart(scene, contour, patch, inside, level, rules.spots):
-        inner += _search(scene, pieces(part, corner), higher, min_area, rules)
-    higher = rules.level_ratio * level
-    clear = stands_out and peak < rules.core_ratio * typical
-    if not inner and not clear and higher < peak:
-        brighter = pieces(above(patch, higher) & inside, corner)
-        inner = _search(scene, brighter, higher, min_area, rules)
-    return found + (inner or (whole if stands_out else []))
+        return
+    # What is above the level becomes 2 where it is connected with the contour, 1 are islands.
+    inside &= above(patch, level)
+    first = contour[0, 0] - corner
+    cv2.floodFill(inside, None, first.tolist(), 2, flags=8)
+    if islands:
+        part.beside = _parts(pieces(inside & 1, corner), level, min_area)
+    inside >>= 1
+    if not scene.judged or _stands_out(scene, contour, box, patch, inside, rules):
+        part.whole = [] if on_border(scene, box) else [_hull_blob(contour)]
+    if scene.judged:
+        apart = come_apart(scene, contour, patch, inside, level, rules.spots)
+        typical, peak = _brightness(scene, patch, inside)
+        higher = max(rules.level_ratio * level, scene.least_peak)
+        clear = part.whole and peak < rules.core_ratio * typical
+        if not apart and not clear and higher < peak:
+            apart = [(above(patch, higher) & inside, higher)]
+        part.inner = [_parts(pieces(mask, corner), lvl, min_area) for mask, lvl in apart]
+    for one in [one for layer in (part.beside, *part.inner) for one in layer]:
+        if one.area > rules.small_area:
+            _take_apart(scene, one, min_area, rules)
+
+
+def _stands_out(
+    scene: Foreground,
+    contour: Contour,
+    box: Box,
+    patch: NDArray[np.float32],
+    inside: NDArray[np.uint8],
+    rules: BlobRules,
+) -> bool:
+    """Whether a part is compact, bright, and brighter than what is around it."""
+    solid = rules.solidity * cv2.contourArea(cv2.convexHull(contour))
+    if cv2.contourArea(contour) < solid:
+        return False
+    typical = _brightness(scene, patch, inside)[0]
+    least = rules.spots.min_step * typical
+    return typical >= scene.least_peak and _step(scene, contour, box, rules.step) >= least
 
 
 def _hull_blob(contour: Contour) -> Blob:

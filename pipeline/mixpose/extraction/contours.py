@@ -143,13 +143,13 @@ def on_border(scene: Foreground, box: Box) -> bool:
 
 def neighbours(
     contours: Sequence[Contour], rules: ContourRules = ContourRules()
-) -> list[list[Contour]]:
-    """Groups of contours that nearly touch: perhaps the parts of one broken rim."""
-    groups: list[list[Contour]] = []
-    for contour in contours:
-        apart, together = [], [contour]
+) -> list[list[int]]:
+    """Groups of contours, by their places, that nearly touch: perhaps parts of one broken rim."""
+    groups: list[list[int]] = []
+    for k, contour in enumerate(contours):
+        apart, together = [], [k]
         for group in groups:
-            if any(_near(contour, other, rules) for other in group):
+            if any(_near(contour, contours[other], rules) for other in group):
                 together += group
             else:
                 apart.append(group)

@@ -27,49 +27,49 @@ Spots = list[tuple[float, float]]
 def all_spots(
     scene: Foreground,
     contours: Sequence[Contour],
-    areas: Sequence[float],
-    level: float,
+    areas: Floats,
+    levels: Floats,
     rules: SpotRules = SpotRules(),
 ) -> list[Spots]:
-    """What `find_spots` gives for each of several small blobs."""
-    found: list[Spots | None] = [None] * len(contours)
-    usual = _usual(scene, contours, rules) if level > 0 and len(contours) >= FEWEST else []
-    if len(usual) >= FEWEST:
-        boxes = np.array([box for _, box in usual])
-        own_areas = np.array([areas[k] for k, _ in usual])
-        centres, sure, bright = _together(scene, boxes, own_areas, level, rules)
-        for (k, _), centre, one, stands_out in zip(
-            usual, centres.tolist(), sure.tolist(), bright.tolist(), strict=True
+    """What `find_spots` gives for each of several small blobs, of areas (K,) above levels (K,)."""
+    found: list[Spots] = [[] for _ in contours]
+    bright, usual = _bright(scene, contours, rules)
+    if len(usual) >= FEWEST and float(levels.min()) > 0:
+        own, boxes = (np.array(one) for one in zip(*usual, strict=True))
+        centres, sure, clear = _together(scene, boxes, areas[own], levels[own], rules)
+        for k, centre, stands_out in zip(
+            own[sure].tolist(), centres[sure].tolist(), clear[sure].tolist(), strict=True
         ):
-            if one and not stands_out:
-                found[k] = []
-            elif one and not (scene.judged and is_long(contours[k], rules)):
+            if not stands_out:
+                bright.remove(k)
+            elif not (scene.judged and is_long(contours[k], rules)):
+                bright.remove(k)
                 found[k] = [(centre[0], centre[1])]
-    return [
-        find_spots(scene, contour, area, level, rules) if spots is None else spots
-        for spots, contour, area in zip(found, contours, areas, strict=True)
-    ]
+    for k in bright:
+        found[k] = find_spots(scene, contours[k], areas[k], float(levels[k]), rules)
+    return found
 
 
-def _usual(
+def _bright(
     scene: Foreground, contours: Sequence[Contour], rules: SpotRules
-) -> list[tuple[int, tuple[int, int, int, int]]]:
-    """Which contours are small, bright enough and well inside of the window, with their boxes."""
+) -> tuple[set[int], list[tuple[int, tuple[int, int, int, int]]]]:
+    """Which contours are bright enough; with boxes, those that are small and well inside too."""
     rows, columns = scene.grey.shape
     inner_v, inner_u = rows - WIDEST_PX - rules.margin, columns - WIDEST_PX - rules.margin
-    usual = []
+    bright, usual = set(), []
     for k, contour in enumerate(contours):
         u, v, width, height = cv2.boundingRect(contour)
-        small = width <= WIDEST_PX and height <= WIDEST_PX
-        if small and rules.margin <= u < inner_u and rules.margin <= v < inner_v:
-            highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
-            if highest - scene.zero >= scene.least_peak:
+        highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
+        if highest - scene.zero >= scene.least_peak:
+            bright.add(k)
+            small = width <= WIDEST_PX and height <= WIDEST_PX
+            if small and rules.margin <= u < inner_u and rules.margin <= v < inner_v:
                 usual.append((k, (u, v, width, height)))
-    return usual
+    return bright, usual
 
 
 def _together(
-    scene: Foreground, boxes: NDArray[np.intp], areas: Floats, level: float, rules: SpotRules
+    scene: Foreground, boxes: NDArray[np.intp], areas: Floats, levels: Floats, rules: SpotRules
 ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Centres (K, 2), which of them need no mask, and which of them stand out."""
     first_u, first_v = (boxes[:, :2] - rules.margin).T
@@ -88,13 +88,14 @@ def _together(
     frame[~np.concatenate([in_row, in_row, in_column, in_column], axis=1)] = np.inf
     frame.sort(axis=1)
     base = frame[each, width + height].astype(np.float64)
+    level = levels.astype(np.float32)[:, None, None]
     alone = (signal > level).reshape(len(boxes), -1).sum(axis=1) == areas
     peak = signal.max(axis=(1, 2)).astype(np.float64)
     bright = np.ones(len(boxes), dtype=np.bool_)
     if scene.judged:
-        bright = (peak - base >= rules.min_step * peak) & (peak - level >= rules.prominence * peak)
-    base = np.minimum(base, level)
-    cut = np.maximum(level, base + rules.centroid * (peak - base)).astype(np.float32)
+        bright = (peak - base >= rules.min_step * peak) & (peak - levels >= rules.prominence * peak)
+    base = np.minimum(base, levels)
+    cut = np.maximum(levels, base + rules.centroid * (peak - base)).astype(np.float32)
     weights = np.maximum(signal - cut[:, None, None], 0)
     moments = weights.reshape(len(boxes), -1) @ monomials(side.size, side.size).T
     total = moments[:, 0]
