@@ -30,6 +30,7 @@ from mixpose.extraction.contours import (
     ContourRules,
     cut_out,
     filled_area,
+    is_solid,
     length_by_width,
     neighbours,
     on_border,
@@ -253,7 +254,7 @@ def _is_disk(scene: Foreground, contour: Contour, rim: Rim, rules: BlobRules) ->
     if not scene.judged:
         return True
     patch, inside, _ = cut_out(scene, contour, cv2.boundingRect(contour), 0)
-    return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)[0]
+    return rim.contrast >= rules.spots.min_step * _brightness(scene, patch, inside)
 
 
 def _take_apart(
@@ -275,36 +276,25 @@ def _take_apart(
     if islands:
         part.beside = _parts(pieces(inside & 1, corner), level, min_area)
     inside >>= 1
-    if not scene.judged or _stands_out(scene, contour, box, patch, inside, rules):
-        part.whole = [] if on_border(scene, box) else [_hull_blob(contour)]
+    peak, typical = cv2.minMaxLoc(patch, inside)[1], 0.0
+    if scene.judged and is_solid(contour, rules.solidity):
+        typical = _brightness(scene, patch, inside)
+    stands_out = (
+        typical >= scene.least_peak
+        and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
+    )
+    if (stands_out or not scene.judged) and not on_border(scene, box):
+        part.whole = [_hull_blob(contour)]
     if scene.judged:
         apart = come_apart(scene, contour, patch, inside, level, rules.spots)
-        typical, peak = _brightness(scene, patch, inside)
         higher = max(rules.level_ratio * level, scene.least_peak)
-        clear = part.whole and peak < rules.core_ratio * typical
+        clear = stands_out and peak < rules.core_ratio * typical
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]
         part.inner = [_parts(pieces(mask, corner), lvl, min_area) for mask, lvl in apart]
     for one in [one for layer in (part.beside, *part.inner) for one in layer]:
         if one.area > rules.small_area:
             _take_apart(scene, one, min_area, rules)
-
-
-def _stands_out(
-    scene: Foreground,
-    contour: Contour,
-    box: Box,
-    patch: NDArray[np.float32],
-    inside: NDArray[np.uint8],
-    rules: BlobRules,
-) -> bool:
-    """Whether a part is compact, bright, and brighter than what is around it."""
-    solid = rules.solidity * cv2.contourArea(cv2.convexHull(contour))
-    if cv2.contourArea(contour) < solid:
-        return False
-    typical = _brightness(scene, patch, inside)[0]
-    least = rules.spots.min_step * typical
-    return typical >= scene.least_peak and _step(scene, contour, box, rules.step) >= least
 
 
 def _hull_blob(contour: Contour) -> Blob:
@@ -314,14 +304,10 @@ def _hull_blob(contour: Contour) -> Blob:
     return Blob(*centre, filled_area(contour), length_by_width(contour))
 
 
-def _brightness(
-    scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]
-) -> tuple[float, float]:
-    """Median and maximum of what is above the detection level within a contour."""
+def _brightness(scene: Foreground, patch: NDArray[np.float32], inside: NDArray[np.uint8]) -> float:
+    """Median of what is above the detection level within a contour."""
     values = patch[(inside > 0) & (patch > scene.level)]
-    if values.size == 0:
-        return 0.0, 0.0
-    return float(np.median(values)), float(values.max())
+    return float(np.median(values)) if values.size else 0.0
 
 
 def _step(scene: Foreground, contour: Contour, box: Box, width: int) -> float:

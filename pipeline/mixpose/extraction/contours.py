@@ -89,6 +89,11 @@ def length_by_width(contour: Contour) -> float:
     return (math.sqrt(long) + 0.5) / (math.sqrt(short) + 0.5)
 
 
+def is_solid(contour: Contour, least: float) -> bool:
+    """Whether a contour fills so much of its convex hull."""
+    return bool(cv2.contourArea(contour) >= least * cv2.contourArea(cv2.convexHull(contour)))
+
+
 def cut_out(
     scene: Foreground, contour: Contour, box: Box, margin: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], tuple[int, int]]:
