@@ -132,11 +132,11 @@ def find_rims(
     ellipses = fit_ellipses(*_side_by_side(hulls), rules)
     found = np.arange(len(outlines))
     # Once more from the better ellipse, which has all of a soft or broken rim within reach.
-    for _ in range(2):
+    for least in (rules.coverage / 2, rules.coverage):
         some, sound = ellipses.select(ellipses.sound), found[ellipses.sound]
         if not sound.size:
             return rims
-        ellipses, edges = _rims_near(signal, some, least_contrast, rules)
+        ellipses, edges = _rims_near(signal, some, least_contrast, least, rules)
         found = sound
     for k, i in enumerate(found.tolist()):
         if ellipses.sound[k]:
@@ -155,11 +155,14 @@ def _side_by_side(points: Sequence[Contour]) -> tuple[Floats, Mask]:
 
 
 def _rims_near(
-    signal: Grey, ellipses: Ellipses, least_contrast: float, rules: EllipseRules
+    signal: Grey, ellipses: Ellipses, least_contrast: float, least: float, rules: EllipseRules
 ) -> tuple[Ellipses, tuple[Floats, Floats, Floats]]:
-    """Ellipses through the edges near others, with coverage, residual and contrast of each."""
+    """Ellipses through the edges near others, with coverage, residual and contrast of each.
+
+    Those that have edges in less than a share `least` of the directions are not fitted.
+    """
     edges, found, steps, lows = _edges(signal, ellipses, least_contrast, rules)
-    found &= (found.sum(axis=1) >= rules.coverage / 2 * DIRECTIONS)[:, None]
+    found &= (found.sum(axis=1) >= least * DIRECTIONS)[:, None]
     light = lows - _medians(lows, found)[:, None]
     dark = found & (light <= rules.lit * _medians(steps, found)[:, None])
     enough = dark.sum(axis=1) >= rules.dark * found.sum(axis=1)
