@@ -103,8 +103,8 @@ _SHAPES = (
     Mutant(
         "extraction-min-area-ignored",
         "extraction/blobs.py",
-        "(area := filled_area(contour)) < min_area",
-        "(area := filled_area(contour)) < 0",
+        "for contour, area in both if area >= min_area]",
+        "for contour, area in both]",
         "specks count as features",
         (_BLOBS,),
     ),

@@ -215,7 +215,7 @@ def _without_disks(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -
 def _find_spots(scene: Foreground, parts: Sequence[Part], rules: BlobRules) -> None:
     small = [part for part in parts if part.area <= rules.small_area]
     contours = [part.contour for part in small]
-    areas, levels = (np.array([getattr(one, key) for one in small]) for key in ("area", "level"))
+    areas, levels = np.array([(part.area, part.level) for part in small]).reshape(-1, 2).T
     found = all_spots(scene, contours, areas, levels, rules.spots)
     for part, spots in zip(small, found, strict=True):
         length = length_by_width(part.contour) if len(spots) == 1 else 1.0
@@ -274,7 +274,7 @@ def _take_apart(
     first = contour[0, 0] - corner
     cv2.floodFill(inside, None, first.tolist(), 2, flags=8)
     if islands:
-        part.beside = _parts(pieces(inside & 1, corner), level, min_area)
+        part.beside = _parts(pieces((inside == 1).view(np.uint8), corner), level, min_area)
     inside >>= 1
     peak, typical = cv2.minMaxLoc(patch, inside)[1], 0.0
     if scene.judged and is_solid(contour, rules.solidity):

@@ -33,7 +33,7 @@ def all_spots(
 ) -> list[Spots]:
     """What `find_spots` gives for each of several small blobs, of areas (K,) above levels (K,)."""
     found: list[Spots] = [[] for _ in contours]
-    bright, usual = _bright(scene, contours, rules)
+    bright, usual = _bright(scene, contours, levels, rules)
     if len(usual) >= FEWEST and float(levels.min()) > 0:
         own, boxes = (np.array(one) for one in zip(*usual, strict=True))
         centres, sure, clear = _together(scene, boxes, areas[own], levels[own], rules)
@@ -51,16 +51,21 @@ def all_spots(
 
 
 def _bright(
-    scene: Foreground, contours: Sequence[Contour], rules: SpotRules
+    scene: Foreground, contours: Sequence[Contour], levels: Floats, rules: SpotRules
 ) -> tuple[set[int], list[tuple[int, tuple[int, int, int, int]]]]:
-    """Which contours are bright enough; with boxes, those that are small and well inside too."""
+    """Which contours may be spots by what is brightest; with boxes, those well inside and small."""
     rows, columns = scene.grey.shape
     inner_v, inner_u = rows - WIDEST_PX - rules.margin, columns - WIDEST_PX - rules.margin
     bright, usual = set(), []
-    for k, contour in enumerate(contours):
+    least = np.full(len(levels), scene.least_peak)
+    if scene.judged:
+        least = np.maximum(least, levels / (1 - rules.prominence))
+    for k, (contour, lowest) in enumerate(
+        zip(contours, (least + scene.zero).tolist(), strict=True)
+    ):
         u, v, width, height = cv2.boundingRect(contour)
         highest = cv2.minMaxLoc(scene.grey[v : v + height, u : u + width])[1]
-        if highest - scene.zero >= scene.least_peak:
+        if highest >= lowest:
             bright.add(k)
             small = width <= WIDEST_PX and height <= WIDEST_PX
             if small and rules.margin <= u < inner_u and rules.margin <= v < inner_v:
