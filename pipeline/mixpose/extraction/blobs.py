@@ -280,14 +280,14 @@ def _take_apart(
     if scene.judged and is_solid(contour, rules.solidity):
         typical = _brightness(scene, patch, inside)
     stands_out = (
-        typical >= scene.least_peak
+        0 < typical >= scene.least_peak
         and _step(scene, contour, box, rules.step) >= rules.spots.min_step * typical
     )
     if (stands_out or not scene.judged) and not on_border(scene, box):
         part.whole = [_hull_blob(contour)]
     if scene.judged:
         apart = come_apart(scene, contour, patch, inside, level, rules.spots)
-        higher = max(rules.level_ratio * level, scene.least_peak)
+        higher = rules.level_ratio * level
         clear = stands_out and peak < rules.core_ratio * typical
         if not apart and not clear and higher < peak:
             apart = [(above(patch, higher) & inside, higher)]
