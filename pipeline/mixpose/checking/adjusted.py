@@ -145,20 +145,27 @@ def _linearised(
     unknown: Unknown, given: Adjustment, f: int, T: Floats, values: Floats, scales: Floats
 ) -> tuple[Floats, Floats]:
     """Residuals (R,) of a frame in the noise, and their derivatives (R, 6 + k), in scales."""
-
-    def residuals(step: Floats) -> Floats:
-        at, moved = values + step[6:] * scales[6:], perturb(T, step[:6] * scales[:6])
-        world = unknown.points(given.points, at) @ moved[:3, :3].T + moved[:3, 3]
-        parts = [np.zeros(0)]
-        for seen in given.frames[f]:
-            sensor = unknown.sensor(seen.name, given.sensors[seen.name], at)
-            y, visible = sensor.project(world[seen.features])
-            parts.append(np.where(visible[:, None], (y - seen.observed) / seen.noise, 0.0).ravel())
-        return np.concatenate(parts)
-
-    steps = _STEP * np.eye(len(scales))
-    columns = [(residuals(step) - residuals(-step)) / (2 * _STEP) for step in steps]
-    return residuals(np.zeros(len(scales))), np.array(columns).T
+    points, steps = unknown.points(given.points, values), _STEP * np.diag(unknown.deviations)
+    lever = points @ T[:3, :3].T
+    world = lever + T[:3, 3]
+    moved = np.zeros((len(points), 3, len(scales)))  # of a point in the world, by pose and values
+    moved[:, :, :3] = np.eye(3) * scales[:3]
+    moved[:, :, 3:6] = np.cross(np.eye(3), lever[:, None]).swapaxes(1, 2) * scales[3:6]
+    for j, step in enumerate(steps if points is not given.points else ()):
+        by_step = unknown.points(given.points, values + step) - points
+        moved[:, :, 6 + j] = by_step @ T[:3, :3].T / _STEP
+    parts, columns = [np.zeros(0)], [np.zeros((0, len(scales)))]
+    for seen in given.frames[f]:
+        at = world[seen.features]
+        sensor = unknown.sensor(seen.name, given.sensors[seen.name], values)
+        y, J, visible = sensor.linearise(at)
+        by_all = J @ moved[seen.features]
+        for j, step in enumerate(steps if sensor is not given.sensors[seen.name] else ()):
+            other = unknown.sensor(seen.name, given.sensors[seen.name], values + step)
+            by_all[:, :, 6 + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
+        parts.append(np.where(visible[:, None], (y - seen.observed) / seen.noise, 0.0).ravel())
+        columns.append(by_all.reshape(-1, len(scales)) / seen.noise)
+    return np.concatenate(parts), np.concatenate(columns)
 
 
 def _endless(sensor: Any) -> Sensor:

@@ -50,7 +50,14 @@ class Change:
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
     """A body of other points; one whose features have an extent is of points, too."""
-    return Body(body.name, tuple(PointFeature(point) for point in points), normals)
+    features = tuple(PointFeature(point) for point in points)
+    return replace(body, features=features, normals=normals)
+
+
+def of_size(body: Body, factor: float) -> Body:
+    """A body whose points, and what is about them, are so many times as large."""
+    larger = of_points(body, factor * body.means, body.normals)
+    return larger if body.radii is None else replace(larger, radii=factor * body.radii)
 
 
 def changes(session: Session) -> Iterator[Change]:
@@ -122,7 +129,7 @@ def of_units(body: Body) -> Iterator[Change]:
         yield Change(
             "points and translations {are} in two units of length",
             f"with points {where}",
-            body=lambda body, k=factor: of_points(body, k * body.means, body.normals),  # type: ignore[misc]
+            body=lambda body, k=factor: of_size(body, k),  # type: ignore[misc]
         )
 
 

@@ -84,8 +84,10 @@ def anywhere(session: Session) -> Session:
 
 
 def best_pose(session: Session, body: Body, number: int, views: Views) -> ScoredPose | None:
-    """The best pose of a frame, searched for."""
+    """The best pose of a frame, searched for with as many guesses as a trial may take."""
     tracker, track = begin(replace(session, body=body))
+    search = replace(tracker.rules.search, max_guesses=DiagnosisRules().guesses)
+    tracker = replace(tracker, rules=replace(tracker.rules, search=search))
     with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
         ranked = tracker.explain(tracker.data(track, number, None, views))
     return ranked[0] if ranked else None

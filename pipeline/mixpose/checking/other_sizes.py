@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from mixpose.body import PointFeature
-from mixpose.checking.changes import OTHER_SIZE, Change, of_points
+from mixpose.checking.changes import OTHER_SIZE, Change, of_size
 from mixpose.checking.evidence import Frames, anywhere, best_pose
 from mixpose.objective import View
 from mixpose.records import Floats
@@ -44,7 +44,7 @@ def other_sizes(session: Session, frames: Frames) -> Iterator[Change]:
         yield Change(
             OTHER_SIZE,
             f"with points {size:.3g} times as large",
-            body=lambda body: of_points(body, size * body.means, body.normals),
+            body=lambda body: of_size(body, size),
             values=1,
         )
 

@@ -34,4 +34,10 @@ class DiagnosisRules:
         0.65, "of the offsets left by a change that is told for that: right rigs gain down to 0.79"
     )
     more: float = constant(0.02, "of the features met by a change that is told for more of them")
+    guesses: float = constant(
+        10_000,
+        "of a search in a frame: poses of right sessions are found with fewer than 2,000 by two "
+        "cameras, with 10,000 by one that sees 40 corners; wrong ones would take 250,000",
+    )
+    behind: float = constant(0.5, "of the best gain so far, below which a change is tried no more")
     patience_s: float = constant(20.0, "of processor time, for all trials together")

@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
 from typing import Any, NamedTuple
 
 from mixpose.body import Body
@@ -33,6 +32,7 @@ from mixpose.checking.meetings import beside, seen_by
 from mixpose.checking.other_sizes import other_sizes
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.values import unknowns
+from mixpose.judgement import ScoredPose
 from mixpose.records import Floats
 from mixpose.session import Session
 
@@ -54,6 +54,19 @@ class Diagnosis:
     change: str = ""
     gain: str = ""
     good: int = 0
+
+
+@dataclass
+class _Runner:
+    """A change on its way through the frames."""
+
+    change: Change
+    frames: Frames
+    poses: list[ScoredPose | None] = field(default_factory=list)
+
+    def gain(self, before: Explained) -> float:
+        """Nats by which it explains the frames that it tried better."""
+        return sum(evidence_of(a) - evidence_of(b) for a, b in zip(self.poses, before.poses))
 
 
 class Tried(NamedTuple):
@@ -88,7 +101,7 @@ def diagnosis(
     is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        half = partial(is_late, 0.5)  # the other half is for values
+        half = partial(is_late, 0.6)  # the rest is for values
         tried += _without_values(session, frames, before, others, half)
     # values only follow the noise where all frames are explained to within it without any
     if not any(_is_all_explained(one, rules) for one in tried):
@@ -127,44 +140,28 @@ def _without_values(
     others: Sequence[tuple[Change, Frames]],
     is_late: Callable[[], bool],
 ) -> Iterator[Tried]:
-    """Changes that explain the first frame better than it is, and then the others."""
-    of_seen = [(change, frames) for change in changes(session)]
-    rules, some, waiting = DiagnosisRules(), 0, list[tuple[Change, Frames]]()
-    for change, seen in [*others, *of_seen]:
-        if is_late():
-            return
-        tried = _by_frames(session, before, change, seen)
-        if tried is None:
-            waiting.append((change, seen))
-        elif tried:
-            is_all = tried[0].explained.good(rules) == len(frames)
-            some += is_all and tried[0].gain > rules.margin
-            yield tried[0]
-    # what explains as little of the first frame as it is may explain the second
-    sizes = ((change, frames) for change in other_sizes(session, frames[:2]))
-    for change, seen in chain(waiting, sizes) if not some else ():
-        if is_late():
-            return
-        yield from _by_frames(session, before, change, seen, skipped=1) or ()
+    """Changes that explain frames better than they are: a race, frame by frame.
 
-
-def _by_frames(
-    session: Session, before: Explained, change: Change, seen: Frames, skipped: int = 0
-) -> list[Tried] | None:
-    """A change by which frames are explained better; None where the first tells nothing."""
-    body, poses, gain = change.body(session.body), list(before.poses[:0]), 0.0
-    order = [*range(skipped, len(seen)), *range(skipped)]
-    for place, k in enumerate(order):
-        number, views = seen[k]
-        poses.append(best_pose(session, body, number, change.views(views)))
-        gain += evidence_of(poses[-1]) - evidence_of(before.poses[k])
-        if gain == 0 and place == 0:
-            return None
-        if gain <= 0:
-            return []
-    by_frame = dict(zip(order, poses))
-    explained = Explained(tuple(by_frame[k] for k in range(len(seen))))
-    return [Tried(change, explained, gain - change.cost)]
+    All changes try the first frame; those that gain far less than the best drop out after each.
+    """
+    runners = [_Runner(*each) for each in [*others, *((c, frames) for c in changes(session))]]
+    for k in range(len(frames)):
+        for place, runner in enumerate(runners):
+            if is_late() and (k == 0 or place > 0):
+                break  # but for the best so far, which is soon done
+            number, views = runner.frames[k]
+            body = runner.change.body(session.body)
+            runner.poses.append(best_pose(session, body, number, runner.change.views(views)))
+        tried = [runner for runner in runners if len(runner.poses) > k]
+        tried.sort(key=lambda runner: -runner.gain(before))
+        best = tried[0].gain(before) if tried else 0.0
+        least = DiagnosisRules().behind * best
+        runners = [r for r in tried if r.gain(before) >= max(least, 0.0)]
+        if best <= 0 and k == 0:  # what explains nothing of the first frame may do of the second
+            runners += [_Runner(c, frames, [None]) for c in other_sizes(session, frames[:2])]
+    for runner in runners:
+        gain = runner.gain(before)
+        yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
 
 
 def _with_values(
