@@ -14,7 +14,8 @@ import pytest
 from mixpose.body import Body, PointFeature
 from mixpose.checking import geometry_doubts, survey
 from mixpose.checking.adjusted import Adjustment, adjusted, promise
-from mixpose.checking.changes import Change
+from mixpose.checking.changes import Change, of_units
+from mixpose.checking.evidence import best_pose
 from mixpose.checking.meetings import Seen
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.checking.trials import Diagnosis, Tried, diagnosis, simplest
@@ -22,7 +23,7 @@ from mixpose.checking.values import unknowns
 from mixpose.density import Observation
 from mixpose.objective import View
 from mixpose.records import PointPattern
-from mixpose.rigid import from_rotation_vector, inverse, transform
+from mixpose.rigid import from_rotation_vector, inverse, perturb, transform
 from mixpose.runner import open_sources
 from mixpose.sensors import PinholeCamera
 from mixpose.session import Session, load_session
@@ -30,6 +31,7 @@ from mixpose.session.setup import Start
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 SIGMA, NOISE = 1.5, 0.1
+MOVED = np.array([1.5, -2.0, 1.0, 0.004, -0.01, 0.006])
 Frames = list[tuple[int, list[View]]]
 
 
@@ -281,6 +283,82 @@ def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
     ]
     assert adjusted(size, given_to(right, few)) is None
     assert promise(size, given_to(right, few)) == 0.0
+
+
+def on_a_slow_machine(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[int]:
+    """Numbers of the frames that are searched, where a search takes so long."""
+    searched: list[int] = []
+    search = best_pose
+
+    def slow(session: Session, body: Body, number: int, views: Any) -> Any:
+        searched.append(number)
+        return search(session, body, number, views)
+
+    monkeypatch.setattr("mixpose.checking.trials.best_pose", slow)
+    seconds_of = "mixpose.checking.trials.time.process_time"
+    monkeypatch.setattr(seconds_of, lambda: seconds * len(searched))
+    return searched
+
+
+def test_no_change_is_begun_when_patience_is_over(
+    right: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = on_a_slow_machine(monkeypatch, 1.1 * DiagnosisRules().patience_s)
+    swapped = recorded(right)
+    swapped["left"], swapped["right"] = swapped["right"], swapped["left"]
+    assert told(right, swapped) == ""
+    assert searched == [0]  # as the session is
+
+
+def test_the_change_that_leads_is_tried_in_all_frames_even_late(
+    right: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = on_a_slow_machine(monkeypatch, 0.047 * DiagnosisRules().patience_s)
+    mirrored = with_points(right, right.body.means * [1, -1, 1])
+    assert told(mirrored, recorded(right)).startswith("the body of [object] is mirrored: ")
+    # the session as it is, as many changes as there is time for, the best of them to the end
+    assert searched == [0, 1, 2, 3, *9 * [0], 1, 2, 3]
+
+
+def test_changes_that_gain_far_less_drop_out_after_a_frame(
+    right: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    searched = on_a_slow_machine(monkeypatch, 0.0)
+    told(with_points(right, right.body.means * [1, -1, 1]), recorded(right))
+    assert searched.count(0) > 10  # all changes try the first frame
+    assert searched.count(3) <= 4  # hardly any the last
+
+
+def test_points_of_another_unit_have_markers_of_that_unit(right: Session) -> None:
+    spheres = replace(right.body, shape="sphere", radii=np.full(7, 6.0))
+    larger = next(of_units(spheres)).body(spheres)
+    np.testing.assert_allclose(larger.means, 1000 * spheres.means)
+    assert larger.radii is not None
+    np.testing.assert_allclose(larger.radii, 6000.0)
+
+
+def test_least_squares_find_where_a_camera_stands(right: Session) -> None:
+    left, other = right.sensors
+    camera: Any = other.sensor
+    moved = replace(camera, T_sensor_world=perturb(camera.T_sensor_world, MOVED))
+    there = replace(right, sensors=(left, replace(other, sensor=moved)))
+    off = [u for u in unknowns(right) if u.what.startswith("T_sensor_world of 'right'")]
+    found = adjusted(off[0], given_to(right, exact(there, right.body.means)))
+    assert found is not None
+    np.testing.assert_allclose(found[0], MOVED, atol=2e-3)  # of 2 mm and 0.01 rad, by the prior
+
+
+def test_a_feature_met_by_chance_outweighs_no_evidence() -> None:
+    def explained(good: int, met: float, rms: float) -> Any:
+        return SimpleNamespace(poses=[None] * 4, met=met, good=lambda _: good, rms=lambda: rms)
+
+    smaller = Change("the body {is} of another size", "with it smaller", values=1)
+    before = explained(4, 50.0, 0.7)
+    one_less = [Tried(smaller, explained(4, 49.0, 0.02), 100.0)]
+    assert "is of another size" in simplest(one_less, before, DiagnosisRules()).change
+    # what meets far less is near a few detections, as a body that is far too small
+    far_less = [Tried(smaller, explained(4, 40.0, 0.02), 100.0)]
+    assert simplest(far_less, before, DiagnosisRules()).change == ""
 
 
 def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:

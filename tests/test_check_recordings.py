@@ -13,9 +13,17 @@ import pytest
 
 import mixpose
 from mixpose.body import Body, PointFeature
-from mixpose.checking import Survey, expected_count, fewest_count, judge, told_apart
+from mixpose.checking import (
+    Survey,
+    expected_count,
+    fewest_count,
+    judge,
+    some_of,
+    told_apart,
+)
 from mixpose.cli.check import check_session
 from mixpose.errors import RecordingError
+from mixpose.runner import open_sources
 from mixpose.simulation import SimulationOptions, simulate
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
@@ -89,6 +97,36 @@ def test_features_are_counted_beside_what_the_body_has(
     # a false spot in every second frame, a marker hidden now and then: 6 to 8 of 7
     assert report.count("features per frame: 6 / 7 / 8 (least / median / most), expected: 7") == 1
     assert "8 images 640x512, frames 0-7; all read" in report
+
+
+def test_features_are_counted_in_some_images_of_a_long_recording_and_all_are_read(
+    recording: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    darkened(recording, 1)
+    for n in range(1, 45):
+        shutil.copy(recording / "left0000.png", recording / f"left{n:04d}.png")
+        shutil.copy(recording / "right0000.png", recording / f"right{n:04d}.png")
+    (recording / "left0001.png").write_bytes(b"no image")
+    with pytest.raises(RecordingError, match=r"left0001\.png"):
+        check_session(recording / "session.toml")
+    report = capsys.readouterr().out
+    assert "1 of the 45 looked at cannot be read" in report
+    assert report.count("features per frame: 0 / 0 / 0 (least / median / most of 20 frames)") == 2
+
+
+def test_images_to_count_in_are_the_same_of_all_sensors(recording: Path) -> None:
+    session = mixpose.load_session(recording / "session.toml")
+    assert some_of(open_sources(session, {})) == set(range(8))
+    for n in range(8, 49):
+        shutil.copy(recording / "left0000.png", recording / f"left{n:04d}.png")
+        shutil.copy(recording / "right0000.png", recording / f"right{n:04d}.png")
+    (recording / "right0000.png").unlink()  # a frame that one sensor lacks displaces no other
+    found = some_of(open_sources(session, {}))
+    assert found is not None
+    assert (len(found), min(found), max(found)) == (20, 1, 48)
+    cut_to(recording, 1)
+    (recording / "right0001.png").write_bytes(b"")
+    assert some_of(open_sources(session, {})) == {0, 1}  # none pairs: those of each
 
 
 def test_all_damaged_frames_are_named_and_the_rest_is_looked_at(
@@ -312,7 +350,9 @@ def test_of_a_stream_only_its_beginning_is_looked_at(
 
 
 def test_the_typical_frame_has_the_median_number_of_features() -> None:
-    seen = Survey(numbers=(4, 5, 6, 7, 8), counts=(0, 9, 3, 40, 7), empty=(4,))
+    seen = Survey(
+        numbers=(4, 5, 6, 7, 8), counted=(4, 5, 6, 7, 8), counts=(0, 9, 3, 40, 7), empty=(4,)
+    )
     # in order the counts are 0, 3, 7, 9, 40
     assert seen.typical_frame == 8
     assert replace(seen, counts=None).typical_frame is None

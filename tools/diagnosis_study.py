@@ -28,6 +28,7 @@ from mixpose.checking import (
     geometry_doubts,
     key_warnings,
     placement_warnings,
+    some_of,
     survey,
     with_image_sizes,
 )
@@ -212,7 +213,7 @@ def said_of(session: Session, known: Surveys) -> tuple[list[str], float]:
     for setup in session.sensors:
         key = (str(session.path), str(setup.source), repr(setup.extract))
         if key not in known:
-            known[key] = survey(session, setup, sources[setup.name])
+            known[key] = survey(session, setup, sources[setup.name], looked_at=some_of(sources))
         surveys[setup.name] = known[key]
     sized = with_image_sizes(session, {name: each.size for name, each in surveys.items()})
     began = time.process_time()

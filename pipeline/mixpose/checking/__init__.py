@@ -1,9 +1,9 @@
 """What can be said of a session before its poses are estimated.
 
-`recordings` reads every frame and counts features, `advice` says which key to change where the
-count is off and the body is found with that change, `sensor_keys` doubts calibrations and widths,
-`placement` looks at where sensors stand and the body starts, `lookalikes` finds poses that the
-sensors could not tell apart, `shared_parts` bodies that could be taken for each other,
+`recordings` reads every frame and counts features in some, `advice` says which key to change where
+the count is off and the body is found with that change, `sensor_keys` doubts calibrations and
+widths, `placement` looks at where sensors stand and the body starts, `lookalikes` finds poses that
+the sensors could not tell apart, `shared_parts` bodies that could be taken for each other,
 `shared_sources` recordings that are given twice, `typical` has poses where the session names no
 start.  `geometry` takes a few frames all over the recording, and `trials` tries what else the
 session could have said: `changes` of it as a whole, and `values` that are `adjusted` to what
@@ -22,7 +22,7 @@ from mixpose.checking.placement import (
     placement_lines,
     placement_warnings,
 )
-from mixpose.checking.recordings import Survey, image_of, numbers_of, survey
+from mixpose.checking.recordings import Survey, image_of, numbers_of, some_of, survey
 from mixpose.checking.sensor_keys import key_warnings
 from mixpose.checking.shared_parts import shared_part_warnings
 from mixpose.checking.shared_sources import shared_source_warnings
@@ -50,6 +50,7 @@ __all__ = [
     "placement_warnings",
     "shared_part_warnings",
     "shared_source_warnings",
+    "some_of",
     "survey",
     "told_apart",
     "typical_poses",

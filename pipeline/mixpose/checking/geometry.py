@@ -204,9 +204,9 @@ def _read(sources: Mapping[str, Source], numbers: Sequence[int]) -> Iterator[Fra
 
 def _shown(session: Session, found: Survey, setup: SensorSetup) -> dict[int, float]:
     """How much of the body each frame may show."""
-    counts = found.counts or [1] * len(found.numbers)
+    counts = found.counts or [1] * len(found.counted)
     most, empty = expected_count(setup, session), {*found.empty}
     return {
         n: 0.0 if n in empty else float(min(count, most))
-        for n, count in zip(found.numbers, counts, strict=True)
+        for n, count in zip(found.counted, counts, strict=True)
     }

@@ -1,8 +1,8 @@
-"""Read every frame of a sensor and count what is found in it."""
+"""Read every frame of a sensor, and count what is found in images all over the recording."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -20,6 +20,9 @@ from mixpose.runner import observation_of
 from mixpose.session import SensorSetup, Session
 
 _QUICK = 5  # frames that are looked at where not all are
+# images of a sensor in which features are counted: to find them takes five times as long as to read
+# an image, and the median of so many is as good as that of all
+_COUNTED = 20
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,13 @@ class Survey:
     ----------
     numbers : tuple of int
         Frames that could be read, ascending.
+    counted : tuple of int
+        Those of them in which features were looked for.
     counts : tuple of int or None
-        Features found in each of them; None where frames are grey values or profiles, in which
+        Features found in each of these; None where frames are grey values or profiles, in which
         nothing is counted.
     empty : tuple of int
-        Frames without any feature, or of one value all over.
+        Those of them without any feature, or of one value all over.
     size : (int, int) or None
         Width and height of the images in px.
     damage : tuple of str
@@ -46,6 +51,7 @@ class Survey:
     """
 
     numbers: tuple[int, ...]
+    counted: tuple[int, ...]
     counts: tuple[int, ...] | None
     empty: tuple[int, ...]
     size: tuple[int, int] | None = None
@@ -59,7 +65,7 @@ class Survey:
         if self.counts is None:
             return None
         middle = np.argsort(self.counts, kind="stable")[len(self.counts) // 2]
-        return self.numbers[int(middle)]
+        return self.counted[int(middle)]
 
 
 def survey(
@@ -68,6 +74,7 @@ def survey(
     source: Source,
     *,
     quick: bool = False,
+    looked_at: Collection[int] | None = None,
     done: Callable[[], None] = lambda: None,
 ) -> Survey:
     """Read the frames of a sensor as a run would, past damaged images.
@@ -80,6 +87,8 @@ def survey(
         The sensor's recording.
     quick : bool
         Look at a few frames only, as is always done of a stream, which has no end.
+    looked_at : collection of int or None
+        Frames whose images are searched for features; None for all that are read.
     done : callable
         Called after each frame.
 
@@ -91,10 +100,16 @@ def survey(
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: list[tuple[int | None, str]] = []
     counts: dict[int, int | None] = {}
-    empty: list[int] = []
+    numbers, empty = list[int](), list[int]()
     size: tuple[int, int] | None = None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
+            numbers.append(frame.number)
+            if isinstance(frame.data, np.ndarray):
+                size = (frame.data.shape[1], frame.data.shape[0])
+                if looked_at is not None and frame.number not in looked_at:
+                    done()
+                    continue
             pattern = observation_of(session, setup, frame).pattern
             if isinstance(pattern, PointPattern):
                 counts[frame.number] = len(pattern.points)
@@ -104,13 +119,12 @@ def survey(
                 is_empty = bool(np.ptp(pattern.values) == 0)
             if is_empty:
                 empty.append(frame.number)
-            if isinstance(frame.data, np.ndarray):
-                size = (frame.data.shape[1], frame.data.shape[0])
             done()
     known = [count for count in counts.values() if count is not None]
     counted = bool(known) and len(known) == len(counts)
     return Survey(
-        numbers=tuple(counts),
+        numbers=tuple(numbers),
+        counted=tuple(counts),
         counts=tuple(known) if counted else None,
         empty=tuple(empty),
         size=size,
@@ -118,6 +132,19 @@ def survey(
         damaged=tuple(number for number, _ in damage if number is not None),
         is_whole=not quick,
     )
+
+
+def some_of(sources: Mapping[str, Source]) -> set[int] | None:
+    """Frames all over a recording that are enough to count features in; None for all.
+
+    They are the same of all sensors, as far as their frames pair.
+    """
+    known = [found for source in sources.values() if (found := numbers_of(source))]
+    if not known:
+        return None
+    numbers = sorted(set.intersection(*known) or set.union(*known))
+    places = np.linspace(0, len(numbers) - 1, min(_COUNTED, len(numbers)))
+    return {numbers[int(place)] for place in places}
 
 
 def image_of(source: Source, number: int) -> Image | None:

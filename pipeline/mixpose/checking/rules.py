@@ -34,6 +34,11 @@ class DiagnosisRules:
         0.65, "of the offsets left by a change that is told for that: right rigs gain down to 0.79"
     )
     more: float = constant(0.02, "of the features met by a change that is told for more of them")
+    fewer: float = constant(
+        0.95,
+        "of the features met before, at least by a change that is told: wrong poses meet one in 50 "
+        "by chance",
+    )
     guesses: float = constant(
         10_000,
         "of a search in a frame: poses of right sessions are found with fewer than 2,000 by two "
@@ -41,3 +46,9 @@ class DiagnosisRules:
     )
     behind: float = constant(0.5, "of the best gain so far, below which a change is tried no more")
     patience_s: float = constant(20.0, "of processor time, for all trials together")
+    as_it_is: float = constant(
+        0.15,
+        "of that, after which no more frames are estimated by the session as it is: 0.6 s a frame "
+        "in most, 3 to 9 s where a body a thousandth as large meets any detection",
+    )
+    whole: float = constant(0.6, "of that, for changes without values: the rest is for values")

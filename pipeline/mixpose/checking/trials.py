@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from mixpose.body import Body
 from mixpose.checking.adjusted import Adjustment, Unknown, adjusted, promise
 from mixpose.checking.changes import Change, changes, of_points, with_sensor
 from mixpose.checking.evidence import (
@@ -97,12 +96,13 @@ def diagnosis(
         return time.process_time() - began > share * rules.patience_s
 
     session = anywhere(session)
-    before = _explained(session, session.body, frames)
+    before = _as_it_is(session, frames, partial(is_late, rules.as_it_is))
+    frames = frames[: len(before.poses)]
     is_good = sum(is_well_explained(pose, rules) for pose in before.poses)
     tried = list[Tried]()
     if before.good(rules) < len(frames) or 2 * is_good < len(frames):
-        half = partial(is_late, 0.6)  # the rest is for values
-        tried += _without_values(session, frames, before, others, half)
+        in_part = partial(is_late, rules.whole)  # the rest is for values
+        tried += _without_values(session, frames, before, others, in_part)
     # values only follow the noise where all frames are explained to within it without any
     if not any(_is_all_explained(one, rules) for one in tried):
         tried += _with_values(session, frames, before, is_late)
@@ -123,8 +123,14 @@ def explanation(session: Session, frames: Frames) -> str | None:
     return late_sensor(session, frames) or diagnosis(session, frames).change or None
 
 
-def _explained(session: Session, body: Body, frames: Frames) -> Explained:
-    return Explained(tuple(best_pose(session, body, n, views) for n, views in frames))
+def _as_it_is(session: Session, frames: Frames, is_late: Callable[[], bool]) -> Explained:
+    """Poses of the session as it is, of fewer frames where a search takes long."""
+    poses = list[ScoredPose | None]()
+    for number, views in frames:
+        if poses and is_late():
+            break
+        poses.append(best_pose(session, session.body, number, views))
+    return Explained(tuple(poses))
 
 
 def _is_all_explained(one: Tried, rules: DiagnosisRules) -> bool:
@@ -157,7 +163,8 @@ def _without_values(
         best = tried[0].gain(before) if tried else 0.0
         least = DiagnosisRules().behind * best
         runners = [r for r in tried if r.gain(before) >= max(least, 0.0)]
-        if best <= 0 and k == 0:  # what explains nothing of the first frame may do of the second
+        if best <= 0 and k == 0 and not is_late():
+            # what explains nothing of the first frame may do of the second
             runners += [_Runner(c, frames, [None]) for c in other_sizes(session, frames[:2])]
     for runner in runners:
         gain = runner.gain(before)
@@ -273,7 +280,7 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
 def _gain(after: Explained, before: Explained, rules: DiagnosisRules) -> str:
     """What is better by a change, in words; empty where that is little."""
     count, now, then = len(before.poses), after.good(rules), before.good(rules)
-    if after.met < before.met:
+    if after.met < rules.fewer * before.met:
         return ""  # what meets less is near some detections, as a body that is far too small
     if now > then:
         as_is = f", {then} as it is" if then else ""

@@ -29,6 +29,7 @@ from mixpose.checking import (
     placement_warnings,
     shared_part_warnings,
     shared_source_warnings,
+    some_of,
     survey,
     told_apart,
     typical_poses,
@@ -108,9 +109,13 @@ def check_session(
     for one in session.objects:
         _say_object(report, session, one)
     surveys: dict[str, Survey] = {}
+    some = None if quick else some_of(opened)
     with _progress(opened, quick=quick) as done:
         for setup in session.sensors:
-            surveys[setup.name] = survey(session, setup, opened[setup.name], quick=quick, done=done)
+            source = opened[setup.name]
+            surveys[setup.name] = survey(
+                session, setup, source, quick=quick, looked_at=some, done=done
+            )
     for setup in session.sensors:
         _say_sensor(report, session, setup, opened[setup.name], surveys)
     report.warnings += shared_source_warnings(session, replaced) + _pairing_warnings(opened)
@@ -224,9 +229,10 @@ def _say_features(
         return
     low, high = min(found.counts), max(found.counts)
     middle = float(np.median(found.counts))
+    of = "" if len(found.counted) == len(found.numbers) else f" of {len(found.counted)} frames"
     report.say(
         "",
-        f"features per frame: {low} / {middle:g} / {high} (least / median / most), expected: "
+        f"features per frame: {low} / {middle:g} / {high} (least / median / most{of}), expected: "
         f"{expected}",
     )
     fewest = min(fewest_count(setup, session.alone(o.body.name)) for o in session.objects)
@@ -235,7 +241,7 @@ def _say_features(
         number = found.typical_frame
         assert number is not None, "there are counts"
         image = image_of(source, number)
-        count = found.counts[found.numbers.index(number)]
+        count = found.counts[found.counted.index(number)]
         report.of_counts.append(
             f"{where}: {judgement} features, {count} in frame {number} where "
             f"{expected} are expected: {advice(session, setup, number, image, expected)}"
