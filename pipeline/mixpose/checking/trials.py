@@ -190,6 +190,10 @@ def _with_values(
     promises = [(promise(unknown, given), unknown) for unknown in unknowns(session)]
     promising = [each for each in promises if each[0] > rules.promise]
     promising.sort(key=lambda each: -each[0] + each[1].cost)
+    # one marker that is off has others beside it doubted, too
+    markers = [each.feature for _, each in promising if each.feature is not None]
+    doubted = {None, *markers[: rules.markers]}
+    promising = [each for each in promising if each[1].feature in doubted]
     for _, unknown in promising[: rules.most]:
         if is_late():
             return
