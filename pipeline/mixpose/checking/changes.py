@@ -106,6 +106,7 @@ def with_sensor(view: View, sensor: Any) -> View:
 
 
 def _of_the_body(body: Body) -> Iterator[Change]:
+    yield from of_units(body)  # before what takes long to search with a tiny body
     middle, normals = body.means.mean(axis=0), body.normals
     other_side = np.array([1.0, 1.0, -1.0])
     turned = None if normals is None else normals * other_side
@@ -120,7 +121,6 @@ def _of_the_body(body: Body) -> Iterator[Change]:
             "with all of them negated",
             body=lambda body: of_points(body, body.means, -normals),
         )
-    yield from of_units(body)
 
 
 def of_units(body: Body) -> Iterator[Change]:

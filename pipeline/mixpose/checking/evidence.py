@@ -83,10 +83,12 @@ def anywhere(session: Session) -> Session:
     return replace(session, start=None) if free_mask(session.estimator).all() else session
 
 
-def best_pose(session: Session, body: Body, number: int, views: Views) -> ScoredPose | None:
-    """The best pose of a frame, searched for with as many guesses as a trial may take."""
+def best_pose(
+    session: Session, body: Body, number: int, views: Views, guesses: float = np.inf
+) -> ScoredPose | None:
+    """The best pose of a frame, searched for with as many guesses at most."""
     tracker, track = begin(replace(session, body=body))
-    search = replace(tracker.rules.search, max_guesses=DiagnosisRules().guesses)
+    search = replace(tracker.rules.search, max_guesses=guesses)
     tracker = replace(tracker, rules=replace(tracker.rules, search=search))
     with np.errstate(all="ignore"), one_blas_thread():  # other bodies may be anywhere
         ranked = tracker.explain(tracker.data(track, number, None, views))

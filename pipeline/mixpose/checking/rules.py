@@ -44,8 +44,8 @@ class DiagnosisRules:
     )
     guesses: float = constant(
         10_000,
-        "of a search in a frame: poses of right sessions are found with fewer than 2,000 by two "
-        "cameras, with 10,000 by one that sees 40 corners; wrong ones would take 250,000",
+        "of a search in a frame by a changed session: poses of right sessions are found with fewer "
+        "than 2,000 by two cameras, with 10,000 by one that sees 40 corners; wrong ones would take 250,000",
     )
     behind: float = constant(0.5, "of the best gain so far, below which a change is tried no more")
     patience_s: float = constant(20.0, "of processor time, for all trials together")
@@ -54,4 +54,4 @@ class DiagnosisRules:
         "of that, after which no more frames are estimated by the session as it is: 0.6 s a frame "
         "in most, 3 to 9 s where a body a thousandth as large meets any detection",
     )
-    whole: float = constant(0.6, "of that, for changes without values: the rest is for values")
+    whole: float = constant(0.75, "of that, for changes without values: the rest is for values")

@@ -23,6 +23,7 @@ from mixpose.checking.evidence import (
     anywhere,
     best_pose,
     evidence_of,
+    is_explained,
     is_well_explained,
     pose_near,
 )
@@ -62,6 +63,18 @@ class _Runner:
     change: Change
     frames: Frames
     poses: list[ScoredPose | None] = field(default_factory=list)
+
+    def advance(self, session: Session) -> None:
+        """Try the next frame."""
+        number, views = self.frames[len(self.poses)]
+        body = self.change.body(session.body)
+        seen, guesses = self.change.views(views), DiagnosisRules().guesses
+        self.poses.append(best_pose(session, body, number, seen, guesses))
+
+    def is_ahead(self, rules: DiagnosisRules) -> bool:
+        """Whether it explains the last frame that it tried."""
+        last = self.poses[-1] if self.poses else None
+        return last is not None and is_explained(last, rules)
 
     def gain(self, before: Explained) -> float:
         """Nats by which it explains the frames that it tried better."""
@@ -150,22 +163,23 @@ def _without_values(
 
     All changes try the first frame; those that gain far less than the best drop out after each.
     """
-    runners = [_Runner(*each) for each in [*others, *((c, frames) for c in changes(session))]]
+    rules, runners = DiagnosisRules(), [_Runner(*each) for each in others]
+    runners += [_Runner(change, frames) for change in changes(session)]
     for k in range(len(frames)):
         for place, runner in enumerate(runners):
             if is_late() and (k == 0 or place > 0):
                 break  # but for the best so far, which is soon done
-            number, views = runner.frames[k]
-            body = runner.change.body(session.body)
-            runner.poses.append(best_pose(session, body, number, runner.change.views(views)))
+            runner.advance(session)
+        if k == 0 and not is_late() and not any(r.is_ahead(rules) for r in runners):
+            sizes = [_Runner(change, frames) for change in other_sizes(session, frames[:2])]
+            for runner in sizes:
+                runner.advance(session)
+            runners += sizes
         tried = [runner for runner in runners if len(runner.poses) > k]
         tried.sort(key=lambda runner: -runner.gain(before))
         best = tried[0].gain(before) if tried else 0.0
-        least = DiagnosisRules().behind * best
-        runners = [r for r in tried if r.gain(before) >= max(least, 0.0)]
-        if best <= 0 and k == 0 and not is_late():
-            # what explains nothing of the first frame may do of the second
-            runners += [_Runner(c, frames, [None]) for c in other_sizes(session, frames[:2])]
+        # where none explains more of the first frame, one may of the second
+        runners = [r for r in tried if r.gain(before) >= max(rules.behind * best, 0.0)]
     for runner in runners:
         gain = runner.gain(before)
         yield Tried(runner.change, Explained(tuple(runner.poses)), gain - runner.change.cost)
