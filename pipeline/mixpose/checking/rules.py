@@ -45,7 +45,8 @@ class DiagnosisRules:
     guesses: float = constant(
         10_000,
         "of a search in a frame by a changed session: poses of right sessions are found with fewer "
-        "than 2,000 by two cameras, with 10,000 by one that sees 40 corners; wrong ones would take 250,000",
+        "than 2,000 by two cameras, with 10,000 by one that sees 40 corners; wrong "
+        "ones would take 250,000",
     )
     behind: float = constant(0.5, "of the best gain so far, below which a change is tried no more")
     patience_s: float = constant(20.0, "of processor time, for all trials together")
