@@ -64,7 +64,7 @@ def test_the_evidence_of_the_search_is_that_of_the_judgement(
         objective = matched_objective(views, EIGHT, [1.5] * len(views))
         for pose, log_odds in zip(poses, found, strict=True):
             judged = judge(objective, pose, ALL_FREE, prior=never)
-            # the search takes the noise for typical; the judgement pays ½ ν (ln f + 1/f − 1) where it
+            # the search takes noise for typical; the judgement pays ½ ν (ln f + 1/f − 1) where it
             # is f times what is usual: 3.1 nats at f = 12, that of the second pose, and ν = 4
             assert 0 < log_odds - judged.log_evidence < 3.2
 
