@@ -189,6 +189,8 @@ def _level(
     rarity, told = 0.0, sums + own
     if believed[1].any():
         variances, rarity = _of_frame(own, believed, rules)
+        # of frames that went before: a first one may be of any noise
+        rarity = rarity if past[1].any() else 0.0
     if ratio > 1:
         told[0] = sums[0] + own[0] / ratio
         if sum(matches.met.tolist()) < model.fewest and past[1].any():
