@@ -63,7 +63,7 @@ SHOWN_BY = {
     "no without_sensor": "a knocked camera",
     "nothing merged": "fast",
     "misses free": "1 pinhole 5/0/5",
-    "unseen free": "2 pinhole 6/2/4",
+    "unseen free": "1 pinhole 8/3/5",
     "clutter even": "1 pinhole 5/0/5",
     "payment by volume": "1 pinhole 5/0/5",
     "prior flat": "a loose start, 60 false",
