@@ -48,7 +48,8 @@ def test_what_many_others_tell_as_well_makes_a_pose_hardly_wider() -> None:
 
 def test_where_nothing_is_cut_a_pose_is_as_the_noise_has_it() -> None:
     found, _ = met(5, np.random.default_rng(0), np.zeros((5, 2)))
-    C, spread, factor = widened(replace(found, crowd=0 * found.crowd), ErrorRules(chances=(0, 0)))
+    never = ErrorRules(chances=(0.0, 0.0, 0.0))
+    C, spread, factor = widened(replace(found, crowd=0 * found.crowd), never)
     np.testing.assert_allclose(spread, 0, atol=1e-12 * np.trace(C))
     assert factor == 1.0
 

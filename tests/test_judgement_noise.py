@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 FREE = np.ones(6, dtype=np.bool_)
 MODEL = NoiseModel()
-ALONE = replace(MODEL, fewest_degrees=1e12, lasting=0.0, errors=ErrorRules(chances=(0.0, 0.0)))
+ALONE = replace(MODEL, fewest_degrees=1e12, lasting=0.0, errors=ErrorRules(chances=(0.0, 0.0, 0.0)))
 """Nothing is enlarged or cut, and nothing believed to last before it is seen."""
 
 

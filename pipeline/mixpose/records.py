@@ -35,6 +35,10 @@ class PointPattern:
         Positive weight of each point; 1 for a plain detection.
     deviations : (M,) float64
         By how much more than others each may err, in sensor units; 0 but for blobs that are cut.
+    radii : (M,) float64
+        Of a disk of as much area as is seen of each, sensor units; 0 where that is not known.
+    is_sized : bool
+        Whether deviations are those of spots that have not the size of a marker.
 
     Raises
     ------
@@ -45,6 +49,8 @@ class PointPattern:
     points: Floats
     weights: Floats
     deviations: Floats = field(default_factory=lambda: np.zeros(()))
+    radii: Floats = field(default_factory=lambda: np.zeros(()))
+    is_sized: bool = False
 
     is_even: bool = field(init=False, default=True)  # whether none errs by more than others
 
@@ -60,7 +66,9 @@ class PointPattern:
 
     def only(self, chosen: Mask) -> PointPattern:
         """Some of the points (M,)."""
-        return PointPattern(self.points[chosen], self.weights[chosen], self.deviations[chosen])
+        fields = self.points, self.weights, self.deviations, self.radii
+        points, weights, deviations, radii = [one[chosen] for one in fields]
+        return PointPattern(points, weights, deviations, radii, self.is_sized)
 
     def weighed(self, deviation: float) -> PointPattern:
         """With weights as exact as detections are beside those that err by a deviation."""
@@ -72,6 +80,7 @@ class PointPattern:
         object.__setattr__(self, "points", points)
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "deviations", np.broadcast_to(self.deviations, weights.shape))
+        object.__setattr__(self, "radii", np.broadcast_to(self.radii, weights.shape))
         object.__setattr__(self, "is_even", not np.count_nonzero(self.deviations))
         if points.ndim != 2:
             raise ValueError(

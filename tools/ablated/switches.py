@@ -113,6 +113,7 @@ SWITCHES = (
     Switch("no mirror image", ruled("look_alikes", kinds=("congruent", "tilted"))),
     Switch("no merged_pair", without_refinement(merged_pair)),
     Switch("no narrowed", without_refinement(narrowed)),
+    Switch("sizes tell nothing", ruled("sizes", cut=0.0)),
     Switch("no without_sensor", without_refinement(without_sensor)),
     Switch("nothing merged", ruled("judgement.association", merged=False)),
     Switch("misses free", free_misses),

@@ -233,4 +233,39 @@ _SADDLES = (
     ),
 )
 
-MUTANTS = (*_LEVELS, *_SHAPES, *_SADDLES)
+_SIZES = (
+    Mutant(
+        "sizes-of-no-scale",
+        "tracking/sizes.py",
+        "logs = np.log(pattern.radii / scales)",
+        "logs = np.log(pattern.radii)",
+        "markers are as large in an image as in space",
+        ("test_tracking_sizes.py",),
+    ),
+    Mutant(
+        "sizes-cut-by-nothing",
+        "tracking/sizes.py",
+        "(1 - smaller)",
+        "(smaller - smaller)",
+        "a sliver is as exact as a disk",
+        ("test_tracking_sizes.py",),
+    ),
+    Mutant(
+        "sizes-learnt-from-slivers",
+        "tracking/sizes.py",
+        "weights = 1 - known.cut(logs, rules)",
+        "weights = np.ones(len(logs))",
+        "cut spots make markers small and sizes uncertain",
+        ("test_tracking_sizes.py",),
+    ),
+    Mutant(
+        "sizes-not-of-a-first-frame",
+        "tracking/tracker.py",
+        "return ranked if data.track.sizes.count else self._by_size(data, ranked)",
+        "return ranked",
+        "in the first frame slivers are as exact as disks",
+        ("test_tracking_sizes.py",),
+    ),
+)
+
+MUTANTS = (*_LEVELS, *_SHAPES, *_SADDLES, *_SIZES)

@@ -104,7 +104,9 @@ def extract_blobs(
     """
     blobs = find_blobs(foreground(image, options, window, rules.threshold), options, rules)
     points = np.array([(blob.u, blob.v) for blob in blobs], dtype=np.float64).reshape(-1, 2)
-    return PointPattern(points + window[:2], np.ones(len(points)), deviations_of(blobs, rules))
+    radii = np.sqrt(np.array([blob.area for blob in blobs]) / math.pi)
+    weights = np.ones(len(points))
+    return PointPattern(points + window[:2], weights, deviations_of(blobs, rules), radii)
 
 
 def deviations_of(blobs: Sequence[Blob], rules: BlobRules = BlobRules()) -> Floats:

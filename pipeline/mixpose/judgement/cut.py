@@ -49,7 +49,8 @@ def with_cut_spots(
     m, s2 = found.dimensions[met[0]], variances[met]
     v = np.maximum(np.array([*np.square(errors.cuts), 1e9])[:, None] / s2, 1.0)
     # a little or much; what is somebody else's may be anywhere
-    prior = np.where(v > 1, np.array([*errors.chances, 0.0])[:, None], 0.0)
+    given = np.array([[*errors.chances, 0.0], [*errors.sized, 0.0]])[found.sized.astype(np.intp)]
+    prior = np.where(v > 1, given[met[0]].T, 0.0)
     prior[-1] = found.crowd[met[0]] * (2 * math.pi * s2 * v[-1]) ** (m / 2)
     P = M + (v - 1)[..., None]
     shares = (v - 1)[..., None] / P

@@ -56,6 +56,10 @@ class NoiseModel:
     )
     memory: float = constant(0.95, "per frame, of the residuals before: 20 frames count")
     fewest_degrees: float = constant(3.0, "of freedom that a variance has at least: thrice as wide")
+    of_frame: float = constant(
+        12.0,
+        "of freedom that the noise so far counts as in a frame: it varies by 40 %, √(2/ν)",
+    )
     lasting: float = constant(0.18, "of the noise: a sensor's fields; half and twice do as well")
     bias: float = constant(0.25, "σ_ε: of fields that last: 0.4 px, a camera turned by 0.02°")
     turned: float = constant(0.03, "rad, of a sensor that stands otherwise; of a body's size")
@@ -149,7 +153,7 @@ def noise_of(
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
     # independent errors are of this frame, drawn to those of all, as in `_of_frame`
-    nu, spare = model.errors.typical_degrees, max(spare, 0.0)
+    nu, spare = model.of_frame, max(spare, 0.0)
     by_kind[0] = (nu * by_kind[0] + own[0, 4]) / (nu + spare)
     degrees = min(degrees, nu + spare)
     # fields last: a further frame shows no more of them

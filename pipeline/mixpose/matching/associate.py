@@ -75,6 +75,7 @@ def associate(
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
     return Matches(
         extra=_extra(views, by, partner, rules.middle),
+        sized=np.array([getattr(view.observation.pattern, "is_sized", False) for view in views]),
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
         sigmas=sigmas,

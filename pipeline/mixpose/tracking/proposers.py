@@ -282,6 +282,8 @@ def narrowed(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterab
 
     Spots that are cut are off by less than a fit's first blur leaves out; narrow ones do.
     """
+    if judged.proposer != predicted.__name__:
+        return
     has_cells = any(view.observation.cell is not None for view in frame.views)
     errors, used = frame.rules.judgement.noise.errors, judged.used
     # what is known to be cut pulls as well

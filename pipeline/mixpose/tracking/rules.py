@@ -9,6 +9,7 @@ from mixpose.fit import FitRules
 from mixpose.judgement import AcceptanceRules, JudgementRules
 from mixpose.search import LIVE, THOROUGH, SearchBudget
 from mixpose.tracking.motion import MotionRules
+from mixpose.tracking.sizes import SizeRules
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Rules:
     motion: MotionRules = MotionRules()
     ranges: RangeRules = RangeRules()
     timing: TimingRules = TimingRules()
+    sizes: SizeRules = SizeRules()
     proposals: ProposalRules = ProposalRules()
     look_alikes: LookAlikeRules = LookAlikeRules()
     search: SearchBudget = THOROUGH

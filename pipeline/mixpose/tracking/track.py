@@ -17,6 +17,7 @@ from mixpose.records import DelaySeen, Floats, Mask
 from mixpose.rigid import inverse, perturb, twist_between
 from mixpose.search import SearchState
 from mixpose.tracking.motion import Course, Distances, MotionRules, RandomWalk, per_kind
+from mixpose.tracking.sizes import Sizes
 from mixpose.tracking.static_clutter import StaticClutter
 
 
@@ -126,6 +127,7 @@ class Track:
     time_s: float | None = None  # of that frame
     misses: int = 0  # frames since then
     residuals: RememberedNoise = RememberedNoise()  # so far
+    sizes: Sizes = Sizes()  # of markers, as spots show them
     walk: RandomWalk | None = None  # None before two uncertain poses
     # features of the last pose that each sensor met, and that it should have
     tallies: Mapping[str, tuple[int, int]] = field(default_factory=dict)

@@ -25,6 +25,7 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
+from mixpose.tracking.sizes import Sizes, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
 from mixpose.tracking.twin import left_by, with_second
 
@@ -103,13 +104,17 @@ class Tracker(Setup):
         """A frame, and what is known before it; sensors that saw nothing are left out."""
         seen = [view for view in views if not view.observation.is_empty]
         predictions = self.predictions(track, frame, time_s)
+        seen = track.delays.applied(seen, time_s, track.seconds_until(time_s))
+        if predictions:
+            T = predictions[0].T_world_object
+            seen = weighed_by_size(seen, self.body, T, track.sizes, self.rules.sizes)
         data = Frame(
             self.body,
             self.options,
             self.samples,
             self.start_uncertainty,
             self.rules,
-            views=track.delays.applied(seen, time_s, track.seconds_until(time_s)),
+            views=seen,
             track=track,
             predictions=predictions,
             T_reference=predictions[0].T_world_object if predictions else self.T_start,
@@ -148,7 +153,18 @@ class Tracker(Setup):
             if quickly and not data.first_is(data.trusted, ranked):
                 break
             quickly = False
-        return ranked
+        return ranked if data.track.sizes.count else self._by_size(data, ranked)
+
+    def _by_size(self, data: Frame, ranked: list[ScoredPose]) -> list[ScoredPose]:
+        """Poses judged again where the best shows how large markers are, which was not known."""
+        if not ranked:
+            return ranked
+        best, rules = ranked[0], self.rules.sizes
+        sizes = sizes_after(Sizes(), best, data.views, rules)
+        views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
+        if not sizes.count:
+            return ranked
+        return judged_again(data.seen_otherwise(views=views), ranked, fitted=True)
 
     def estimate(
         self, data: Frame, after: Track, verdict: Verdict, ranked: Sequence[ScoredPose]
@@ -243,10 +259,14 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     agreeing = sum(met >= least * max(in_view, 1) for met, in_view in tallies) > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
+    sizes = track.sizes
+    if is_ok:
+        sizes = sizes_after(sizes, best, data.views, data.rules.sizes)
     return follow(
         data,
         found,
         residuals=best.noise if is_ok else track.residuals,
+        sizes=sizes,
         tallies=dict(zip(used.names, tallies)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,

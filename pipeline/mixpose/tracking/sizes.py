@@ -1,0 +1,119 @@
+"""How large markers look, and so which spots are cut, merged or something else.
+
+A marker of radius R in an image whose scale is s (pixels per length at the feature) has a spot of
+radius sR.  What hides a part of it leaves r² of (sR)² of the area, and moves the centroid by what
+is lost of the whole disk's moment: by sR (1 − r²/s²R²) where what is lost lies at the rim, and
+as far where only a part at the rim is left.  What is larger is merged, with the roles exchanged.
+
+Whole spots scatter about their size by a deviation τ of its logarithm; cut ones have any size.
+Both R and τ are learnt from the frames that are ok; before the first nothing is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mixpose.body import Body
+from mixpose.constants import constant
+from mixpose.density import Observation
+from mixpose.judgement import ScoredPose
+from mixpose.objective import View, project_body
+from mixpose.records import Floats, PointPattern
+
+
+@dataclass(frozen=True)
+class SizeRules:
+    """What is believed of the sizes of spots."""
+
+    cut: float = constant(0.1, "of spots by which features are met: 18 % before a hand, else 1 %")
+    scatter: float = constant(0.1, "τ before it is seen: grey levels move outlines of small spots")
+    scatter_counts: float = constant(1.0, "spots that this counts as: what is seen soon tells more")
+    least: float = constant(0.01, "τ at least: disks of 6 px are as exact")
+    memory: float = constant(0.95, "per frame, as of noise")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sums over spots that are likely whole: their number, logarithms of R, and squares."""
+
+    count: float = 0.0
+    mean: float = 0.0
+    squares: float = 0.0  # about the mean
+
+    def scatter(self, rules: SizeRules) -> float:
+        """τ."""
+        prior = rules.scatter_counts
+        variance = (self.squares + prior * rules.scatter**2) / (self.count + prior)
+        return max(float(np.sqrt(variance)), rules.least)
+
+    def cut(self, logs: Floats, rules: SizeRules) -> Floats:
+        """Chances (n,) that spots are cut or merged, by ln r/s (n,)."""
+        tau, off = self.scatter(rules), logs - self.mean
+        whole = np.exp(-0.5 * (off / tau) ** 2) / (np.sqrt(2 * np.pi) * tau)
+        cut = rules.cut * np.exp(-np.abs(off))
+        return np.asarray(cut / (cut + (1 - rules.cut) * whole))
+
+    def followed(self, logs: Floats, rules: SizeRules) -> Sizes:
+        """With the spots (n,) of one more frame."""
+        if not logs.size:
+            return self
+        known = self if self.count else Sizes(0.0, float(np.median(logs)))
+        weights = 1 - known.cut(logs, rules)
+        count = rules.memory * self.count + float(weights.sum())
+        if count <= 0:
+            return self
+        mean = known.mean + float(weights @ (logs - known.mean)) / count
+        squares = rules.memory * self.squares + float(weights @ (logs - mean) ** 2)
+        return Sizes(count, mean, squares)
+
+
+def weighed_by_size(
+    views: Sequence[View], body: Body, T_world_object: Floats, sizes: Sizes, rules: SizeRules
+) -> list[View]:
+    """Views with the deviations of spots that have not the size of the nearest feature."""
+    if not (sizes.count and rules.cut):
+        return list(views)
+    at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
+    seen_otherwise = list(views)
+    for k, view in enumerate(views):
+        pattern = view.observation.pattern
+        if not isinstance(pattern, PointPattern) or not pattern.radii.all() or not at.seen[k].any():
+            continue
+        (seen,) = at.seen[k, 0].nonzero()
+        away = np.linalg.norm(pattern.points[:, None] - at.y[k, 0, seen], axis=2)
+        scales = _scales(at.J[k, 0, seen])[away.argmin(axis=1)]
+        logs = np.log(pattern.radii / scales)
+        whole = scales * np.exp(sizes.mean)
+        smaller = np.exp(-2 * np.abs(logs - sizes.mean))
+        moved = np.maximum(pattern.radii, whole) * (1 - smaller)
+        own = np.sqrt(sizes.cut(logs, rules) / 2) * moved  # of each of two coordinates
+        known = replace(pattern, deviations=np.maximum(pattern.deviations, own), is_sized=True)
+        seen_as = view.observation
+        seen_otherwise[k] = replace(
+            view, observation=Observation(known, seen_as.sigma, seen_as.intrinsic)
+        )
+    return seen_otherwise
+
+
+def sizes_after(before: Sizes, best: ScoredPose, views: Sequence[View], rules: SizeRules) -> Sizes:
+    """What is known after a frame that is ok."""
+    used, logs = best.used, []
+    patterns = {view.name: view.observation.pattern for view in views}
+    for k, name in enumerate(used.names):
+        pattern = patterns[name]
+        if not isinstance(pattern, PointPattern) or not pattern.radii.all():
+            continue
+        met = np.flatnonzero((used.detections[k] >= 0) & (used.shares[k] == used.weights[k]))
+        by = used.detections[k, met]
+        scales = _scales(used.J[k, met]) * used.sigmas[k]
+        own = np.log(pattern.radii[by] / scales)
+        logs.append(own if before.count else own[pattern.deviations[by] == 0])
+    return before.followed(np.concatenate(logs) if logs else np.zeros(0), rules)
+
+
+def _scales(J: Floats) -> Floats:
+    """Pixels per length (n,) by Jacobians (n, 2, 6) of places by the pose."""
+    return np.asarray(np.sqrt(np.square(J[..., :3]).sum(axis=(-2, -1)) / 2))

@@ -1,0 +1,138 @@
+"""Spots that have not the size of a marker are known to be cut, and tell less of a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detections import TRUTH
+from numpy.typing import NDArray
+
+from mixpose.body import Body, PointFeature
+from mixpose.density import Observation
+from mixpose.fit import EstimatorOptions
+from mixpose.objective import View, project_body
+from mixpose.records import PointPattern
+from mixpose.rigid import rotation_angle_deg
+from mixpose.sensors import PinholeCamera
+from mixpose.tracking import Tracker
+from mixpose.tracking.sizes import SizeRules, Sizes, sizes_after, weighed_by_size
+
+Floats = NDArray[np.float64]
+
+RULES = SizeRules()
+RADIUS, NOISE = 5.0, 0.03  # of markers, mm; of centres, px
+PLACES = np.array([[0, 0, 0], [60, 5, 0], [-50, 20, 15], [20, -40, 30], [-30, -25, 60.0]])
+BODY = Body("pointer", tuple(PointFeature(place) for place in PLACES))
+
+
+def seen(
+    cameras: Sequence[PinholeCamera],
+    rng: np.random.Generator,
+    lost: dict[tuple[int, int], float] | None = None,
+) -> list[View]:
+    """Disks before cameras; of some, by camera and marker, a share of the area is hidden."""
+    at = project_body(tuple(cameras), BODY).project(TRUTH[None])
+    views = []
+    for k, camera in enumerate(cameras):
+        scales = np.sqrt(np.square(at.J[k, 0, :, :, :3]).sum(axis=(1, 2)) / 2)
+        radii = RADIUS * scales
+        points = at.y[k, 0] + rng.normal(0, NOISE, (len(PLACES), 2))
+        for (camera_cut, marker), share in (lost or {}).items():
+            if camera_cut == k:
+                # what is lost lies at the rim: the centroid of the rest moves away from it
+                points[marker, 0] += radii[marker] * share / (1 - share)
+                radii[marker] *= np.sqrt(1 - share)
+        pattern = PointPattern(points, np.ones(len(points)), np.zeros(len(points)), radii)
+        views.append(View(str(k), camera, Observation(pattern, 1.5)))
+    return views
+
+
+def test_whole_spots_teach_the_size_and_how_exact_it_is() -> None:
+    rng, sizes = np.random.default_rng(0), Sizes()
+    for _ in range(40):
+        logs = np.log(RADIUS) + rng.normal(0, 0.02, 8)
+        logs[0] -= 0.7  # one in eight is cut to half its radius
+        sizes = sizes.followed(logs, RULES)
+    assert np.exp(sizes.mean) == pytest.approx(RADIUS, rel=0.01)
+    assert sizes.scatter(RULES) == pytest.approx(0.02, rel=0.4)  # drawn to what is believed before
+    whole, cut = sizes.cut(np.log(RADIUS) + np.array([0.02, -0.7]), RULES)
+    assert whole < 0.05
+    assert cut > 0.999
+
+
+def test_sizes_that_scatter_tell_nothing() -> None:
+    rng, sizes = np.random.default_rng(0), Sizes()
+    for _ in range(20):
+        sizes = sizes.followed(np.log(RADIUS) + rng.normal(0, 0.3, 8), RULES)
+    assert sizes.cut(np.log(RADIUS) + np.array([-0.4]), RULES)[0] < 0.5
+
+
+def test_a_spot_is_taken_to_be_off_by_as_much_as_its_area_says(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    rng, share = np.random.default_rng(1), 0.3
+    views = seen(pinhole_cameras, rng, {(0, 2): share})
+    known = Sizes(200.0, float(np.log(RADIUS)), 200 * 0.01**2)
+    found = weighed_by_size(views, BODY, TRUTH, known, RULES)
+    pattern = found[0].observation.pattern
+    assert isinstance(pattern, PointPattern)
+    assert pattern.is_sized
+    whole = np.delete(pattern.deviations, 2)
+    assert whole.max() < NOISE
+    before = views[0].observation.pattern
+    assert isinstance(before, PointPattern)
+    # of each of two coordinates; it was moved by R s / (1 − s)
+    radius = before.radii[2] / np.sqrt(1 - share)
+    assert pattern.deviations[2] == pytest.approx(radius * share / np.sqrt(2), rel=0.02)
+
+
+def test_before_any_size_is_known_and_without_radii_views_stay_as_they_are(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = seen(pinhole_cameras, np.random.default_rng(2))
+    assert weighed_by_size(views, BODY, TRUTH, Sizes(), RULES) == views
+    known = Sizes(50.0, float(np.log(RADIUS)), 0.005)
+    plain = []
+    for view in views:
+        pattern = view.observation.pattern
+        assert isinstance(pattern, PointPattern)
+        points = PointPattern(pattern.points, pattern.weights)
+        plain.append(replace(view, observation=Observation(points, 1.5)))
+    assert weighed_by_size(plain, BODY, TRUTH, known, RULES) == plain
+
+
+def test_slivers_do_not_turn_a_pose_and_are_no_reason_to_be_sure(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    """From the second frame on two of five markers are cut to a third in each camera."""
+    rng, errors = np.random.default_rng(3), []
+    tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH)
+    track, first = tracker.advance(tracker.begin(), 0, 0.0, seen(pinhole_cameras, rng))
+    assert first.status == "ok"
+    assert np.exp(track.sizes.mean) == pytest.approx(RADIUS, rel=0.02)
+    for frame in range(1, 6):
+        cut = {(camera, marker): 0.6 for camera in range(2) for marker in (1, 2)}
+        views = seen(pinhole_cameras, rng, cut)
+        track, told = tracker.advance(track, frame, frame / 30, views)
+        assert told.T_world_object is not None
+        errors.append(rotation_angle_deg(told.T_world_object, TRUTH))
+    # three whole markers before two cameras tell the turn to 0.03 px of 60 px
+    assert max(errors) < 0.15
+
+
+def test_a_frame_by_itself_learns_the_size_from_its_pose(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    views = seen(pinhole_cameras, np.random.default_rng(4), {(0, 1): 0.25})
+    tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH)
+    data = tracker.data(tracker.begin(), 0, None, views)
+    best = tracker.explain(data)[0]
+    assert best.used.sized.all()
+    deviation = np.sqrt(best.used.extra[0, 1]) * best.used.sigmas[0]
+    known = sizes_after(Sizes(), best, views, RULES)
+    assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)
+    # as off as it is, 1.4 px, where how much sizes scatter is hardly known yet
+    assert deviation > 10 * NOISE
