@@ -98,7 +98,7 @@ def test_a_proposer_of_ones_own_is_a_function_that_yields_starts(
     assert (estimate.status, estimate.proposer) == ("ok", "told")
 
 
-def test_a_prediction_finds_a_pose_in_clutter_and_so_does_the_search(
+def test_a_right_prediction_finds_a_pose_in_clutter_where_poses_around_it_do_not(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     # 340 false detections beside 7 true ones; the start is right, and said to be off by 80 mm and
@@ -107,7 +107,7 @@ def test_a_prediction_finds_a_pose_in_clutter_and_so_does_the_search(
     tracker = Tracker.create(EIGHT, EstimatorOptions(), TRUTH, rotation_deg=40, distance=80)
     assert is_right(first_frame(tracker, views), TRUTH)
     assert is_right(first_frame(only(tracker, "predicted"), views), TRUTH)
-    assert is_right(first_frame(without(tracker, "predicted"), views), TRUTH)
+    assert not is_right(first_frame(without(tracker, "predicted"), views), TRUTH)
 
 
 def test_several_starts_find_a_pose_off_its_prediction_in_clutter(
