@@ -1,14 +1,18 @@
-"""What a run says in the end about frames that may show the body twice."""
+"""What a run says in the end: a body seen twice, and sensors that are flooded."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mixpose.cli.findings import Findings
-from mixpose.records import Estimate, Status
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, Status
+from mixpose.runner import observation_of
 from mixpose.session import load_session
 from mixpose.tracking import TWICE
 
@@ -27,3 +31,51 @@ def test_poses_before_the_body_is_seen_twice_may_be_of_its_mirror_image(before: 
     (line,) = findings.warnings()
     assert line.startswith(f"{TWICE} in {20 - before} of 20 frames")
     assert line.endswith("is there a mirror?") == (before > 0)
+
+
+@pytest.mark.parametrize(("status", "warned"), [("lost", True), ("ok", False)])
+def test_features_by_the_hundred_are_told_where_frames_are_not_ok(
+    status: Status, warned: bool
+) -> None:
+    session = load_session(SESSION)
+    findings = Findings(session)
+    (left, right), label = session.sensors, session.labels[0]
+    spots = np.random.default_rng(0).uniform(0, 400, (700, 2))
+    for frame in range(5):
+        crowd = PointPattern(spots, np.ones(700))
+        few = PointPattern(spots[:7], np.ones(7))
+        views = [
+            View("left", left.sensor, Observation(few, 1.0)),
+            View("right", right.sensor, Observation(crowd, 1.0)),
+        ]
+        estimate = Estimate(frame, None, label, status, None, None, 0.0, {})
+        pictures = {name: RawFrame(frame, None, few) for name in ("left", "right")}
+        findings.watch(FrameSet(frame, None, pictures), views, estimate)
+        if status == "lost":
+            findings.add(estimate)
+    warnings = findings.warnings()
+    assert len(warnings) == warned
+    for line in warnings:
+        assert line.startswith("sensor 'right' found up to 700 features, where 7 are expected, in")
+        assert "[extract]" in line
+
+
+def test_a_flooded_image_is_told_as_such_though_nothing_of_it_is_used() -> None:
+    session = load_session(SESSION)
+    findings = Findings(session)
+    setup, label = session.sensors[0], session.labels[0]
+    image = np.zeros((480, 640), np.uint8)
+    image[6::6, 6::6] = 200  # 79 x 106 spots: more than are kept of a frame
+    options = replace(setup.extract, threshold=100.0, min_area=1.0)
+    setup = replace(setup, extract=options)
+    for frame in range(3):
+        raw = RawFrame(frame, None, image)
+        observation = observation_of(session, setup, raw)
+        assert observation.is_empty
+        estimate = Estimate(frame, None, label, "lost", None, None, 0.0, {})
+        view = View(setup.name, setup.sensor, observation)
+        findings.watch(FrameSet(frame, None, {setup.name: raw}), [view], estimate)
+        findings.add(estimate)
+    flooded = [line for line in findings.warnings() if line.startswith(f"sensor {setup.name!r}")]
+    assert len(flooded) == 1
+    assert flooded[0].startswith(f"sensor {setup.name!r} found up to 8374 features")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +149,31 @@ def test_truncated_mp4_with_its_index_first_is_read_as_far_as_it_goes(tmp_path: 
     frames, error = read(path)
     assert 5 < len(frames) < 25
     assert "clip.mp4: cut short" in error
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
+@pytest.mark.parametrize("first", [True, False])
+def test_an_mp4_in_a_pipe_is_read_or_refused_by_where_its_index_is(
+    first: bool, tmp_path: Path
+) -> None:
+    data = write_video(tmp_path / "clip.mp4", "mp4v").read_bytes()
+    # more than a decoder holds: it cannot go back to frames before an index at the end
+    parts = boxes(data)
+    spare = (8 + 2**17).to_bytes(4) + b"free" + bytes(2**17)
+    assert list(parts)[-1] == b"moov"
+    data = index_first(data) if first else data.replace(parts[b"moov"], spare + parts[b"moov"])
+    os.mkfifo(tmp_path / "pipe")
+
+    def write() -> None:
+        with contextlib.suppress(BrokenPipeError):
+            (tmp_path / "pipe").write_bytes(data)
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    frames, error = read(tmp_path / "pipe")
+    writer.join()
+    assert len(frames) == (COUNT if first else 0)
+    assert ("has its index at its end" in error) != first
 
 
 def test_trimmed_mp4_is_whole_though_it_counts_hidden_frames(tmp_path: Path) -> None:

@@ -200,6 +200,30 @@ def test_expected_features_that_are_not_found_name_the_key_and_the_direction(
     assert words in advice_for(with_options(recording, lines), 6, pose_of_frame_6)
 
 
+@pytest.mark.parametrize("rule", ["otsu", "auto"])
+@pytest.mark.parametrize("polarity", ["bright", "dark"])
+def test_a_grey_level_beside_that_of_a_rule_is_a_number_of_the_image(
+    rule: str, polarity: str, recording: Path, pose_of_frame_6: NDArray[np.float64]
+) -> None:
+    for path in recording.glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path), image if polarity == "bright" else 255 - image)
+    lines = f'method = "blobs"\nthreshold = "{rule}"\npolarity = "{polarity}"\nmin_area = 60'
+    session = with_options(recording, lines)
+    text = advice_for(session, 6, pose_of_frame_6)
+    side = "below" if polarity == "bright" else "above"
+    told = re.search(rf'set threshold to a grey level {side} (\d+), that of "{rule}"', text)
+    assert told is not None, text
+    # as a level of its own, rounded, it parts what the rule parts: pieces keep their areas
+    by_rule = re.search(r"lower min_area = 60 to (\d+)", text)
+    session.write_text(session.read_text().replace(f'"{rule}"', told[1]))
+    by_number = re.search(r"min_area = 60 to (\d+)", advice_for(session, 6, pose_of_frame_6))
+    assert by_rule is not None
+    assert by_number is not None
+    assert abs(int(by_number[1]) - int(by_rule[1])) <= 2  # px, of a grey level less or more
+
+
 def test_following_the_advice_finds_the_features(
     recording: Path, pose_of_frame_6: NDArray[np.float64]
 ) -> None:

@@ -57,7 +57,7 @@ def test_whole_spots_teach_the_size_and_how_exact_it_is() -> None:
         logs[0] -= 0.7  # one in eight is cut to half its radius
         sizes = sizes.followed(logs, RULES)
     assert np.exp(sizes.mean) == pytest.approx(RADIUS, rel=0.01)
-    assert sizes.scatter(RULES) == pytest.approx(0.02, rel=0.4)  # drawn to what is believed before
+    assert 0.02 < sizes.scatter(RULES) < 0.035  # 0.02, drawn to what is believed before
     whole, cut = sizes.cut(np.log(RADIUS) + np.array([0.02, -0.7]), RULES)
     assert whole < 0.05
     assert cut > 0.999

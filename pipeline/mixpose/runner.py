@@ -347,7 +347,8 @@ def observation_of(
         pattern = extract(frame.data, options, window=window, base=session.folder)
         if isinstance(pattern, PointPattern) and len(pattern.points) > MOST_DETECTIONS:
             # flooded with light or noise: nothing in it can be told from anything
-            pattern = PointPattern(pattern.points[:0], pattern.weights[:0])
+            empty = PointPattern(pattern.points[:0], pattern.weights[:0])
+            return Observation(empty, options.sigma, passed_over=pattern.size)
     if isinstance(pattern, PointPattern):
         return Observation(pattern, options.sigma)
     width = float(np.hypot(options.sigma, options.spot_sigma))

@@ -13,7 +13,7 @@ from statistics import median
 import numpy as np
 
 from mixpose.body import ASIDE
-from mixpose.checking import CAUSES, explanation
+from mixpose.checking import CAUSES, explanation, judge
 from mixpose.cli.body_size import BodySize, size_warnings
 from mixpose.judgement import APART
 from mixpose.objective import View
@@ -106,6 +106,9 @@ class Findings:
         names = [setup.name for setup in session.sensors]
         self._no_frame = {name: Stretches() for name in names}
         self._no_feature = {name: Stretches() for name in names}
+        self._flooded = {name: Stretches() for name in names}
+        self._most = dict.fromkeys(names, 0)  # features of one frame
+        self._expected = sum(len(one.body) * len(one.labels) for one in session.objects)
         self._same = {name: Stretches() for name in names}
         self._far = {name: Stretches() for name in names}
         self._usual = {name: deque[float](maxlen=_USUAL) for name in names}
@@ -129,11 +132,15 @@ class Findings:
         self._again = set()
         place = self._places + 1
         seen = {view.name for view in views if not view.observation.is_empty}
+        flooded = self._too_many(views) if estimate.status != "ok" else {}
+        for name, count in flooded.items():
+            self._flooded[name].add(frame_set.number, place)
+            self._most[name] = max(self._most[name], count)
         for name in self._no_frame:
             frame = frame_set.frames.get(name)
             if frame is None:
                 self._no_frame[name].add(frame_set.number, place)
-            elif name not in seen:
+            elif name not in seen and name not in flooded:
                 self._no_feature[name].add(frame_set.number, place)
             data = None if frame is None else frame.data
             if isinstance(data, np.ndarray):
@@ -142,6 +149,19 @@ class Findings:
                 self._images[name] = data
         if estimate.status != "ok" and len(self._frames) < _KEPT and len(seen) > 1:
             self._frames.append((frame_set.number, list(views)))
+
+    def _too_many(self, views: Sequence[View]) -> dict[str, int]:
+        """How many features sensors found that found far more than there are."""
+        counts = {
+            view.name: len(view.observation.points) + view.observation.passed_over
+            for view in views
+            if view.name in self._flooded and view.observation.points is not None
+        }
+        return {
+            name: count
+            for name, count in counts.items()
+            if judge(count, self._expected) == "too many"
+        }
 
     def add(self, estimate: Estimate) -> None:
         """Count a frame."""
@@ -218,6 +238,13 @@ class Findings:
                         f"sensor {name!r} had {what} in {each.count} of {total} frames: "
                         f"{each.text()}"
                     )
+        for name, each in self._flooded.items():
+            if each.longest >= _LONG or each.count > _OFTEN * total:
+                lines.append(
+                    f"sensor {name!r} found up to {self._most[name]} features, where "
+                    f"{self._expected} are expected, in {each.count} of {total} frames, none of "
+                    f"them ok: {each.text()}; mixpose check says which key of [extract] to change"
+                )
         for name, each in self._same.items():
             if each.count:
                 lines.append(

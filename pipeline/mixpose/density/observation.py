@@ -86,6 +86,7 @@ class Observation:
     pattern: Pattern  # g0 in sensor coordinates
     sigma: float  # σ_ε, the finest standard deviation of a feature
     intrinsic: float = 0.0  # the same in the pattern already: σ_ε of simulated densities
+    passed_over: int = 0  # detections that are not in the pattern, as they were too many
 
     def __post_init__(self) -> None:
         if not 0 < self.sigma < np.inf:

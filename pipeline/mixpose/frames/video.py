@@ -13,7 +13,15 @@ from typing import ClassVar
 import cv2
 
 from mixpose.errors import RecordingError
-from mixpose.frames.capture import ColourRoom, NotOpenedError, grab, is_stream, opened, retrieve
+from mixpose.frames.capture import (
+    ColourRoom,
+    NotOpenedError,
+    grab,
+    is_pipe,
+    is_stream,
+    opened,
+    retrieve,
+)
 from mixpose.frames.containers import container_of, missing_bytes
 from mixpose.frames.source import SourceKind, SourceSpec, numbers_text, selection
 from mixpose.frames.times import Clock, require_times, untimed
@@ -138,6 +146,12 @@ class Video:
             raise RecordingError(
                 f"{self.address}: cut short, {self.missing} bytes are missing; "
                 f"{self._reached(count - 1)}"
+            )
+        if count == 0 and is_pipe(self.address):
+            raise RecordingError(
+                f"{self.address}: no frame could be read from this pipe; an .mp4 or .mov has its "
+                "index at its end as a rule and cannot be read from a pipe then: name the file "
+                "itself, or write .mkv or .avi to the pipe"
             )
         lost = self.size is not None and count == 0
         if lost or self._ends_early(capture, count, last_time_s):

@@ -100,15 +100,16 @@ def _about_spots(finding: Finding, image: Image, body: Body) -> list[str]:
     options = finding.setup.extract
     scene = _scene(image, options)
     share = float(np.mean(above(scene.grey, scene.zero + scene.level)))
+    level = _level(scene, image, options)
     lines = []
     if share > _FLOODED and finding.points is not None and len(finding.points) > 3 * len(body):
         lines.append(
-            f"too much of the image counts as feature: {_stricter(options)}, or set threshold "
-            '= "local" where the light is uneven'
+            f"too much of the image counts as feature: {_stricter(options, level)}, or set "
+            'threshold = "local" where the light is uneven'
         )
     expected = finding.expectation
     if expected is None:
-        return lines + _about_number(finding, body, scene)
+        return lines + _about_number(finding, body, scene, level)
     lines += _about_missing(finding, expected, image, scene, body)
     if options.method == "blobs":
         lines += _about_extra(finding, expected, image, scene)
@@ -122,6 +123,7 @@ def _about_missing(
     options = finding.setup.extract
     raw = _bright(image, options)
     missing = _sorted_out(finding, expected, scene, raw)
+    used = _level(scene, image, options)
     lines = []
     if found := missing["nothing"]:
         lines.append(
@@ -137,7 +139,7 @@ def _about_missing(
     if found := missing["small"]:
         lines.append(
             f"not met, too small: {_some(found, body)}; lower min_area = {options.min_area:g} to "
-            f"{min(found.values()):g}, or {_direction(options, lower=True)}"
+            f"{min(found.values()):g}, or {_direction(options, lower=True, level=used)}"
         )
     if found := missing["large"]:
         lines.append(
@@ -148,7 +150,7 @@ def _about_missing(
         lines.append(
             f"not met though bright there: {_some(found, body)}; they run into something else, are "
             "partly hidden, have no clear shape, or are not where the object says; "
-            f"{_direction(options, lower=False)}"
+            f"{_direction(options, lower=False, level=used)}"
         )
     return lines
 
@@ -216,7 +218,7 @@ def _about_extra(
     return [f"{text} and look like those that do; clutter is allowed for, or cover it up"]
 
 
-def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
+def _about_number(finding: Finding, body: Body, scene: Foreground, level: float) -> list[str]:
     """Advice without a pose: only the number of features is known."""
     options = finding.setup.extract
     if finding.count < 0.8 * len(body):
@@ -235,7 +237,7 @@ def _about_number(finding: Finding, body: Body, scene: Foreground) -> list[str]:
                 f"{large.min()} px: raise max_area = {options.max_area:g}"
             )
         polarity = f'; is polarity = "{options.polarity}" right?' if not finding.count else ""
-        return lines or [f"too few: {_direction(options, lower=True)}{polarity}"]
+        return lines or [f"too few: {_direction(options, lower=True, level=level)}{polarity}"]
     if finding.count > 3 * len(body):
         return [
             "too many: look which are markers, and whether they differ from the rest in brightness "
@@ -350,17 +352,34 @@ def _looser(options: ExtractOptions, level: float, raw: Floats, image: Image) ->
     return f"{direction} it: threshold = {_in_image(level, image, options):.0f}"
 
 
-def _stricter(options: ExtractOptions) -> str:
+def _level(scene: Foreground, image: Image, options: ExtractOptions) -> float:
+    """The grey level in the image above which, or below, something is a feature where it is even.
+
+    A background that varies is out of `scene.grey`; its middle stands for it.
+    """
+    base = float(np.median(_bright(image, options))) if scene.judged else 0.0
+    return _in_image(base + scene.level, image, options)
+
+
+def _stricter(options: ExtractOptions, level: float) -> str:
     areas = f", raise min_area = {options.min_area:g} or set max_area"
-    return _direction(options, lower=False) + (areas if options.method == "blobs" else "")
+    return _direction(options, lower=False, level=level) + (
+        areas if options.method == "blobs" else ""
+    )
 
 
-def _direction(options: ExtractOptions, *, lower: bool) -> str:
-    """How the threshold is to be moved, which for dark features is the other way round."""
+def _direction(options: ExtractOptions, *, lower: bool, level: float | None = None) -> str:
+    """How the threshold is to be moved, which for dark features is the other way round.
+
+    `level` is the grey level in the image that a rule chose, where it chose one.
+    """
     down = lower == (options.polarity == "bright" or options.method in ("corners", "log"))
     now = options.threshold
     if isinstance(now, str):
-        return f'set threshold to a grey level {"below" if down else "above"} that of "{now}"'
+        side = "below" if down else "above"
+        if level is None:
+            return f'set threshold to a number {side} that of "{now}"'
+        return f'set threshold to a grey level {side} {level:.0f}, that of "{now}"'
     return f"{'lower' if down else 'raise'} threshold = {now:g}"
 
 
