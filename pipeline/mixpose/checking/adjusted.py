@@ -72,9 +72,8 @@ class Adjustment:
             for seen in others if unknown.feature is not None else ():
                 is_it = seen.features == unknown.feature
                 if is_it.any():
-                    own.append(
-                        replace(seen, features=seen.features[is_it], observed=seen.observed[is_it])
-                    )
+                    parts = seen.features[is_it], seen.observed[is_it], seen.noise[is_it]
+                    own.append(Seen(seen.name, *parts))
         return replace(self, sensors=endless, frames=frames)
 
     @property
@@ -163,8 +162,9 @@ def _linearised(
         for j, step in enumerate(steps if sensor is not given.sensors[seen.name] else ()):
             other = unknown.sensor(seen.name, given.sensors[seen.name], values + step)
             by_all[:, :, 6 + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
-        parts.append(np.where(visible[:, None], (y - seen.observed) / seen.noise, 0.0).ravel())
-        columns.append(by_all.reshape(-1, len(scales)) / seen.noise)
+        off, noise = np.where(visible[:, None], y - seen.observed, 0.0), seen.noise[:, None]
+        parts.append((off / noise).ravel())
+        columns.append((by_all / noise[..., None]).reshape(-1, len(scales)))
     return np.concatenate(parts), np.concatenate(columns)
 
 

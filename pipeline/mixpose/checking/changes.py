@@ -188,5 +188,5 @@ def _flipped(view: View, width: int) -> View:
     if not isinstance(pattern, PointPattern):
         return view
     points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
-    flipped = PointPattern(np.asarray(points), pattern.weights)
+    flipped = replace(pattern, points=np.asarray(points))
     return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))

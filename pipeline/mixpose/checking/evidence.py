@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.checking.lookalikes import NOISE_OF_SIGMA
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
@@ -55,9 +56,10 @@ def evidence_of(pose: ScoredPose | None) -> float:
 
 
 def rms_of(pose: ScoredPose) -> float:
-    """Root mean square of the offsets of a pose, in sigma."""
-    matches = pose.matches
-    return float(np.sqrt(matches.squares.sum() / max(float(matches.met.sum()), 1e-12)))
+    """Root mean square of the offsets of a pose, in sigma; a cut spot counts as far as it is exact."""
+    matches, noise = pose.matches, NOISE_OF_SIGMA**2
+    shares = matches.shares * (noise / (noise + matches.extra))
+    return float(np.sqrt((shares * matches.squared).sum() / max(float(shares.sum()), 1e-12)))
 
 
 def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:
