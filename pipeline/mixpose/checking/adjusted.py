@@ -76,6 +76,11 @@ class Adjustment:
                     own.append(Seen(seen.name, *parts))
         return replace(self, sensors=endless, frames=frames)
 
+    def has(self, unknown: Unknown) -> bool:
+        """Whether anything may have met its feature that was missed."""
+        feature, frames = unknown.feature, self.beside
+        return feature is not None and any(feature in s.features for own in frames for s in own)
+
     @property
     def count(self) -> int:
         """Number of coordinates that are met."""

@@ -38,6 +38,10 @@ class Change:
         The body by the one given.
     cost : float
         Nats that the choice of its values costs.
+    values : int
+        How many are chosen.
+    feature : int or None
+        The only one that is changed.
     """
 
     what: str
@@ -46,6 +50,7 @@ class Change:
     body: Callable[[Body], Body] = lambda body: body
     cost: float = 0.0
     values: int = 0
+    feature: int | None = None
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:

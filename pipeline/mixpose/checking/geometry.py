@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -73,14 +74,22 @@ def geometry_doubts(
     cameras = any(isinstance(s.sensor, PinholeCamera | FisheyeCamera) for s in session.sensors)
     if len(session.labels) > 1 or streams or not (cameras or len(sources) > 1):
         return Doubts()
-    chosen = list(_shared(session, sources, surveys))
+    count = DiagnosisRules().frames
+    chosen = list(_shared(session, sources, surveys, count))
     frames = [(each.number, observe(session, each)) for each in chosen]
     if not frames:
         return Doubts()
     others = _otherwise(session, surveys, chosen)
     if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
         return _at_the_start(session, sources, surveys)
-    found = diagnosis(session, frames, others)
+
+    def further() -> Frames:
+        """As many frames again, between those."""
+        known = {number for number, _ in frames}
+        more = _shared(session, sources, surveys, 2 * count, known)
+        return [(each.number, observe(session, each)) for each in islice(more, count)]
+
+    found = diagnosis(session, frames, others, further)
     if found.change:
         return Doubts((f"{found.change}, {found.gain}",), explains=True)
     if not found.good and len(sources) > 1:
@@ -162,17 +171,25 @@ def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
 
 
 def _shared(
-    session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
+    session: Session,
+    sources: Mapping[str, Source],
+    surveys: Mapping[str, Survey],
+    count: int,
+    known: Container[int] = (),
 ) -> Iterator[FrameSet]:
-    """A few frames all over the recording, in which sensors see most, the richest first."""
+    """A few frames all over the recording, in which sensors see most, the richest first.
+
+    Those that are known are left out.
+    """
     shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
     numbers = _numbers(session, surveys, sources)
 
     def richness(number: int) -> float:
         return sum(each[number] for each in shown)
 
-    parts = np.array_split(np.array(numbers, dtype=int), DiagnosisRules().frames)
+    parts = np.array_split(np.array(numbers, dtype=int), count)
     best = [max(part.tolist(), key=richness) for part in parts if len(part)]
+    best = [number for number in best if number not in known]
     yield from _read(sources, sorted(best, key=lambda n: (-richness(n), n)))
 
 
