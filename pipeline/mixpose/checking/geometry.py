@@ -79,7 +79,7 @@ def geometry_doubts(
     frames = [(each.number, observe(session, each)) for each in chosen]
     if not frames:
         return Doubts()
-    others = _otherwise(session, surveys, chosen)
+    others = _otherwise(session, sources, surveys, [number for number, _ in frames])
     if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
         return _at_the_start(session, sources, surveys)
 
@@ -109,7 +109,7 @@ def _at_the_start(
 ) -> Doubts:
     """Whether the first frame has the body at [start] only if points are in another unit."""
     rules, start = DiagnosisRules(), session.start
-    first = next(_read(sources, _numbers(session, surveys, sources)[:1]), None)
+    first = next(_read(sources, surveys, _numbers(session, surveys, sources)[:1]), None)
     if start is None or first is None:
         return Doubts()
     number, views, T = first.number, observe(session, first), start.T_world_object
@@ -142,7 +142,10 @@ def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
 
 
 def _otherwise(
-    session: Session, surveys: Mapping[str, Survey], chosen: Sequence[FrameSet]
+    session: Session,
+    sources: Mapping[str, Source],
+    surveys: Mapping[str, Survey],
+    numbers: Sequence[int],
 ) -> list[tuple[Change, Frames]]:
     """The other polarity, where images hold too few features or too many."""
     odd = [
@@ -163,7 +166,8 @@ def _otherwise(
     change = Change(
         f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
     )
-    return [(change, [(each.number, observe(changed, each)) for each in chosen])]
+    seen = [(each.number, observe(changed, each)) for each in _read(sources, {}, numbers)]
+    return [(change, seen)]
 
 
 def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
@@ -190,7 +194,7 @@ def _shared(
     parts = np.array_split(np.array(numbers, dtype=int), count)
     best = [max(part.tolist(), key=richness) for part in parts if len(part)]
     best = [number for number in best if number not in known]
-    yield from _read(sources, sorted(best, key=lambda n: (-richness(n), n)))
+    yield from _read(sources, surveys, sorted(best, key=lambda n: (-richness(n), n)))
 
 
 def _numbers(
@@ -205,11 +209,16 @@ def _numbers(
     return numbers
 
 
-def _read(sources: Mapping[str, Source], numbers: Sequence[int]) -> Iterator[FrameSet]:
-    """Frames by their numbers; none after one that cannot be read."""
+def _read(
+    sources: Mapping[str, Source], surveys: Mapping[str, Survey], numbers: Sequence[int]
+) -> Iterator[FrameSet]:
+    """Frames by their numbers, with what was found in them; none after one that cannot be read."""
     for number in numbers:
         frames = {}
         for name, source in sources.items():
+            if name in surveys and number in surveys[name].found:
+                frames[name] = surveys[name].found[number]
+                continue
             try:
                 with closing(source.frames(number, number + 1)) as found:
                     frames[name] = next(found)

@@ -122,9 +122,7 @@ def _met(matches: Matches, k: int) -> Pairs:
     return features, observed, matches.sigmas[k] * deviations
 
 
-def _shifted(
-    views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]
-) -> list[Pairs]:
+def _shifted(views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]) -> list[Pairs]:
     """Features and the detections upon which one displacement of all brings them."""
     detections, sensor = [_pattern(view).points for view in views], views[0].sensor
     assert isinstance(sensor, PinholeCamera | FisheyeCamera)
