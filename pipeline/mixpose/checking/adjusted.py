@@ -88,16 +88,25 @@ class Adjustment:
 
 
 def promise(unknown: Unknown, given: Adjustment) -> float:
-    """Nats that values are likely to gain, by one step of least squares at the noise as it is."""
+    """Nats that values are likely to gain, by one step of least squares.
+
+    What is far off may be of clutter and gains no more than what is outlying, wherever it is moved.
+    """
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
-    without, r = _normal(unknown, given, given.poses, np.zeros(k))
-    (A, b), n = without, len(without[1]) - k
-    noise = max(float(np.median(np.abs(r))) / 0.6745, 0.1)
-    left = A[n:, n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), A[:n, n:])
-    pull = b[n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), b[:n])
-    return float(pull @ np.linalg.solve(left + 1e-9 * np.eye(k), pull)) / (2 * noise**2)
+    (A, b), _ = _normal(unknown, given, given.poses, np.zeros(k))
+    step, scales = np.linalg.solve(A + 1e-9 * np.eye(len(b)), b), _scales(unknown, given)
+    gain, F = 0.0, len(given.poses)
+    for f in range(F):
+        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
+        r, J = _linearised(unknown, given, f, given.poses[f], np.zeros(k), scales[own])
+        gain += float((_loss(r) - _loss(r + J @ step[own])).sum())
+    return gain
+
+
+def _loss(residuals: Floats) -> Floats:
+    return np.asarray(0.5 * np.minimum(np.abs(residuals), _OUTLYING) ** 2)
 
 
 def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:

@@ -212,19 +212,22 @@ def _with_values(
         [pose.T_world_object for _, pose in posed],
         beside(posed),
     )
-    promises = [(promise(unknown, given), unknown) for unknown in unknowns(session)]
+    alone = replace(given, beside=[])  # what is beside a feature that is missed may be of another
+    promises = [
+        (promise(unknown, matches), unknown, matches)
+        for unknown in unknowns(session)
+        for matches in ((given, alone) if given.has(unknown) else (alone,))
+    ]
     promising = [each for each in promises if each[0] > rules.promise]
     promising.sort(key=lambda each: -each[0] + each[1].cost)
     # one marker that is off has others beside it doubted, too
-    markers = [each.feature for _, each in promising if each.feature is not None]
-    doubted = {None, *markers[: rules.markers]}
+    markers = [each.feature for _, each, _ in promising if each.feature is not None]
+    doubted = {None, *list(dict.fromkeys(markers))[: rules.markers]}
     promising = [each for each in promising if each[1].feature in doubted]
-    for _, unknown in promising[: rules.most]:
-        # what is beside a feature that is missed may be of another
-        for matches in (given, *([replace(given, beside=[])] if given.has(unknown) else ())):
-            if is_late():
-                return
-            yield from _fitted(session, frames, before, known, matches, unknown)
+    for _, unknown, matches in promising[: rules.most]:
+        if is_late():
+            return
+        yield from _fitted(session, frames, before, known, matches, unknown)
 
 
 def _fitted(
