@@ -22,7 +22,7 @@ from mixpose.session import SensorSetup, Session
 _QUICK = 5  # frames that are looked at where not all are
 # images of a sensor in which features are counted: to find them takes five times as long as to read
 # an image, and the median of so many is as good as that of all
-_COUNTED = 12
+_COUNTED = 20
 
 
 @dataclass(frozen=True)
