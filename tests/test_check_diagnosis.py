@@ -243,6 +243,7 @@ def test_frames_of_fewer_coordinates_than_a_pose_has_are_not_searched(
     with (tmp_path / "right.csv").open("a", encoding="utf-8") as table_of_right:
         table_of_right.write("0,300,200\n")  # a fourth: two coordinates more than a pose
     sources = open_sources(few, {})
+    surveys = {setup.name: survey(few, setup, sources[setup.name]) for setup in few.sensors}
     geometry_doubts(few, sources, surveys)
     assert len(asked) == 1
 
@@ -251,7 +252,7 @@ def exact(session: Session, points: np.ndarray) -> list[list[Seen]]:
     """What the cameras meet of a body without noise."""
     return [
         [
-            Seen(s.name, np.arange(7), s.sensor.project(transform(T, points))[0], 0.3)
+            Seen(s.name, np.arange(7), s.sensor.project(transform(T, points))[0], np.full(7, 0.3))
             for s in session.sensors
         ]
         for T in poses()
@@ -275,10 +276,38 @@ def test_least_squares_find_the_size_of_what_was_met(right: Session) -> None:
     assert promise(size, given_to(right, exact(right, right.body.means))) < 1e-3
 
 
+def test_what_a_neighbour_shows_in_place_of_a_hidden_marker_promises_little(right: Session) -> None:
+    """One detection 30 deviations off gains no more than clutter; the same off in all gains all."""
+    marker = next(each for each in unknowns(right) if each.feature == 2)
+    frames = exact(right, right.body.means)
+    off = np.zeros((7, 2))
+    off[2] = 9.0  # px
+    first = frames[0][0]
+    frames[0][0] = replace(first, observed=first.observed + off)
+    assert promise(marker, given_to(right, frames)) < DiagnosisRules().promise
+    moved = np.array(right.body.means)
+    moved[2] += [3.0, -4.0, 0.0]
+    assert promise(marker, given_to(right, exact(right, moved))) > 2 * DiagnosisRules().promise
+
+
+def test_a_cut_spot_pulls_as_little_as_it_says(right: Session) -> None:
+    """A hundredth of the weight: one 9 px off moves a marker by less than a tenth of a mm."""
+    marker = next(each for each in unknowns(right) if each.feature == 2)
+    frames = exact(right, right.body.means)
+    first, noise = frames[0][0], np.full(7, 0.3)
+    noise[2] = 30.0
+    off = np.zeros((7, 2))
+    off[2] = 9.0
+    frames[0][0] = replace(first, observed=first.observed + off, noise=noise)
+    found = adjusted(marker, given_to(right, frames))
+    assert found is not None
+    assert np.linalg.norm(found[0]) < 0.1
+
+
 def test_too_few_matches_say_nothing_of_values(right: Session) -> None:
     size = next(iter(unknowns(right)))
     few = [
-        [Seen(one.name, one.features[:2], one.observed[:2], one.noise) for one in frame[:1]]
+        [Seen(one.name, one.features[:2], one.observed[:2], one.noise[:2]) for one in frame[:1]]
         for frame in exact(right, right.body.means)
     ]
     assert adjusted(size, given_to(right, few)) is None

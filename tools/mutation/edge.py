@@ -165,8 +165,8 @@ _CHECKING = (
     Mutant(
         "checking-a-chance-match-outweighs-evidence",
         "checking/trials.py",
-        "if after.met < rules.fewer * before.met:",
-        "if after.met < before.met:",
+        "if after.met() < rules.fewer * before.met():",
+        "if after.met() < before.met():",
         "a body 2 % too large is not told where a wrong pose met a reflection",
         _DIAGNOSIS,
     ),

@@ -72,10 +72,14 @@ class Adjustment:
             for seen in others if unknown.feature is not None else ():
                 is_it = seen.features == unknown.feature
                 if is_it.any():
-                    own.append(
-                        replace(seen, features=seen.features[is_it], observed=seen.observed[is_it])
-                    )
+                    parts = seen.features[is_it], seen.observed[is_it], seen.noise[is_it]
+                    own.append(Seen(seen.name, *parts))
         return replace(self, sensors=endless, frames=frames)
+
+    def has(self, unknown: Unknown) -> bool:
+        """Whether anything may have met its feature that was missed."""
+        feature, frames = unknown.feature, self.beside
+        return feature is not None and any(feature in s.features for own in frames for s in own)
 
     @property
     def count(self) -> int:
@@ -84,16 +88,25 @@ class Adjustment:
 
 
 def promise(unknown: Unknown, given: Adjustment) -> float:
-    """Nats that values are likely to gain, by one step of least squares at the noise as it is."""
+    """Nats that values are likely to gain, by one step of least squares.
+
+    What is far off may be of clutter and gains no more than what is outlying, wherever it is moved.
+    """
     given, k = given.of(unknown), len(unknown.deviations)
     if given.count < 6 * len(given.frames) + k + _FEWEST:
         return 0.0
-    without, r = _normal(unknown, given, given.poses, np.zeros(k))
-    (A, b), n = without, len(without[1]) - k
-    noise = max(float(np.median(np.abs(r))) / 0.6745, 0.1)
-    left = A[n:, n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), A[:n, n:])
-    pull = b[n:] - A[n:, :n] @ np.linalg.solve(A[:n, :n] + 1e-9 * np.eye(n), b[:n])
-    return float(pull @ np.linalg.solve(left + 1e-9 * np.eye(k), pull)) / (2 * noise**2)
+    (A, b), _ = _normal(unknown, given, given.poses, np.zeros(k))
+    step, scales = np.linalg.solve(A + 1e-9 * np.eye(len(b)), b), _scales(unknown, given)
+    gain, F = 0.0, len(given.poses)
+    for f in range(F):
+        own = [*range(6 * f, 6 * f + 6), *range(6 * F, 6 * F + k)]
+        r, J = _linearised(unknown, given, f, given.poses[f], np.zeros(k), scales[own])
+        gain += float((_loss(r) - _loss(r + J @ step[own])).sum())
+    return gain
+
+
+def _loss(residuals: Floats) -> Floats:
+    return np.asarray(0.5 * np.minimum(np.abs(residuals), _OUTLYING) ** 2)
 
 
 def adjusted(unknown: Unknown, given: Adjustment) -> tuple[Floats, list[Floats]] | None:
@@ -163,8 +176,9 @@ def _linearised(
         for j, step in enumerate(steps if sensor is not given.sensors[seen.name] else ()):
             other = unknown.sensor(seen.name, given.sensors[seen.name], values + step)
             by_all[:, :, 6 + j] += np.where(visible[:, None], other.project(at)[0] - y, 0.0) / _STEP
-        parts.append(np.where(visible[:, None], (y - seen.observed) / seen.noise, 0.0).ravel())
-        columns.append(by_all.reshape(-1, len(scales)) / seen.noise)
+        off, noise = np.where(visible[:, None], y - seen.observed, 0.0), seen.noise[:, None]
+        parts.append((off / noise).ravel())
+        columns.append((by_all / noise[..., None]).reshape(-1, len(scales)))
     return np.concatenate(parts), np.concatenate(columns)
 
 

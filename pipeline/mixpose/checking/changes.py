@@ -38,6 +38,10 @@ class Change:
         The body by the one given.
     cost : float
         Nats that the choice of its values costs.
+    values : int
+        How many are chosen.
+    feature : int or None
+        The only one that is changed.
     """
 
     what: str
@@ -46,6 +50,7 @@ class Change:
     body: Callable[[Body], Body] = lambda body: body
     cost: float = 0.0
     values: int = 0
+    feature: int | None = None
 
 
 def of_points(body: Body, points: Floats, normals: Floats | None = None) -> Body:
@@ -188,5 +193,5 @@ def _flipped(view: View, width: int) -> View:
     if not isinstance(pattern, PointPattern):
         return view
     points = pattern.points * [-1.0, 1.0] + [width - 1.0, 0.0]
-    flipped = PointPattern(np.asarray(points), pattern.weights)
+    flipped = replace(pattern, points=np.asarray(points))
     return replace(view, observation=type(view.observation)(flipped, view.observation.sigma))

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from mixpose.body import Body
+from mixpose.checking.lookalikes import NOISE_OF_SIGMA
 from mixpose.checking.rules import DiagnosisRules
 from mixpose.fit import free_mask
 from mixpose.judgement import ScoredPose
@@ -39,14 +40,18 @@ class Explained:
         """How many frames are explained, by all of their sensors."""
         return sum(pose is not None and is_explained(pose, rules) for pose in self.poses)
 
-    @property
-    def met(self) -> float:
-        """Number of features that sensors meet."""
-        return sum(float(pose.matches.met.sum()) for pose in self.poses if pose is not None)
+    def met(self, feature: int | None = None) -> float:
+        """Number of features that sensors meet; how many meet one of them."""
+        return sum(
+            float(pose.matches.shares[:, _columns(feature)].sum())
+            for pose in self.poses
+            if pose is not None
+        )
 
-    def rms(self) -> float:
-        """Root mean square of what features are met off, in sigma: of the median frame."""
-        return float(np.median([rms_of(pose) for pose in self.poses if pose is not None] or [0.0]))
+    def rms(self, feature: int | None = None) -> float:
+        """Root mean square of what features, or one, are met off, in sigma: of the median frame."""
+        found = [rms_of(pose, feature) for pose in self.poses if pose is not None]
+        return float(np.median([each for each in found if np.isfinite(each)] or [0.0]))
 
 
 def evidence_of(pose: ScoredPose | None) -> float:
@@ -54,10 +59,20 @@ def evidence_of(pose: ScoredPose | None) -> float:
     return 0.0 if pose is None else max(pose.log_evidence, 0.0)
 
 
-def rms_of(pose: ScoredPose) -> float:
-    """Root mean square of the offsets of a pose, in sigma."""
-    matches = pose.matches
-    return float(np.sqrt(matches.squares.sum() / max(float(matches.met.sum()), 1e-12)))
+def rms_of(pose: ScoredPose, feature: int | None = None) -> float:
+    """Root mean square of the offsets of a pose, or of a feature there, in sigma; NaN of none.
+
+    A cut spot counts as far as it is exact.
+    """
+    matches, noise = pose.matches, NOISE_OF_SIGMA**2
+    shares = (matches.shares * (noise / (noise + matches.extra)))[:, _columns(feature)]
+    total = float(shares.sum())
+    squares = float((shares * matches.squared[:, _columns(feature)]).sum())
+    return float(np.sqrt(squares / total)) if total > 0 else np.nan
+
+
+def _columns(feature: int | None) -> slice:
+    return slice(feature, None if feature is None else feature + 1)
 
 
 def is_explained(pose: ScoredPose, rules: DiagnosisRules) -> bool:

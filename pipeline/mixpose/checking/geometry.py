@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -73,14 +74,22 @@ def geometry_doubts(
     cameras = any(isinstance(s.sensor, PinholeCamera | FisheyeCamera) for s in session.sensors)
     if len(session.labels) > 1 or streams or not (cameras or len(sources) > 1):
         return Doubts()
-    chosen = list(_shared(session, sources, surveys))
+    count = DiagnosisRules().frames
+    chosen = list(_shared(session, sources, surveys, count))
     frames = [(each.number, observe(session, each)) for each in chosen]
     if not frames:
         return Doubts()
-    others = _otherwise(session, surveys, chosen)
+    others = _otherwise(session, sources, surveys, [number for number, _ in frames])
     if not any(_can_tell(views) for seen in (frames, *(s for _, s in others)) for _, views in seen):
         return _at_the_start(session, sources, surveys)
-    found = diagnosis(session, frames, others)
+
+    def further() -> Frames:
+        """As many frames again, between those."""
+        known = {number for number, _ in frames}
+        more = _shared(session, sources, surveys, 2 * count, known)
+        return [(each.number, observe(session, each)) for each in islice(more, count)]
+
+    found = diagnosis(session, frames, others, further)
     if found.change:
         return Doubts((f"{found.change}, {found.gain}",), explains=True)
     if not found.good and len(sources) > 1:
@@ -100,7 +109,7 @@ def _at_the_start(
 ) -> Doubts:
     """Whether the first frame has the body at [start] only if points are in another unit."""
     rules, start = DiagnosisRules(), session.start
-    first = next(_read(sources, _numbers(session, surveys, sources)[:1]), None)
+    first = next(_read(sources, surveys, _numbers(session, surveys, sources)[:1]), None)
     if start is None or first is None:
         return Doubts()
     number, views, T = first.number, observe(session, first), start.T_world_object
@@ -133,7 +142,10 @@ def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
 
 
 def _otherwise(
-    session: Session, surveys: Mapping[str, Survey], chosen: Sequence[FrameSet]
+    session: Session,
+    sources: Mapping[str, Source],
+    surveys: Mapping[str, Survey],
+    numbers: Sequence[int],
 ) -> list[tuple[Change, Frames]]:
     """The other polarity, where images hold too few features or too many."""
     odd = [
@@ -154,7 +166,8 @@ def _otherwise(
     change = Change(
         f"features {{are}} {polarity} in the images", f'with polarity = "{polarity}" in [extract]'
     )
-    return [(change, [(each.number, observe(changed, each)) for each in chosen])]
+    seen = [(each.number, observe(changed, each)) for each in _read(sources, {}, numbers)]
+    return [(change, seen)]
 
 
 def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
@@ -162,18 +175,26 @@ def _expected(setup: SensorSetup, session: Session) -> tuple[int, int]:
 
 
 def _shared(
-    session: Session, sources: Mapping[str, Source], surveys: Mapping[str, Survey]
+    session: Session,
+    sources: Mapping[str, Source],
+    surveys: Mapping[str, Survey],
+    count: int,
+    known: Container[int] = (),
 ) -> Iterator[FrameSet]:
-    """A few frames all over the recording, in which sensors see most, the richest first."""
+    """A few frames all over the recording, in which sensors see most, the richest first.
+
+    Those that are known are left out.
+    """
     shown = [_shown(session, surveys[setup.name], setup) for setup in session.sensors]
     numbers = _numbers(session, surveys, sources)
 
     def richness(number: int) -> float:
         return sum(each[number] for each in shown)
 
-    parts = np.array_split(np.array(numbers, dtype=int), DiagnosisRules().frames)
+    parts = np.array_split(np.array(numbers, dtype=int), count)
     best = [max(part.tolist(), key=richness) for part in parts if len(part)]
-    yield from _read(sources, sorted(best, key=lambda n: (-richness(n), n)))
+    best = [number for number in best if number not in known]
+    yield from _read(sources, surveys, sorted(best, key=lambda n: (-richness(n), n)))
 
 
 def _numbers(
@@ -188,11 +209,16 @@ def _numbers(
     return numbers
 
 
-def _read(sources: Mapping[str, Source], numbers: Sequence[int]) -> Iterator[FrameSet]:
-    """Frames by their numbers; none after one that cannot be read."""
+def _read(
+    sources: Mapping[str, Source], surveys: Mapping[str, Survey], numbers: Sequence[int]
+) -> Iterator[FrameSet]:
+    """Frames by their numbers, with what was found in them; none after one that cannot be read."""
     for number in numbers:
         frames = {}
         for name, source in sources.items():
+            if name in surveys and number in surveys[name].found:
+                frames[name] = surveys[name].found[number]
+                continue
             try:
                 with closing(source.frames(number, number + 1)) as found:
                     frames[name] = next(found)

@@ -16,7 +16,7 @@ from mixpose.objective import View
 from mixpose.records import Floats, Indices, PointPattern
 from mixpose.sensors import FisheyeCamera, PinholeCamera
 
-Pairs: TypeAlias = tuple[Indices, Floats]
+Pairs: TypeAlias = tuple[Indices, Floats, Floats]  # as in `Seen`
 Posed: TypeAlias = tuple[Sequence[View], ScoredPose]
 
 _MISSED = 0.3  # of the body: a camera that meets less mostly misses it
@@ -33,7 +33,7 @@ class Seen:
     name: str
     features: Indices  # (n,)
     observed: Floats  # (n, 2)
-    noise: float
+    noise: Floats  # (n,) standard deviations, in sensor units; of cut spots larger ones
 
 
 def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
@@ -59,9 +59,9 @@ def seen_by(frames: Sequence[Posed]) -> list[list[Seen]]:
                 for each, k in zip(matches, rows)
             ]
             pairs = max(pairs, _shifted([view for _, view in own], predicted), key=_count)
-        for (f, view), (features, observed) in zip(own, pairs):
-            if len(features):
-                seen[f].append(Seen(name, features, observed, _noise(view)))
+        for (f, _), met in zip(own, pairs):
+            if len(met[0]):
+                seen[f].append(Seen(name, *met))
     return seen
 
 
@@ -75,14 +75,14 @@ def beside(frames: Sequence[Posed]) -> list[list[Seen]]:
                 continue
             k = matches.names.index(view.name)
             features = np.flatnonzero((matches.weights[k] > 0) & (matches.shares[k] <= 0.5))
-            points = np.delete(_points(view), np.unique(_taken(matches, k)), axis=0)
-            if len(features) and len(points):
+            free = np.setdiff1d(np.arange(len(_pattern(view).points)), _taken(matches, k))
+            if len(features) and len(free):
                 near = _BESIDE * view.observation.sigma
-                away, at = cKDTree(points).query(
+                away, at = cKDTree(_pattern(view).points[free]).query(
                     matches.places[k, features], distance_upper_bound=near
                 )
                 is_near = np.isfinite(away)
-                own.append(Seen(view.name, features[is_near], points[at[is_near]], _noise(view)))
+                own.append(Seen(view.name, *_pairs(view, features[is_near], free[at[is_near]])))
         found.append(own)
     return found
 
@@ -94,18 +94,20 @@ def is_camera(view: View) -> bool:
     )
 
 
-def _points(view: View) -> Floats:
+def _pattern(view: View) -> PointPattern:
     pattern = view.observation.pattern
     assert isinstance(pattern, PointPattern)
-    return pattern.points
+    return pattern
 
 
-def _noise(view: View) -> float:
-    return NOISE_OF_SIGMA * view.observation.sigma
+def _pairs(view: View, features: Indices, detections: Indices) -> Pairs:
+    pattern, noise = _pattern(view), NOISE_OF_SIGMA * view.observation.sigma
+    deviations = np.hypot(noise, np.broadcast_to(pattern.deviations, pattern.size))
+    return features, pattern.points[detections], deviations[detections]
 
 
 def _count(pairs: Sequence[Pairs]) -> int:
-    return sum(len(features) for features, _ in pairs)
+    return sum(len(features) for features, *_ in pairs)
 
 
 def _taken(matches: Matches, k: int) -> Indices:
@@ -115,13 +117,14 @@ def _taken(matches: Matches, k: int) -> Indices:
 
 def _met(matches: Matches, k: int) -> Pairs:
     features = np.flatnonzero(matches.shares[k] > 0.5)
-    off = matches.sigmas[k] * matches.offsets[k, features]
-    return features, np.asarray(matches.places[k, features] + off)
+    observed = matches.places[k, features] + matches.sigmas[k] * matches.offsets[k, features]
+    deviations = np.sqrt(NOISE_OF_SIGMA**2 + matches.extra[k, features])
+    return features, observed, matches.sigmas[k] * deviations
 
 
-def _shifted(views: Sequence[View], predicted: Sequence[Pairs]) -> list[Pairs]:
+def _shifted(views: Sequence[View], predicted: Sequence[tuple[Indices, Floats]]) -> list[Pairs]:
     """Features and the detections upon which one displacement of all brings them."""
-    detections, sensor = [_points(view) for view in views], views[0].sensor
+    detections, sensor = [_pattern(view).points for view in views], views[0].sensor
     assert isinstance(sensor, PinholeCamera | FisheyeCamera)
     differences = np.concatenate(
         [(d[:, None] - y[None, i]).reshape(-1, 2) for d, (i, y) in zip(detections, predicted)]
@@ -132,9 +135,9 @@ def _shifted(views: Sequence[View], predicted: Sequence[Pairs]) -> list[Pairs]:
 
     def hits(shift: Any) -> list[Pairs]:
         found = []
-        for tree, d, (i, y) in zip(trees, detections, predicted):
+        for tree, view, (i, y) in zip(trees, views, predicted):
             away, at = tree.query(y[i] + shift, distance_upper_bound=near)
-            found.append((i[np.isfinite(away)], d[at[np.isfinite(away)]]))
+            found.append(_pairs(view, i[np.isfinite(away)], at[np.isfinite(away)]))
         return found
 
     return max(map(hits, differences), key=_count, default=[])

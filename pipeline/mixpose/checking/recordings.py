@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
@@ -48,6 +48,8 @@ class Survey:
         Their numbers, as far as known.
     is_whole : bool
         Whether all frames were looked at.
+    found : mapping of int to RawFrame
+        Frames that were counted, with the points found in place of an image.
     """
 
     numbers: tuple[int, ...]
@@ -58,6 +60,7 @@ class Survey:
     damage: tuple[str, ...] = ()
     damaged: tuple[int, ...] = ()
     is_whole: bool = True
+    found: Mapping[int, RawFrame] = field(default_factory=dict)
 
     @property
     def typical_frame(self) -> int | None:
@@ -100,7 +103,7 @@ def survey(
     quick = quick or (isinstance(source, Video) and source.size is None)
     damage: list[tuple[int | None, str]] = []
     counts: dict[int, int | None] = {}
-    numbers, empty = list[int](), list[int]()
+    numbers, empty, found = list[int](), list[int](), dict[int, RawFrame]()
     size: tuple[int, int] | None = None
     with closing(_frames(source, damage, quick=quick)) as frames:
         for frame in frames:
@@ -113,6 +116,7 @@ def survey(
             pattern = observation_of(session, setup, frame).pattern
             if isinstance(pattern, PointPattern):
                 counts[frame.number] = len(pattern.points)
+                found[frame.number] = replace(frame, data=pattern)
                 is_empty = not len(pattern.points)
             else:
                 counts[frame.number] = None
@@ -131,6 +135,7 @@ def survey(
         damage=tuple(text for _, text in damage),
         damaged=tuple(number for number, _ in damage if number is not None),
         is_whole=not quick,
+        found=found,
     )
 
 

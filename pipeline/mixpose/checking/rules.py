@@ -24,11 +24,17 @@ class DiagnosisRules:
         "nats by which a change explains frames better: right sessions gain up to 5 after what "
         "values cost, of 80 changes; a marker that is found again gains 9 in a frame",
     )
-    rival: float = constant(
-        10.0, "nats within which another change is as good: frames differ by 5 by chance"
+    undecided: float = constant(
+        6.0, "nats by which a change by values gains too little to be told, and too much for chance"
     )
+    chance: float = constant(5.0, "nats by which two estimates of a frame may differ")
+    rival: float = constant(10.0, "nats within which another change is as good: twice as much")
     share: float = constant(0.05, "of what is gained, as well: errors of frames are alike")
-    promise: float = constant(8.0, "nats that least squares foretell, for a change to be tried")
+    promise: float = constant(
+        4.0,
+        "nats that least squares foretell, for a change to be tried: a marker 5 mm off has 7 at "
+        "least, right sessions of a hand 2 at most",
+    )
     most: int = constant(8, "changes of values that are tried, the most promising first")
     markers: int = constant(
         2, "of these for markers: a body 2 % too large has 3 of 72 promise more than its size does"

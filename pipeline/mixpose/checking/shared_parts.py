@@ -20,7 +20,9 @@ def shared_part_warnings(session: Session) -> list[str]:
 
     The largest part of each pair is named.
     """
-    warnings = []
+    warnings = list[str]()
+    if len(session.objects) < 2:
+        return warnings
     noise = _noise_length(session)
     for one, other in combinations([each.body for each in session.objects], 2):
         parts = congruent_parts(one, other, _tolerance(one, other, noise))

@@ -90,7 +90,10 @@ class Tried(NamedTuple):
 
 
 def diagnosis(
-    session: Session, frames: Frames, others: Sequence[tuple[Change, Frames]] = ()
+    session: Session,
+    frames: Frames,
+    others: Sequence[tuple[Change, Frames]] = (),
+    further: Callable[[], Frames] = lambda: (),
 ) -> Diagnosis:
     """What is most likely wrong with a session, by frames of its recording.
 
@@ -102,6 +105,8 @@ def diagnosis(
         By number; those that show most first.
     others : sequence of (Change, sequence of (int, sequence of View))
         Changes of how features are extracted, with what is extracted then.
+    further : callable
+        Frames that are looked at, too, where these leave a change by values undecided.
     """
     rules, began = DiagnosisRules(), time.process_time()
 
@@ -119,7 +124,13 @@ def diagnosis(
     # values only follow the noise where all frames are explained to within it without any
     if not any(_is_all_explained(one, rules) for one in tried):
         tried += _with_values(session, frames, before, is_late)
-    return simplest(tried, before, rules)
+    found = simplest(tried, before, rules)
+    if found.change or all(one.gain < rules.undecided for one in tried if one.change.values):
+        return found
+    more = further()
+    poses = before.poses + _as_it_is(session, more, is_late).poses
+    before, frames = Explained(poses), [*frames, *more][: len(poses)]
+    return simplest([*_with_values(session, frames, before, is_late)], before, rules)
 
 
 def explanation(session: Session, frames: Frames) -> str | None:
@@ -137,10 +148,10 @@ def explanation(session: Session, frames: Frames) -> str | None:
 
 
 def _as_it_is(session: Session, frames: Frames, is_late: Callable[[], bool]) -> Explained:
-    """Poses of the session as it is, of fewer frames where a search takes long."""
-    poses = list[ScoredPose | None]()
+    """Poses of the session as it is, of fewer frames where a search takes long in vain."""
+    rules, poses = DiagnosisRules(), list[ScoredPose | None]()
     for number, views in frames:
-        if poses and is_late():
+        if poses and is_late() and not is_well_explained(poses[-1], rules):
             break
         poses.append(best_pose(session, session.body, number, views))
     return Explained(tuple(poses))
@@ -201,17 +212,22 @@ def _with_values(
         [pose.T_world_object for _, pose in posed],
         beside(posed),
     )
-    promises = [(promise(unknown, given), unknown) for unknown in unknowns(session)]
+    alone = replace(given, beside=[])  # what is beside a feature that is missed may be of another
+    promises = [
+        (promise(unknown, matches), unknown, matches)
+        for unknown in unknowns(session)
+        for matches in ((given, alone) if given.has(unknown) else (alone,))
+    ]
     promising = [each for each in promises if each[0] > rules.promise]
     promising.sort(key=lambda each: -each[0] + each[1].cost)
     # one marker that is off has others beside it doubted, too
-    markers = [each.feature for _, each in promising if each.feature is not None]
-    doubted = {None, *markers[: rules.markers]}
+    markers = [each.feature for _, each, _ in promising if each.feature is not None]
+    doubted = {None, *list(dict.fromkeys(markers))[: rules.markers]}
     promising = [each for each in promising if each[1].feature in doubted]
-    for _, unknown in promising[: rules.most]:
+    for _, unknown, matches in promising[: rules.most]:
         if is_late():
             return
-        yield from _fitted(session, frames, before, known, given, unknown)
+        yield from _fitted(session, frames, before, known, matches, unknown)
 
 
 def _fitted(
@@ -223,7 +239,7 @@ def _fitted(
     unknown: Unknown,
 ) -> Iterator[Tried]:
     """A change by values, fitted twice: matches are better known by then."""
-    found: list[Any] = []
+    rules, found = DiagnosisRules(), list[Any]()
     for _ in range(2):
         fitted = adjusted(unknown, given)
         if fitted is None:
@@ -251,13 +267,15 @@ def _fitted(
         return  # nor are the others worth a search then
     for k, (number, views) in enumerate(frames):
         # a pose that wrong values led to may be another one
-        if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]):
+        if k not in known or evidence_of(after[k]) < evidence_of(before.poses[k]) - rules.chance:
             again = best_pose(session, body, number, _by(unknown, values, views))
             after[k] = max(again, after[k], key=evidence_of) if k in known else again
     explained, count = Explained(tuple(after)), len(values)
     unlikely = float(((values / unknown.deviations) ** 2).sum())
-    cost = 0.5 * (count * math.log(max(2 * explained.met, 2.0)) + unlikely)
-    change = Change(unknown.what, unknown.remedy(values), cost=cost, values=count)
+    cost = 0.5 * (count * math.log(max(2 * explained.met(), 2.0)) + unlikely)
+    change = Change(
+        unknown.what, unknown.remedy(values), cost=cost, values=count, feature=unknown.feature
+    )
     yield Tried(change, explained, explained.evidence - before.evidence - cost - unknown.cost)
 
 
@@ -269,7 +287,7 @@ def _by(unknown: Unknown, values: Floats, views: Views) -> list[Any]:
 def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -> Diagnosis:
     """The simplest of the changes that explain most, and another that is as simple and good."""
     good = before.good(rules)
-    told = [(one, _gain(one.explained, before, rules)) for one in tried]
+    told = [(one, _gain(one, before, rules)) for one in tried]
     told = [(one, gain) for one, gain in told if gain and one.gain > rules.margin]
     if not told:
         return Diagnosis(good=good)
@@ -295,19 +313,23 @@ def simplest(tried: Sequence[Tried], before: Explained, rules: DiagnosisRules) -
     return Diagnosis(text, gain, good)
 
 
-def _gain(after: Explained, before: Explained, rules: DiagnosisRules) -> str:
-    """What is better by a change, in words; empty where that is little."""
+def _gain(one: Tried, before: Explained, rules: DiagnosisRules) -> str:
+    """What is better by a change, in words, of what it concerns; empty where that is little."""
+    after, feature = one.explained, one.change.feature
     count, now, then = len(before.poses), after.good(rules), before.good(rules)
-    if after.met < rules.fewer * before.met:
+    met, rms = before.met(feature), before.rms(feature)
+    if after.met() < rules.fewer * before.met():
         return ""  # what meets less is near some detections, as a body that is far too small
     if now > then:
         as_is = f", {then} as it is" if then else ""
         return f"{now} of {count} frames are explained{as_is}"
-    if after.rms() < rules.clearer * before.rms():
+    if after.rms(feature) < rules.clearer * rms:
+        what = "features are" if feature is None else "it is"
         return (
-            f"features are met to {after.rms():.2g} sigma in place of {before.rms():.2g} in "
-            f"{count} frames"
+            f"{what} met to {after.rms(feature):.2g} sigma in place of {rms:.2g} in {count} frames"
         )
-    more = round(after.met - before.met)
-    least = max(2.0, rules.more * before.met)
-    return f"{more} more features are met in {count} frames" if more >= least else ""
+    more = round(after.met(feature) - met)
+    if more < max(2.0, rules.more * met):
+        return ""
+    what = "features are met" if feature is None else "images show it"
+    return f"{more} more {what} in {count} frames"
