@@ -76,6 +76,7 @@ def matches_of(*sensors: Seen) -> Matches:
         beside=np.full(arrays["weights"].shape, np.nan),
         finest=of_each("finest"),
         extra=np.zeros(arrays["weights"].shape),
+        radii=np.zeros(arrays["weights"].shape),
         sized=np.zeros(len(sensors), np.bool_),
     )
 

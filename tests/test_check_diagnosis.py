@@ -379,7 +379,9 @@ def test_least_squares_find_where_a_camera_stands(right: Session) -> None:
 
 def test_a_feature_met_by_chance_outweighs_no_evidence() -> None:
     def explained(good: int, met: float, rms: float) -> Any:
-        return SimpleNamespace(poses=[None] * 4, met=met, good=lambda _: good, rms=lambda: rms)
+        return SimpleNamespace(
+            poses=[None] * 4, met=lambda *_: met, good=lambda _: good, rms=lambda *_: rms
+        )
 
     smaller = Change("the body {is} of another size", "with it smaller", values=1)
     before = explained(4, 50.0, 0.7)
@@ -392,7 +394,9 @@ def test_a_feature_met_by_chance_outweighs_no_evidence() -> None:
 
 def test_of_changes_that_explain_about_as_much_the_simplest_is_told() -> None:
     def explained(good: int, rms: float) -> Any:
-        return SimpleNamespace(poses=[None] * 4, met=50.0, good=lambda _: good, rms=lambda: rms)
+        return SimpleNamespace(
+            poses=[None] * 4, met=lambda *_: 50.0, good=lambda _: good, rms=lambda *_: rms
+        )
 
     other_size = Change("the body {is} of another size", "with it larger", values=1)
     elsewhere = Change("a camera {is} elsewhere", "with it moved", values=6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from math import lgamma, log, pi
 
@@ -33,12 +34,15 @@ def odds_at(
     size: float,
     model: DetectionModel,
     spreads: Floats | None = None,
+    surfaces: Sequence[int] | None = None,
 ) -> float:
     """Of one pose."""
     variances, sizes = np.full((1, len(found)), S2), np.array([size])
     matches = Matches.stacked([matches_of(*found)])
     at_S2 = information[None] / S2
-    odds = log_evidence(matches, variances, FREE, [prior], sizes, model, at_S2, spreads)
+    given = [prior], sizes, model, at_S2, spreads
+    of = None if surfaces is None else np.array(surfaces)
+    odds = log_evidence(matches, variances, FREE, *given, of)
     return float(odds[0, 0])
 
 
@@ -62,6 +66,22 @@ def test_the_odds_by_volume_are_those_of_the_formula() -> None:
 def test_a_feature_that_is_missed_costs_as_much_as_its_chance() -> None:
     lost = evidence(SIX) - evidence(replace(SIX, expected=7.0))
     assert lost == pytest.approx(log(4))
+
+
+def test_a_surface_of_which_nothing_is_seen_is_hidden_as_one_feature() -> None:
+    def odds(met: int, surfaces: list[int]) -> float:
+        J = np.random.default_rng(0).normal(0, 1, (10, 2, 6))
+        shares = (np.arange(10) < met).astype(np.float64)
+        one = Seen(J, sigma=2.0, shares=shares, count=10.0)
+        return odds_at([one], KNOWN, (-10.0, np.ones(6)), 1.0, BY_VOLUME, None, surfaces)
+
+    alone, on_two = list(range(10)), [0] * 6 + [1] * 4
+    # four tags' corners, say, of which a finger covers one: 4 misses by themselves, 1 together
+    assert odds(6, on_two) - odds(6, alone) == pytest.approx(3 * log(4))
+    # a surface that is seen in part is missed feature by feature
+    assert odds(7, on_two) == pytest.approx(odds(7, alone))
+    # of a body of one surface a sensor meets something or is blind
+    assert odds(6, [0] * 10) == pytest.approx(odds(6, [-1] * 10))
 
 
 def test_a_feature_that_no_camera_sees_is_covered_and_counts_as_missed_twice() -> None:

@@ -132,7 +132,7 @@ def test_a_frame_by_itself_learns_the_size_from_its_pose(
     best = tracker.explain(data)[0]
     assert best.used.sized.all()
     deviation = np.sqrt(best.used.extra[0, 1]) * best.used.sigmas[0]
-    known = sizes_after(Sizes(), best, views, RULES)
+    known = sizes_after(Sizes(), best, RULES)
     assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)
     # off by half a radius, where how much sizes scatter is hardly known yet
     assert deviation > 10 * NOISE

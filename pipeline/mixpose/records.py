@@ -64,6 +64,11 @@ class PointPattern:
         """Sum of the weights."""
         return float(self.weights.sum())
 
+    @cached_property
+    def has_radii(self) -> bool:
+        """Whether the radius of each point is known."""
+        return bool(self.size and self.radii.all())
+
     def only(self, chosen: Mask) -> PointPattern:
         """Some of the points (M,)."""
         fields = self.points, self.weights, self.deviations, self.radii

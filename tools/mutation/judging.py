@@ -104,6 +104,14 @@ _FIELDS = (
 
 _CUT = (
     Mutant(
+        "judgement-surfaces-hidden-corner-by-corner",
+        "judgement/judge.py",
+        "counts = np.where(own & hidden[..., None], 1 / several[..., None], counts)",
+        "counts = np.where(own & hidden[..., None], 1.0, counts)",
+        "a tag that is covered counts as four markers that are",
+        ("test_judgement_evidence.py",),
+    ),
+    Mutant(
         "judgement-nothing-is-cut",
         "judgement/cut.py",
         "np.where(v > 1, given[met[0]].T, 0.0)",

@@ -13,7 +13,7 @@ from scipy.special import ndtri
 from mixpose.body.features import Feature
 from mixpose.body.sampling import Sampler, uniforms
 from mixpose.body.symmetry import default_tolerance, grid_steps, keeps_normals, symmetries
-from mixpose.records import Floats
+from mixpose.records import Floats, Indices
 
 Shape: TypeAlias = Literal["point", "sphere", "disk"]
 
@@ -133,6 +133,13 @@ class Body:
     def node_normals(self) -> Floats | None:
         """Normals of the nodes (Q, 3), None where the body has none."""
         return None if self.normals is None else self.normals[self.nodes.feature]
+
+    @cached_property
+    def surfaces(self) -> Indices:
+        """Numbers (Q,) of the surfaces of nodes: those with the very same normal; -1 of none."""
+        if self.node_normals is None:
+            return np.full(len(self.nodes.points), -1)
+        return np.unique(self.node_normals, axis=0, return_inverse=True)[1].reshape(-1)
 
     @cached_property
     def node_radii(self) -> Floats | None:

@@ -28,7 +28,7 @@ from mixpose.constants import constant
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverted, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import Floats, Mask, SensorReport
+from mixpose.records import Floats, Indices, Mask, SensorReport
 
 Prior: TypeAlias = tuple[float, Floats]
 """What is known of a pose before its frame: log of its density, per length and radian of each free
@@ -210,7 +210,11 @@ def _evidence(
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
     bent = np.zeros((len(cases), 6, 6))
     given = seen, variances, free, priors, sizes, detection
-    evidence = log_evidence(*given, information_of(seen, variances))
+    most = seen.shares.shape[-1]
+    surfaces = np.full((*sizes.shape, most), -1)
+    for own, body in zip(surfaces.reshape(-1, most), bodies, strict=True):
+        own[: len(body.surfaces)] = body.surfaces
+    evidence = log_evidence(*given, information_of(seen, variances), None, surfaces)
     if any(body.spread for body in bodies):
         spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
         by_pose = spreads.reshape(len(cases), *spreads.shape[-3:])
@@ -220,7 +224,9 @@ def _evidence(
         # rigid as a rule, and bent now and then: as often the one as the other
         information = information_of(seen, variances, spreads)
         at_all = spreads.any(axis=(-3, -2, -1))
-        both = np.logaddexp(evidence, log_evidence(*given, information, spreads)) - math.log(2)
+        both = np.logaddexp(
+            evidence, log_evidence(*given, information, spreads, surfaces)
+        ) - math.log(2)
         evidence = np.where(at_all, both, evidence)
         for k in np.flatnonzero(at_all).tolist():
             inner = np.ix_(free, free)
@@ -252,12 +258,13 @@ def log_evidence(
     detection: DetectionModel,
     information: Floats,  # (K, 6, 6)
     spreads: Floats | None = None,
+    surfaces: Indices | None = None,
 ) -> Floats:
     """Log odds (2, K) for bodies at K poses against clutter, of arguments as in `odds_of`.
 
     As the pose pays by volume or by count, whichever is cheaper; and as it pays by volume.
     """
-    odds = odds_of(found, variances, sizes, detection, spreads)
+    odds = odds_of(found, variances, sizes, detection, spreads, surfaces)
     # a direction that the data leave open is as uncertain as before
     log_densities, wide = (np.array(parts) for parts in zip(*priors, strict=True))
     (chosen,) = free.nonzero()
@@ -277,6 +284,7 @@ def odds_of(
     sizes: Floats,  # (K,) of the body, length units
     detection: DetectionModel,
     spreads: Floats | None = None,  # (K, N, 3, 3) of features in the world, where a body gives way
+    surfaces: Indices | None = None,  # (K, N) or (N,) of features, as `Body.surfaces`
 ) -> tuple[Floats, Floats, Floats]:
     """What features met gain (K,) against clutter, others lose, and coordinates that tell anything.
 
@@ -287,6 +295,8 @@ def odds_of(
     rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
     gained = found.shares * np.maximum(rarity - _costs(found, roots, spreads), 0.0)
     missed = (found.weights - found.shares) * detection.log_missed
+    if surfaces is not None and surfaces.max() > 0:
+        missed *= _each_of_hidden(found, surfaces)
     # what a sensor that is covered, blurred or out of step meets, it meets by chance
     is_blind = (gained + missed).sum(axis=-1) < detection.log_blind
     shares = found.shares
@@ -310,6 +320,21 @@ def odds_of(
     unseen = found.unseen.sum(axis=-1) * detection.log_unseen
     gained, missed, coordinates = np.array([gained, missed, coordinates]).sum(axis=-1)
     return gained, missed + unseen, coordinates
+
+
+def _each_of_hidden(found: Matches, surfaces: Indices) -> Floats:
+    """How much each feature (K, L, N) counts of what is missed.
+
+    A surface of which a sensor meets nothing, while it meets others, is hidden as one feature is.
+    """
+    counts, met = np.ones(found.shares.shape), found.shares > 0
+    meets = met.any(axis=-1)
+    for number in range(int(surfaces.max()) + 1):
+        own = (surfaces == number)[..., None, :]
+        several = np.maximum((found.weights * own).sum(axis=-1), 1.0)
+        hidden = meets & ~(met & own).any(axis=-1)
+        counts = np.where(own & hidden[..., None], 1 / several[..., None], counts)
+    return counts
 
 
 def _costs(found: Matches, roots: Floats, spreads: Floats | None) -> Floats:

@@ -73,8 +73,10 @@ def associate(
     if np.count_nonzero(merged):
         paired = np.nonzero(partner >= 0)
         J[paired] = (J[paired] + J[paired[0], partner[paired]]) / 2
+    extra, radii = _looks(views, by, partner, rules.middle)
     return Matches(
-        extra=_extra(views, by, partner, rules.middle),
+        extra=extra,
+        radii=radii,
         sized=np.array([getattr(view.observation.pattern, "is_sized", False) for view in views]),
         names=tuple([view.name for view in views]),
         dimensions=dimensions,
@@ -116,16 +118,21 @@ def _detections(views: Sequence[View]) -> Floats:
     return detections
 
 
-def _extra(views: Sequence[View], by: Indices, partner: Indices, middle: float) -> Floats:
-    """Variances (L, n) of the detections by which features are met beyond noise, σ_ε²."""
-    extra = np.where(partner >= 0, middle**2, 0.0)
-    for k, pattern in enumerate([view.observation.pattern for view in views]):
-        if isinstance(pattern, PointPattern) and not pattern.is_even:
-            # what two features share is long for that
-            single = np.flatnonzero((by[k] >= 0) & (partner[k] < 0))
-            deviations = pattern.deviations[by[k, single]] / views[k].observation.sigma
-            extra[k, single] = deviations * deviations
-    return extra
+def _looks(
+    views: Sequence[View], by: Indices, partner: Indices, middle: float
+) -> tuple[Floats, Floats]:
+    """Variances (L, n) of what meets features beyond noise, σ_ε², and radii, sensor units."""
+    extra, radii = np.where(partner >= 0, middle**2, 0.0), np.zeros(by.shape)
+    for k, view in enumerate(views):
+        pattern = view.observation.pattern
+        if not isinstance(pattern, PointPattern) or (pattern.is_even and not pattern.has_radii):
+            continue
+        # what two features share is long for that
+        single = np.flatnonzero((by[k] >= 0) & (partner[k] < 0))
+        deviations = pattern.deviations[by[k, single]] / view.observation.sigma
+        extra[k, single] = deviations * deviations
+        radii[k, single] = pattern.radii[by[k, single]]
+    return extra, radii
 
 
 def _to_nearest(

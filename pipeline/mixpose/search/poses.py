@@ -125,7 +125,7 @@ def odds_at(problem: SearchProblem, matches: Matches) -> tuple[Floats, Floats, F
     squares, errors = np.where(spare > 0, matches.squares, 0.0), rules.noise.errors
     degrees, size = errors.typical_degrees, np.full(len(met), 2 * body.radius)
     variances = (degrees * errors.typical**2 + squares) / (degrees + spare)
-    return odds_of(matches, variances, size, rules.detection)
+    return odds_of(matches, variances, size, rules.detection, surfaces=body.surfaces)
 
 
 def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
@@ -179,6 +179,7 @@ def matches_of(problem: SearchProblem, poses: Floats) -> Matches:
         unmatched_nearby=nothing,
         beside=np.full(seen.shape, np.nan),
         extra=np.zeros(seen.shape),
+        radii=np.zeros(seen.shape),
         finest=nothing + 1.0,
         parts=parts_of(len(sensors), clouds),
     )

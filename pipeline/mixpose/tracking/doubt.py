@@ -67,7 +67,9 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     most = -math.log(rules.acceptance.mistaken)
     mistaken = {one.name: min(one.log_odds, most) for one in mistakes if one.log_odds > 0}
     against = _alternatives(data, best, mistakes)
-    return replace(verdict, mistaken=mistaken).doubted(against)
+    # what lasts shows in frames like those before; one that is not is a doubled image, or the like
+    is_usual = best.residual_ratio <= rules.acceptance.changed
+    return replace(verdict, mistaken=mistaken if is_usual else None).doubted(against)
 
 
 def _alternatives(

@@ -80,7 +80,7 @@ def weighed_by_size(
     seen_otherwise = list(views)
     for k, view in enumerate(views):
         pattern = view.observation.pattern
-        if not isinstance(pattern, PointPattern) or not pattern.radii.all() or not at.seen[k].any():
+        if not isinstance(pattern, PointPattern) or not (pattern.has_radii and at.seen[k].any()):
             continue
         (seen,) = at.seen[k, 0].nonzero()
         away = np.linalg.norm(pattern.points[:, None] - at.y[k, 0, seen], axis=2)
@@ -98,22 +98,16 @@ def weighed_by_size(
     return seen_otherwise
 
 
-def sizes_after(before: Sizes, best: ScoredPose, views: Sequence[View], rules: SizeRules) -> Sizes:
+def sizes_after(before: Sizes, best: ScoredPose, rules: SizeRules) -> Sizes:
     """What is known after a frame that is ok."""
-    used, logs = best.used, []
-    patterns = {view.name: view.observation.pattern for view in views}
-    for k, name in enumerate(used.names):
-        pattern = patterns[name]
-        if not isinstance(pattern, PointPattern) or not pattern.radii.all():
-            continue
-        met = np.flatnonzero((used.detections[k] >= 0) & (used.shares[k] == used.weights[k]))
-        by = used.detections[k, met]
-        scales = _scales(used.J[k, met]) * used.sigmas[k]
-        own = np.log(pattern.radii[by] / scales)
-        logs.append(own if before.count else own[pattern.deviations[by] == 0])
-    return before.followed(np.concatenate(logs) if logs else np.zeros(0), rules)
+    used = best.used
+    met = (used.radii > 0) & (used.shares == used.weights) & (used.shares > 0)
+    if not before.count:
+        met &= used.extra < best.variances[:, None]  # of no shape that is odd
+    scales = _scales(used.J * used.sigmas[:, None, None, None])
+    return before.followed(np.log(used.radii[met] / scales[met]), rules)
 
 
 def _scales(J: Floats) -> Floats:
-    """Pixels per length (n,) by Jacobians (n, 2, 6) of places by the pose."""
+    """Pixels per length (...,) by Jacobians (..., 2, 6) of places by the pose."""
     return np.asarray(np.sqrt(np.square(J[..., :3]).sum(axis=(-2, -1)) / 2))

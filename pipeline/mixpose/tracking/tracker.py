@@ -160,7 +160,7 @@ class Tracker(Setup):
         if not ranked:
             return ranked
         best, rules = ranked[0], self.rules.sizes
-        sizes = sizes_after(Sizes(), best, data.views, rules)
+        sizes = sizes_after(Sizes(), best, rules)
         views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
         if not sizes.count:
             return ranked
@@ -261,7 +261,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     sizes = track.sizes
     if is_ok:
-        sizes = sizes_after(sizes, best, data.views, data.rules.sizes)
+        sizes = sizes_after(sizes, best, data.rules.sizes)
     return follow(
         data,
         found,
