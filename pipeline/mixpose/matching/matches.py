@@ -180,8 +180,8 @@ class ErrorRules:
         "of each: of 13,400 spots before a hand 1.0, 0.5, 0.1 % are 0.14, 0.22, 2.8 px off",
     )
     sized: tuple[float, float, float] = constant(
-        (0.006, 0.0004, 0.0),
-        "of each by their sizes: of 12,100 spots 1.4, 0.4, 0.1, 0.02 % are 0.1, 0.15, 0.3, 0.5 px "
+        (0.006, 0.002, 0.0),
+        "of each by their sizes: of 12,100 spots 1.6, 0.6, 0.2, 0.05 % are 0.1, 0.15, 0.3, 0.5 px "
         "off, and none 1 px",
     )
     outlying: float = constant(3.5, "deviations from which an offset is no noise: 2 in 1000")

@@ -89,7 +89,9 @@ def weighed_by_size(
         whole = scales * np.exp(sizes.mean)
         smaller = np.exp(-2 * np.abs(logs - sizes.mean))
         moved = np.maximum(pattern.radii, whole) * (1 - smaller)
-        own = np.sqrt(sizes.cut(logs, rules) / 2) * moved  # of each of two coordinates
+        # where sizes speak for it: what is likely whole is not made less exact by a little
+        is_cut = sizes.cut(logs, rules) > rules.cut
+        own = np.where(is_cut, moved / np.sqrt(2), 0.0)  # of each of two coordinates
         known = replace(pattern, deviations=np.maximum(pattern.deviations, own), is_sized=True)
         seen_as = view.observation
         seen_otherwise[k] = replace(
