@@ -235,7 +235,7 @@ _SADDLES = (
 
 _SIZES = (
     Mutant(
-        "sizes-of-no-scale",
+        "tracking-sizes-of-no-scale",
         "tracking/sizes.py",
         "logs = np.log(pattern.radii / scales)",
         "logs = np.log(pattern.radii)",
@@ -243,15 +243,15 @@ _SIZES = (
         ("test_tracking_sizes.py",),
     ),
     Mutant(
-        "sizes-cut-by-nothing",
+        "tracking-sizes-cut-by-nothing",
         "tracking/sizes.py",
         "(1 - smaller)",
-        "(smaller - smaller)",
+        "0.0 * (1 - smaller)",
         "a sliver is as exact as a disk",
         ("test_tracking_sizes.py",),
     ),
     Mutant(
-        "sizes-learnt-from-slivers",
+        "tracking-sizes-learnt-from-slivers",
         "tracking/sizes.py",
         "weights = 1 - known.cut(logs, rules)",
         "weights = np.ones(len(logs))",
@@ -259,7 +259,7 @@ _SIZES = (
         ("test_tracking_sizes.py",),
     ),
     Mutant(
-        "sizes-not-of-a-first-frame",
+        "tracking-sizes-not-of-a-first-frame",
         "tracking/tracker.py",
         "return ranked if data.track.sizes.count else self._by_size(data, ranked)",
         "return ranked",
