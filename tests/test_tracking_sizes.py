@@ -18,6 +18,7 @@ from mixpose.records import PointPattern
 from mixpose.rigid import rotation_angle_deg
 from mixpose.sensors import PinholeCamera
 from mixpose.tracking import Tracker
+from mixpose.tracking.rules import Rules
 from mixpose.tracking.sizes import SizeRules, Sizes, sizes_after, weighed_by_size
 
 Floats = NDArray[np.float64]
@@ -127,12 +128,13 @@ def test_a_frame_by_itself_learns_the_size_from_its_pose(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:
     views = seen(pinhole_cameras, np.random.default_rng(4), {(0, 1): 0.35})
-    tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH)
+    exact = Rules(sizes=SizeRules(scatter=0.03))  # disks
+    tracker = Tracker.create(BODY, EstimatorOptions(), TRUTH, rules=exact)
     data = tracker.data(tracker.begin(), 0, None, views)
     best = tracker.explain(data)[0]
     assert best.used.sized.all()
     deviation = np.sqrt(best.used.extra[0, 1]) * best.used.sigmas[0]
     known = sizes_after(Sizes(), best, RULES)
     assert np.exp(known.mean) == pytest.approx(RADIUS, rel=0.05)
-    # off by half a radius, where how much sizes scatter is hardly known yet
+    # off by half a radius
     assert deviation > 10 * NOISE

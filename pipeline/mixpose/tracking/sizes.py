@@ -74,7 +74,7 @@ def weighed_by_size(
     views: Sequence[View], body: Body, T_world_object: Floats, sizes: Sizes, rules: SizeRules
 ) -> list[View]:
     """Views with the deviations of spots that have not the size of the nearest feature."""
-    if not (sizes.count and rules.cut):
+    if not (sizes.count and rules.cut and views):
         return list(views)
     at = project_body(tuple(view.sensor for view in views), body).project(T_world_object[None])
     seen_otherwise = list(views)
@@ -89,8 +89,8 @@ def weighed_by_size(
         whole = scales * np.exp(sizes.mean)
         smaller = np.exp(-2 * np.abs(logs - sizes.mean))
         moved = np.maximum(pattern.radii, whole) * (1 - smaller)
-        # where sizes speak for it: what is likely whole is not made less exact by a little
-        is_cut = sizes.cut(logs, rules) > rules.cut
+        # what is likely whole is not made less exact by a little
+        is_cut = sizes.cut(logs, rules) > 0.5
         own = np.where(is_cut, moved / np.sqrt(2), 0.0)  # of each of two coordinates
         known = replace(pattern, deviations=np.maximum(pattern.deviations, own), is_sized=True)
         seen_as = view.observation

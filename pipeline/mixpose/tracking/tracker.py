@@ -15,7 +15,15 @@ from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import APART, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
+from mixpose.records import (
+    Estimate,
+    Floats,
+    Hypothesis,
+    Offsets,
+    PointPattern,
+    SensorReport,
+    label_of,
+)
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, of_other_things
@@ -162,7 +170,17 @@ class Tracker(Setup):
         best, rules = ranked[0], self.rules.sizes
         sizes = sizes_after(Sizes(), best, rules)
         views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
-        if not sizes.count:
+        looks = [
+            (one.observation.pattern, two.observation.pattern)
+            for one, two in zip(data.views, views, strict=True)
+        ]
+        # where no spot is cut by its size, poses are what they are
+        if not any(
+            isinstance(before, PointPattern)
+            and isinstance(after, PointPattern)
+            and (after.deviations > before.deviations).any()
+            for before, after in looks
+        ):
             return ranked
         return judged_again(data.seen_otherwise(views=views), ranked, fitted=True)
 
