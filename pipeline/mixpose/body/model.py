@@ -135,10 +135,10 @@ class Body:
         return None if self.normals is None else self.normals[self.nodes.feature]
 
     @cached_property
-    def surfaces(self) -> Indices:
-        """Numbers (Q,) of the surfaces of nodes: those with the very same normal; -1 of none."""
+    def surfaces(self) -> Indices | None:
+        """Numbers (Q,) of the nodes' surfaces, each of one normal; None where the body has none."""
         if self.node_normals is None:
-            return np.full(len(self.nodes.points), -1)
+            return None
         return np.unique(self.node_normals, axis=0, return_inverse=True)[1].reshape(-1)
 
     @cached_property

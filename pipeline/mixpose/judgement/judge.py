@@ -210,10 +210,7 @@ def _evidence(
     sizes = np.array([2 * body.radius for body in bodies]).reshape(variances.shape[:-1])
     bent = np.zeros((len(cases), 6, 6))
     given = seen, variances, free, priors, sizes, detection
-    most = seen.shares.shape[-1]
-    surfaces = np.full((*sizes.shape, most), -1)
-    for own, body in zip(surfaces.reshape(-1, most), bodies, strict=True):
-        own[: len(body.surfaces)] = body.surfaces
+    surfaces = _surfaces_of(bodies, (*sizes.shape, seen.shares.shape[-1]))
     evidence = log_evidence(*given, information_of(seen, variances), None, surfaces)
     if any(body.spread for body in bodies):
         spreads = np.zeros((*sizes.shape, seen.shares.shape[-1], 3, 3))
@@ -224,14 +221,24 @@ def _evidence(
         # rigid as a rule, and bent now and then: as often the one as the other
         information = information_of(seen, variances, spreads)
         at_all = spreads.any(axis=(-3, -2, -1))
-        both = np.logaddexp(
-            evidence, log_evidence(*given, information, spreads, surfaces)
-        ) - math.log(2)
+        bent_odds = log_evidence(*given, information, spreads, surfaces)
+        both = np.logaddexp(evidence, bent_odds) - math.log(2)
         evidence = np.where(at_all, both, evidence)
         for k in np.flatnonzero(at_all).tolist():
             inner = np.ix_(free, free)
             bent[k][inner] = inverted(information.reshape(-1, 6, 6)[k][inner])
     return evidence, bent
+
+
+def _surfaces_of(bodies: Sequence[Body], shape: tuple[int, ...]) -> Indices | None:
+    """Surfaces (K, N) of bodies side by side, -1 of none; None where no body has any."""
+    if all(body.surfaces is None for body in bodies):
+        return None
+    surfaces = np.full(shape, -1)
+    for own, body in zip(surfaces.reshape(len(bodies), -1), bodies, strict=True):
+        if body.surfaces is not None:
+            own[: len(body.surfaces)] = body.surfaces
+    return surfaces
 
 
 def flat_prior(body: Body, free: Mask, detection: DetectionModel) -> Prior:

@@ -18,7 +18,6 @@ import numpy as np
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.density import Observation
 from mixpose.judgement import ScoredPose
 from mixpose.objective import View, project_body
 from mixpose.records import Floats, PointPattern
@@ -93,11 +92,19 @@ def weighed_by_size(
         is_cut = sizes.cut(logs, rules) > 0.5
         own = np.where(is_cut, moved / np.sqrt(2), 0.0)  # of each of two coordinates
         known = replace(pattern, deviations=np.maximum(pattern.deviations, own), is_sized=True)
-        seen_as = view.observation
-        seen_otherwise[k] = replace(
-            view, observation=Observation(known, seen_as.sigma, seen_as.intrinsic)
-        )
+        seen_otherwise[k] = replace(view, observation=replace(view.observation, pattern=known))
     return seen_otherwise
+
+
+def are_less_exact(views: Sequence[View], known: Sequence[View]) -> bool:
+    """Whether spots of views are known to be cut that were not by themselves."""
+    patterns = [[view.observation.pattern for view in pair] for pair in zip(views, known)]
+    return any(
+        isinstance(by_itself, PointPattern)
+        and isinstance(by_size, PointPattern)
+        and bool((by_size.deviations > by_itself.deviations).any())
+        for by_itself, by_size in patterns
+    )
 
 
 def sizes_after(before: Sizes, best: ScoredPose, rules: SizeRules) -> Sizes:

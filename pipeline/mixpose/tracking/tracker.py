@@ -15,15 +15,7 @@ from mixpose.fit import EstimatorOptions, Fit
 from mixpose.judgement import APART, ScoredPose, Verdict, insert
 from mixpose.matching import Matches
 from mixpose.objective import View
-from mixpose.records import (
-    Estimate,
-    Floats,
-    Hypothesis,
-    Offsets,
-    PointPattern,
-    SensorReport,
-    label_of,
-)
+from mixpose.records import Estimate, Floats, Hypothesis, Offsets, SensorReport, label_of
 from mixpose.rigid import is_rigid
 from mixpose.threads import one_blas_thread
 from mixpose.tracking.doubt import decided, of_other_things
@@ -33,7 +25,7 @@ from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.motion import per_kind
 from mixpose.tracking.proposers import PROPOSERS, REFINEMENTS, Proposer, Refinement
 from mixpose.tracking.rules import Rules
-from mixpose.tracking.sizes import Sizes, sizes_after, weighed_by_size
+from mixpose.tracking.sizes import Sizes, are_less_exact, sizes_after, weighed_by_size
 from mixpose.tracking.track import Branch, Track, predict
 from mixpose.tracking.twin import left_by, with_second
 
@@ -170,17 +162,8 @@ class Tracker(Setup):
         best, rules = ranked[0], self.rules.sizes
         sizes = sizes_after(Sizes(), best, rules)
         views = weighed_by_size(data.views, self.body, best.T_world_object, sizes, rules)
-        looks = [
-            (one.observation.pattern, two.observation.pattern)
-            for one, two in zip(data.views, views, strict=True)
-        ]
         # where no spot is cut by its size, poses are what they are
-        if not any(
-            isinstance(before, PointPattern)
-            and isinstance(after, PointPattern)
-            and (after.deviations > before.deviations).any()
-            for before, after in looks
-        ):
+        if not are_less_exact(data.views, views):
             return ranked
         return judged_again(data.seen_otherwise(views=views), ranked, fitted=True)
 
