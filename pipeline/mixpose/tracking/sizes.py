@@ -29,7 +29,7 @@ class SizeRules:
 
     cut: float = constant(0.1, "of spots by which features are met: 18 % before a hand, else 1 %")
     scatter: float = constant(0.1, "τ before it is seen: grey levels move outlines of small spots")
-    scatter_counts: float = constant(6.0, "spots that this counts as: by 1, 7 of 4,468 are outside")
+    scatter_counts: float = constant(6.0, "spots that this counts as: those of a frame")
     least: float = constant(0.01, "τ at least: disks of 6 px are as exact")
     memory: float = constant(0.95, "per frame, as of noise")
 
