@@ -93,6 +93,30 @@ def test_a_body_given_mirrored_is_never_ok(
         assert estimate.status != "ok"
 
 
+def test_a_body_once_seen_as_its_mirror_image_stays_in_doubt_where_both_are_alike(
+    pinhole_cameras: list[PinholeCamera],
+) -> None:
+    # the mirror image of four markers in a plane, one before it, is these four as well
+    points = PLATE * ([[1, 1, 0]] * 4 + [[1, 1, 1]])
+    given, shown = (
+        Body("plate", tuple(PointFeature(point) for point in points * [1, 1, side]))
+        for side in (1, -1)
+    )
+    plane = Body("plane", given.features[:4])
+    tracker = Tracker.create(given, EstimatorOptions())
+    for first, expected in ((given, "ok"), (shown, "ambiguous")):
+        track = tracker.begin()
+        for frame, body in enumerate((first, plane, plane)):
+            views = detect(pinhole_cameras, body, TRUTH, noise=0.2, seed=frame)
+            track, estimate = tracker.advance(track, frame, None, views)
+            assert estimate.status == expected
+    # and frames that show the body itself end it
+    for frame in (3, 4):
+        views = detect(pinhole_cameras, given, TRUTH, noise=0.2, seed=frame)
+        track, estimate = tracker.advance(track, frame, None, views)
+    assert estimate.status == "ok"
+
+
 def test_a_body_few_of_whose_markers_are_seen_beside_false_ones_is_not_its_mirror_image(
     pinhole_cameras: list[PinholeCamera],
 ) -> None:

@@ -316,7 +316,7 @@ def test_what_is_left_out_counts_as_missed(pinhole_cameras: list[PinholeCamera])
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
-def test_what_one_of_two_cameras_sees_again_and_again_is_not_surer_for_it(
+def test_what_one_camera_sees_again_and_again_is_not_surer_for_it(
     pinhole_cameras: list[PinholeCamera], cameras: int
 ) -> None:
     # five markers of eight, as another body may show them: one frame is not sure of them
@@ -334,6 +334,4 @@ def test_what_one_of_two_cameras_sees_again_and_again_is_not_surer_for_it(
         ]
         track, estimate = tracker.advance(track, frame, 0.04 * frame, views[:cameras])
         statuses.append(estimate.status)
-    # a camera alone has nothing else to go by
-    assert statuses[0] == "ambiguous"
-    assert set(statuses[1:]) == {"ok" if cameras == 1 else "ambiguous"}
+    assert set(statuses) == {"ambiguous"}

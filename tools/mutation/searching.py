@@ -68,8 +68,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-a-turned-camera-is-as-told",
         "tracking/doubt.py",
-        "math.log(rules.mistaken) + one.log_odds +",
-        "math.log(rules.mistaken) - abs(one.log_odds) +",
+        "math.log(likely) + one.log_odds +",
+        "math.log(likely) - abs(one.log_odds) +",
         "two cameras of which one was turned agree about a wrong pose",
         ("test_turned_camera.py",),
     ),
@@ -92,8 +92,8 @@ _PROPOSALS = (
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "    return _gained(data, best) - best.log_evidence",
-        "    return -best.log_evidence",
+        "gained = 0.0 if data.track.believed else _gained(data, best)",
+        "gained = 0.0",
         "another body that looks alike to one camera is ok after a frame or two",
         (_STARTS,),
     ),
@@ -247,7 +247,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            odds = _evidence(there, Start(T, data.close)) - own",
+        "            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own",
         "            odds = -math.inf",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
@@ -255,7 +255,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            odds = _evidence(there, Start(T, data.close)) - own",
+        "            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own",
         "            odds = 9.0",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),

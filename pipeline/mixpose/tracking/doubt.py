@@ -3,7 +3,8 @@
 Other things, or another body of the session, may have three markers in the same places.  What
 looks like the body by chance does so for several frames: what the track expects then tells nothing.
 The mirror image of the body is a rival where features are missed beside detections that belong to
-none, reflected in the plane nearest to those met; of few in the first frames, wherever it is.
+none, reflected in the plane nearest to those met; of few in the first frames, wherever it is.  That
+the session tells it as its mirror image is a mistake like others: what frames say of it adds up.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from mixpose.tracking.track import Track
 from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat
 
 FEW = "few markers are met, which other things may have alike"
-ALONE = "one sensor of several meets the body, which none of its frames was sure of by itself"
+UNSURE = "no frame by itself is sure of the body"
 CHANGED = "features are met much farther off than in the frames before"
 OPEN = "features that would fix it are hidden or cut"
 MIRRORED = "it shows the body's mirror image"
@@ -61,10 +62,11 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     if not is_sure(best, data.free, data.rules.acceptance):
         return verdict
     rules, sensors = data.rules, {view.name: view.sensor for view in data.still or data.views}
-    given = rules.judgement.noise, sensors, data.track.mistaken
-    mistakes = list(possible_mistakes(best, data.body, data.free, *given))
-    # however often it was seen, it is no likelier than not: one frame may tell that it is none
-    most = -math.log(rules.acceptance.mistaken)
+    before = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
+    given = rules.judgement.noise, sensors, before
+    mistakes = [*possible_mistakes(best, data.body, data.free, *given), of_reflection(data, best)]
+    # however often it was seen, frames that tell otherwise are as rare as mistakes
+    most = -2 * math.log(rules.acceptance.mistaken)
     mistaken = {one.name: min(one.log_odds, most) for one in mistakes if one.log_odds > 0}
     against = _alternatives(data, best, mistakes)
     # what lasts shows in frames like those before; one that is not is a doubled image, or the like
@@ -77,14 +79,14 @@ def _alternatives(
 ) -> Iterator[Alternative]:
     """What else a frame may show that a sure pose is told from."""
     rules, track, noise = data.rules.acceptance, data.track, data.rules.judgement.noise
-    mirrored = 0.5 if data.options.mirrors else rules.mistaken
-    yield Alternative(MIRRORED, math.log(mirrored) + of_reflection(data, best))
     if data.options.mirrors and is_flat(data):
         yield Alternative(IN_A_MIRROR)
     yield Alternative(FEW, of_other_things(data, best))
-    yield Alternative(ALONE, _of_one_sensor(data, best))
+    yield Alternative(UNSURE, _of_chance_that_lasts(data, best))
     for one in mistakes:
-        yield Alternative(one.what, math.log(rules.mistaken) + one.log_odds + one.log_harm)
+        # of a scene with mirrors nobody knows which side a frame shows
+        likely = 0.5 if one.name == MIRRORED and data.options.mirrors else rules.mistaken
+        yield Alternative(one.what, math.log(likely) + one.log_odds + one.log_harm)
     if one_misses(best, track.residuals.total, track.agreed, rules, noise):
         yield Alternative(APART)
     if best.residual_ratio > rules.changed:
@@ -93,15 +95,14 @@ def _alternatives(
         yield Alternative(OPEN)
 
 
-def _of_one_sensor(data: Frame, best: ScoredPose) -> float:
-    """Log odds of clutter where one sensor of several meets the body, and no frame was ok before.
+def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
+    """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
     A pose that is sure for doubtful ones before it alone errs as they do.
     """
-    met = np.count_nonzero(best.matches.met)
-    if data.track.believed or len(data.sensors) < 2 or met != 1:
-        return -math.inf
-    return _gained(data, best) - best.log_evidence
+    gained = 0.0 if data.track.believed else _gained(data, best)
+    # beyond that of clutter, which counts already
+    return gained + math.log(-math.expm1(-gained)) - best.log_evidence if gained else -math.inf
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
@@ -126,8 +127,19 @@ def of_other_things(data: Frame, judged: ScoredPose) -> float:
     return float(odds - (_gained(data, judged) if data.track.known else 0.0))
 
 
-def of_reflection(data: Frame, judged: ScoredPose) -> float:
-    """Log odds of the body's mirror image; minus infinity where it cannot be, or is not likely."""
+def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
+    """By how much likelier the body's mirror image is, by this frame and those before it.
+
+    A mirror in the scene shows it in one frame and not in another.
+    """
+    lasts = not data.options.mirrors
+    before = data.track.mistaken.get(MIRRORED, 0.0) if lasts else 0.0
+    return Mistake(MIRRORED, MIRRORED, before + _reflected(data, judged, before > 0), 0.0)
+
+
+def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
+    """Log odds by this frame; minus infinity where it cannot be, or where nobody `asked` for more
+    than what is likely."""
     rules, seen, T = data.rules, judged.matches, judged.T_world_object
     # where a turn brings it onto its mirror image no camera tells one side's markers
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
@@ -136,15 +148,16 @@ def of_reflection(data: Frame, judged: ScoredPose) -> float:
     accepted, met = rules.acceptance, seen.met_by
     own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mistaken)
     # of these the mirror image may meet more than the body
-    if sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
+    if asked or sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
         # one camera alone may have met a feature by chance
         sharp = met >= min(2, met.max())
         there = _mirrored(data, sharp if sharp.sum() >= 3 else met > 0)
         # no rival meets less than a quarter of what the body meets; values grow as the square
         theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
-        if theirs > value / 16:
-            odds = _evidence(there, Start(T, data.close)) - own
-            if odds > likely:
+        if asked or theirs > value / 16:
+            # as it stands, and fitted, which may end at clutter
+            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own
+            if asked or odds > likely:
                 return odds
     if not _is_by_chance(data, judged):
         return -math.inf
