@@ -92,7 +92,7 @@ _PROPOSALS = (
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "gained = 0.0 if data.track.believed else _gained(data, best)",
+        "gained = 0.0 if track.believed or track.frame is None else _gained(data, best)",
         "gained = 0.0",
         "another body that looks alike to one camera is ok after a frame or two",
         (_STARTS,),

@@ -100,7 +100,8 @@ def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
 
     A pose that is sure for doubtful ones before it alone errs as they do.
     """
-    gained = 0.0 if data.track.believed else _gained(data, best)
+    track = data.track
+    gained = 0.0 if track.believed or track.frame is None else _gained(data, best)
     # beyond that of clutter, which counts already
     return gained + math.log(-math.expm1(-gained)) - best.log_evidence if gained else -math.inf
 

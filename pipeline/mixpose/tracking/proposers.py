@@ -254,7 +254,7 @@ def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Ite
 
 
 def _paired(seen: Matches, reach: float, middle: float) -> Matches:
-    """In each sensor the feature missed nearest to the detection of another, as one with that.
+    """In each sensor the features missed near detections of single ones, as one with these.
 
     `reach` is how far that may be, squared, in variances of C.
     """
@@ -262,18 +262,20 @@ def _paired(seen: Matches, reach: float, middle: float) -> Matches:
         return seen
     shares, offsets, J = seen.shares.copy(), seen.offsets.copy(), seen.J.copy()
     merged, extra = seen.merged.copy(), seen.extra.copy()
-    for k in np.flatnonzero((seen.merged == 0) & (seen.missed > 0) & (seen.met > 0)):
-        met = np.flatnonzero(seen.detections[k] >= 0)
+    for k in np.flatnonzero((seen.missed > 0) & (seen.met > 0)):
+        by = seen.detections[k]
+        met = np.flatnonzero((by >= 0) & ((by[:, None] == by).sum(axis=1) == 1))
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
         away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
         squared = (away * away).sum(axis=2) / 2
-        if squared.min(initial=np.inf) <= reach:
+        while squared.min(initial=np.inf) <= reach:
             i, j = np.unravel_index(int(squared.argmin()), squared.shape)
             pair = [lost[i], met[j]]
             shares[k, pair] = shares[k, met[j]] / 2
             offsets[k, pair] = (away[i, j] + offsets[k, met[j]]) / 2
             J[k, pair] = J[k, pair].mean(axis=0)
-            merged[k], extra[k, pair] = 1, middle**2
+            merged[k], extra[k, pair] = merged[k] + 1, middle**2
+            squared[i], squared[:, j] = np.inf, np.inf
     return replace(seen, shares=shares, offsets=offsets, J=J, merged=merged, extra=extra)
 
 
