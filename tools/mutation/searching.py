@@ -92,9 +92,17 @@ _PROPOSALS = (
     Mutant(
         "tracking-what-is-seen-again-is-surer",
         "tracking/doubt.py",
-        "gained = 0.0 if track.believed or track.frame is None else _gained(data, best)",
+        "gained = max(_gained(data, best) - more, 0.0)",
         "gained = 0.0",
         "another body that looks alike to one camera is ok after a frame or two",
+        (_STARTS,),
+    ),
+    Mutant(
+        "tracking-other-features-tell-nothing-more",
+        "tracking/doubt.py",
+        "np.maximum(before - _shown(data, best), 0.0).sum()",
+        "np.maximum(0.0 * _shown(data, best), 0.0).sum()",
+        "what one camera sees of the body one feature after the other never makes it sure",
         (_STARTS,),
     ),
     Mutant(
@@ -247,7 +255,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own",
+        "            odds = max(there_as) - own",
         "            odds = -math.inf",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
@@ -255,7 +263,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own",
+        "            odds = max(there_as) - own",
         "            odds = 9.0",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),

@@ -22,6 +22,7 @@ from mixpose.judgement.judge import (
     Prior as Prior,
     ScoredPose as ScoredPose,
     flat_prior as flat_prior,
+    gained_by as gained_by,
     judge as judge,
     judge_together as judge_together,
     odds_of as odds_of,

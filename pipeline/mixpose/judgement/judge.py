@@ -298,9 +298,7 @@ def odds_of(
     Of K poses as if they had not been chosen to fit; three coordinates for a point in space.
     """
     roots, m = np.sqrt(variances[..., None] + found.extra), found.dimensions[:, None]
-    crowd = found.crowd[..., None] * roots**m
-    rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
-    gained = found.shares * np.maximum(rarity - _costs(found, roots, spreads), 0.0)
+    gained = gained_by(found, roots, detection, spreads)
     missed = (found.weights - found.shares) * detection.log_missed
     if surfaces is not None and surfaces.max() > 0:
         missed *= _each_of_hidden(found, surfaces)
@@ -327,6 +325,16 @@ def odds_of(
     unseen = found.unseen.sum(axis=-1) * detection.log_unseen
     gained, missed, coordinates = np.array([gained, missed, coordinates]).sum(axis=-1)
     return gained, missed + unseen, coordinates
+
+
+def gained_by(
+    found: Matches, roots: Floats, detection: DetectionModel, spreads: Floats | None = None
+) -> Floats:
+    """What each feature (..., L, N) gains against clutter in each sensor by itself, in nats."""
+    m = found.dimensions[:, None]
+    crowd = found.crowd[..., None] * roots**m
+    rarity = np.log(detection.probability / np.maximum(crowd * (2 * np.pi) ** (m / 2), 1e-300))
+    return np.asarray(found.shares * np.maximum(rarity - _costs(found, roots, spreads), 0.0))
 
 
 def _each_of_hidden(found: Matches, surfaces: Indices) -> Floats:

@@ -23,13 +23,14 @@ from mixpose.judgement import (
     ScoredPose,
     Verdict,
     decide,
+    gained_by,
     is_far_off,
     is_open,
     is_sure,
     one_misses,
     possible_mistakes,
 )
-from mixpose.records import Mask
+from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
@@ -98,12 +99,30 @@ def _alternatives(
 def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
     """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
-    A pose that is sure for doubtful ones before it alone errs as they do.
+    Each feature tells once that it is none, as well as any frame shows it.
     """
     track = data.track
-    gained = 0.0 if track.believed or track.frame is None else _gained(data, best)
+    if track.believed or track.frame is None:
+        return -math.inf
+    before = 0.0 if track.shown is None else track.shown
+    more = float(np.maximum(before - _shown(data, best), 0.0).sum())
+    gained = max(_gained(data, best) - more, 0.0)
     # beyond that of clutter, which counts already
     return gained + math.log(-math.expm1(-gained)) - best.log_evidence if gained else -math.inf
+
+
+def shown_after(data: Frame, best: ScoredPose) -> Floats | None:
+    """`Track.shown` after a frame; of a pose that nobody expected, by this frame alone."""
+    if data.track.believed:
+        return None
+    own, before = _shown(data, best), data.track.shown
+    return own if before is None or not _gained(data, best) else np.maximum(own, before)
+
+
+def _shown(data: Frame, best: ScoredPose) -> Floats:
+    """What each feature (N,) gains in the sensor that shows it best, in nats."""
+    roots = np.sqrt(best.variances[:, None] + best.used.extra)
+    return gained_by(best.used, roots, data.rules.judgement.detection).max(axis=0)
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
@@ -139,8 +158,10 @@ def of_reflection(data: Frame, judged: ScoredPose) -> Mistake:
 
 
 def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
-    """Log odds by this frame; minus infinity where it cannot be, or where nobody `asked` for more
-    than what is likely."""
+    """Log odds by this frame; minus infinity where it cannot be.
+
+    What is not likely is looked for only where it is `asked` for.
+    """
     rules, seen, T = data.rules, judged.matches, judged.T_world_object
     # where a turn brings it onto its mirror image no camera tells one side's markers
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
@@ -157,7 +178,8 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
         theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
         if asked or theirs > value / 16:
             # as it stands, and fitted, which may end at clutter
-            odds = max(_evidence(there, Start(T, near)) for near in (None, data.close)) - own
+            there_as = [_evidence(there, Start(T, near)) for near in (None, data.close)]
+            odds = max(there_as) - own
             if asked or odds > likely:
                 return odds
     if not _is_by_chance(data, judged):

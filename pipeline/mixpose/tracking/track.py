@@ -136,6 +136,8 @@ class Track:
     doubted: bool = False  # whether another body may have what the last pose meets
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
+    # (N,) nats that each feature gained at most, in frames one after the other, none of them ok
+    shown: Floats | None = None
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain
     tried: Mapping[str, int] = field(default_factory=dict)
