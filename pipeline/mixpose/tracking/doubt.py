@@ -122,7 +122,7 @@ def shown_after(data: Frame, best: ScoredPose) -> Floats | None:
 def _shown(data: Frame, best: ScoredPose) -> Floats:
     """What each feature (N,) gains in the sensor that shows it best, in nats."""
     roots = np.sqrt(best.variances[:, None] + best.used.extra)
-    return gained_by(best.used, roots, data.rules.judgement.detection).max(axis=0)
+    return np.asarray(gained_by(best.used, roots, data.rules.judgement.detection).max(axis=0))
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
