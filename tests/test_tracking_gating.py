@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from detections import view_of
 from numpy.typing import NDArray
 
 from mixpose.body import Body, PointFeature
-from mixpose.judgement import AcceptanceRules
 from mixpose.rigid import from_parts
 from mixpose.sensors import PinholeCamera
-from mixpose.tracking import Branch, Expectation, are_as_good, have_fewer, is_convincing
+from mixpose.tracking import Branch, Expectation
 
 Floats = NDArray[np.float64]
 
@@ -59,29 +56,3 @@ def test_features_that_a_camera_does_not_see_have_no_part_in_its_window() -> Non
     normals = np.array([[0, 0, -1.0], [0, 0, -1], [0, 0, -1], [0, 0, 1]])
     found = window(body_of(*points, normals=normals), (0.0, 0.0, 500.0))
     np.testing.assert_allclose(found, (596, 472, 685, 553), atol=1)  # whole pixels
-
-
-@pytest.mark.parametrize(("count", "fewer"), [(7, True), (8, False), (9, False)])
-def test_fewer_detections_than_were_met_are_noticed(count: int, fewer: bool) -> None:
-    before = {"0": (8, 8)}
-    views = [view_of("0", CAMERA, np.zeros((count, 2)))]
-    assert have_fewer(views, before) is fewer
-    assert have_fewer(views, {}) is False
-
-
-def test_a_sensor_that_misses_one_more_is_not_as_good() -> None:
-    before = {"0": (7, 8)}
-    assert are_as_good({"0": (7, 8)}, before)
-    assert not are_as_good({"0": (6, 8)}, before)
-    assert are_as_good({"1": (0, 8)}, before)
-
-
-def test_a_covered_camera_does_not_count_where_two_others_agree() -> None:
-    tallies = {
-        "0": (8, 8),
-        "1": (7, 8),
-        "2": (1, 8),
-    }
-    assert is_convincing(tallies, ["0", "1", "2"], AcceptanceRules())
-    # of 16 features 9 are met
-    assert not is_convincing(tallies, ["0", "2"], AcceptanceRules())

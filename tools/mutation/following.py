@@ -160,6 +160,22 @@ _MOTION = (
 
 _GATING = (
     Mutant(
+        "tracking-windows-for-ever",
+        "tracking/scene.py",
+        "in_turn = frame % self.scene.rules.thorough == 0",
+        "in_turn = False",
+        "what enters the view elsewhere is never seen",
+        ("test_runner_windows.py",),
+    ),
+    Mutant(
+        "tracking-windows-are-sure",
+        "tracking/scene.py",
+        "            if self._are_sure(after):",
+        "            if after:",
+        "a body that left its window is lost, or in doubt for nothing",
+        ("test_runner_windows.py",),
+    ),
+    Mutant(
         "tracking-windows-of-an-exact-prediction",
         "tracking/scene.py",
         "margins = self.reach * np.sqrt(by_pose)",
@@ -198,30 +214,6 @@ _GATING = (
         "lower = np.where(True, at.y - margins, np.inf)",
         "windows reach to features that no camera sees",
         (_WINDOWS,),
-    ),
-    Mutant(
-        "tracking-fewer-detections-go-unnoticed",
-        "tracking/scene.py",
-        "is not None and len(points) < before[view.name][0]",
-        "is not None and len(points) < 0",
-        "a window that cuts features off is not noticed",
-        (_WINDOWS,),
-    ),
-    Mutant(
-        "tracking-as-good-whatever-is-missed",
-        "tracking/scene.py",
-        "in_view - met <= before[name][1] - before[name][0]",
-        "in_view - met <= 1000",
-        "a window that cuts features off is not noticed",
-        (_WINDOWS,),
-    ),
-    Mutant(
-        "tracking-worse-than-before-convinces",
-        "tracking/scene.py",
-        "are_as_good(now.tallies, then.tallies)",
-        "True",
-        "features that left the window are not looked for",
-        ("test_runner_windows.py",),
     ),
 )
 

@@ -255,7 +255,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-pass",
         "tracking/doubt.py",
-        "            odds = max(there_as) - own",
+        "            odds = max([_evidence(there, one) for one in starts]) - own",
         "            odds = -math.inf",
         "the body in a window is taken for the body",
         ("test_tracking_reflection.py",),
@@ -263,7 +263,7 @@ _REFLECTION = (
     Mutant(
         "tracking-mirror-images-are-suspected-everywhere",
         "tracking/doubt.py",
-        "            odds = max(there_as) - own",
+        "            odds = max([_evidence(there, one) for one in starts]) - own",
         "            odds = 9.0",
         "a flat body with a hidden marker is never sure",
         ("test_tracking_reflection.py",),

@@ -12,9 +12,6 @@ from mixpose.tracking.scene import (
     Expectation as Expectation,
     Scene as Scene,
     WindowedScene as WindowedScene,
-    are_as_good as are_as_good,
-    have_fewer as have_fewer,
-    is_convincing as is_convincing,
 )
 from mixpose.tracking.track import (
     Branch as Branch,

@@ -177,9 +177,9 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
         # no rival meets less than a quarter of what the body meets; values grow as the square
         theirs, value = (one.finest.value(T[None])[0] for one in (there, data))
         if asked or theirs > value / 16:
-            # as it stands, and fitted, which may end at clutter
-            there_as = [_evidence(there, Start(T, near)) for near in (None, data.close)]
-            odds = max(there_as) - own
+            # fitted, which may end at clutter, and where it is asked for as it stands
+            starts = [Start(T, data.close), *([Start(T)] if asked else [])]
+            odds = max([_evidence(there, one) for one in starts]) - own
             if asked or odds > likely:
                 return odds
     if not _is_by_chance(data, judged):

@@ -86,4 +86,6 @@ class SceneRules:
     gate: float = constant(6.0, "σ_ε around expected features: met within 2.2, the rest is motion")
     touching: float = constant(3.0, "σ_ε between images that run together: twice a spot's width")
     pulled: float = constant(0.1, "offset² in σ_ε² of a spot of two bodies: 2.5 times a blob's")
-    thorough: int = constant(10, "frames, of which one searches thoroughly for what is away: 1/3 s")
+    thorough: int = constant(
+        10, "frames, of which one is seen whole, and searched for what is away: 1/3 s"
+    )

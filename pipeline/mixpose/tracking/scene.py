@@ -7,13 +7,13 @@ in that frame, with each other's pose among their hypotheses; afterwards they go
 Bodies that nothing was known of before get the poses that are left in the order of the world's
 x coordinate (then y, then z) of their origins.
 
-Images are looked at where tracks expect the bodies: what is met there convinces, or all is seen.
+Images are looked at where tracks expect the bodies: a frame is sure of them there, or all is seen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement import AcceptanceRules, Alternative, Verdict
+from mixpose.judgement import Alternative, Verdict
 from mixpose.objective import View, project_body
 from mixpose.records import Estimate, Floats, Mask
 from mixpose.sensors import Sensor
@@ -38,7 +38,6 @@ from mixpose.tracking.tracker import Tracker, followed
 from mixpose.tracking.twin import is_flat
 
 Box: TypeAlias = tuple[int, int, int, int]
-Tallies: TypeAlias = Mapping[str, tuple[int, int]]  # of features met, and in view
 
 
 @dataclass(frozen=True)
@@ -171,35 +170,9 @@ class Expectation:
         }
 
 
-def is_convincing(tallies: Tallies, cameras: Iterable[str], rules: AcceptanceRules) -> bool:
-    """Whether cameras met so much of the body that the next frame need not be seen whole."""
-    some = [tallies[name] for name in cameras if name in tallies]
-    agreeing = [(met, in_view) for met, in_view in some if met >= rules.agreeing * in_view > 0]
-    met, in_view = np.sum(agreeing if len(agreeing) > 1 else [*some, (0, 0)], axis=0)
-    return bool(met > rules.convincing * in_view)
-
-
-def are_as_good(tallies: Tallies, before: Tallies) -> bool:
-    """Whether no sensor misses more of the body than in the frame before."""
-    return all(
-        in_view - met <= before[name][1] - before[name][0]
-        for name, (met, in_view) in tallies.items()
-        if name in before
-    )
-
-
-def have_fewer(views: Sequence[View], before: Tallies) -> bool:
-    """Whether a camera has fewer detections than it met features in the frame before."""
-    return any(
-        (points := view.observation.points) is not None and len(points) < before[view.name][0]
-        for view in views
-        if view.name in before
-    )
-
-
 @dataclass(frozen=True)
 class WindowedScene:
-    """A scene that looks where its bodies are expected, and at all there is if that is too little.
+    """A scene that looks where its bodies are expected, and at all there is where it is not sure.
 
     Its cameras are those whose features in a part of the image are those of the whole image.
     """
@@ -215,29 +188,27 @@ class WindowedScene:
         observe: Callable[[Mapping[str, Box]], list[View]],
         images: Collection[str],
     ) -> tuple[tuple[Track, ...], list[Estimate], list[View]]:
-        """As `Scene.advance`: around the predictions if that convinces, else of all there is.
+        """As `Scene.advance`: around the predictions if that is sure, else of all there is.
 
         `observe` makes views of boxes by camera, of `images` only; without a box they are whole.
         """
-        boxes = self._windows(tracks, frame, time_s) if images and self._are_met(tracks) else {}
+        in_turn = frame % self.scene.rules.thorough == 0  # for what enters the view
+        boxes = {}
+        if images and not in_turn and self._are_sure(tracks):
+            boxes = self._windows(tracks, frame, time_s)
         if windows := {name: box for name, box in boxes.items() if name in images}:
             views = observe(windows)
-            if not any(have_fewer(views, track.tallies) for track in tracks):
-                after, estimates = self.scene.advance(tracks, frame, time_s, views)
-                pairs = zip(after, tracks, strict=True)
-                if self._are_met(after) and all(
-                    are_as_good(now.tallies, then.tallies) for now, then in pairs
-                ):
-                    return after, estimates, views
+            after, estimates = self.scene.advance(tracks, frame, time_s, views)
+            if self._are_sure(after):
+                return after, estimates, views
         views = observe({})
         return *self.scene.advance(tracks, frame, time_s, views), views
 
-    def _are_met(self, tracks: Sequence[Track]) -> bool:
-        """Whether the last frame was sure of all bodies, and met most of each."""
+    def _are_sure(self, tracks: Sequence[Track]) -> bool:
+        """Whether the last frame was sure of all bodies, and of none in a mirror."""
         return all(
             not (track.misses or track.doubted)
             and (track.believed >= tracked.rules.proposals.whole or not is_flat(tracked))
-            and is_convincing(track.tallies, self.cameras, tracked.rules.acceptance)
             for tracked, track in zip(self.scene.bodies, tracks, strict=True)
         )
 
