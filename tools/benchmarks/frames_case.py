@@ -34,7 +34,7 @@ from mixpose.records import Estimate, RawFrame
 from mixpose.session import Session, load_session
 from mixpose.simulation import SimulationOptions
 
-FRAMES = 20
+FRAMES, OF_REAL = 20, 600  # frames at most, of scenes that are made and of recordings
 RESOLUTION, FOCAL = (1280, 1024), 900.0
 MOTION = SimulationOptions(frames=FRAMES, amplitude_translation=30.0)
 HAND = SimulationOptions(
@@ -145,14 +145,15 @@ REAL: Mapping[str, tuple[Scene, float | None]] = {
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    print(f"frames: processor ms of a frame beside decoding, at most {FRAMES} frames")
+    print(f"frames: processor ms of a frame beside decoding, at most {FRAMES} or {OF_REAL} frames")
     scenes = {**SCENES, **(REAL if os.environ.get("MIXPOSE_RECORDINGS") else {})}
     figures: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         for name, (scene, aim) in scenes.items():
             if not options.rows or any(text in name for text in options.rows):
                 print(f" {name}")
-                figures[name] = told(measured(scene(Path(folder))), aim)
+                frames = FRAMES if name in SCENES else OF_REAL
+                figures[name] = told(measured(scene(Path(folder)), frames), aim)
     return figures
 
 
@@ -165,7 +166,7 @@ def told(figures: dict[str, Any], aim: float | None) -> dict[str, Any]:
     return figures
 
 
-def measured(session: Session, frames: int = FRAMES) -> dict[str, Any]:
+def measured(session: Session, frames: int) -> dict[str, Any]:
     """Milliseconds of the first frame and of those after it, by stage, and calls."""
     opened: dict[str, Source] = {
         name: Held(source, tuple(islice(source.frames(), frames)))
