@@ -27,7 +27,7 @@ def widened(found: Matches, errors: ErrorRules = ErrorRules()) -> tuple[Floats, 
     C, r = np.linalg.inv(J.T @ J).astype(np.float64), found.offsets.ravel() / NOISE
     variances = np.full(found.shares.shape, NOISE**2)
     known = np.full(6, 10.0)
-    return (C, *with_cut_spots(found, J, r, C, known, variances, errors, 0.001))
+    return (C, *with_cut_spots(found, J, r, J.T @ J, known, variances, errors, 0.001))
 
 
 def met(features: int, rng: np.random.Generator, errors: Floats) -> tuple[Matches, Floats]:

@@ -30,7 +30,10 @@ from mixpose.judgement.judge import (
 )
 from mixpose.judgement.expected import (
     expected_covariance as expected_covariance,
+)
+from mixpose.judgement.information import (
     invert_information as invert_information,
+    inverted as inverted,
 )
 from mixpose.judgement.mistakes import (
     APART as APART,
@@ -40,5 +43,4 @@ from mixpose.judgement.mistakes import (
 from mixpose.judgement.noise import (
     NoiseModel as NoiseModel,
     RememberedNoise as RememberedNoise,
-    inverted as inverted,
 )

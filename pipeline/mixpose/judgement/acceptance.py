@@ -13,8 +13,9 @@ from scipy.special import chdtri, expit, logit
 
 from mixpose.body import Body
 from mixpose.constants import constant
+from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.judge import ScoredPose
-from mixpose.judgement.noise import NoiseModel, information_of, inverted
+from mixpose.judgement.noise import NoiseModel
 from mixpose.matching import LEAST_VARIANCE, Matches
 from mixpose.records import Floats, Mask, Status
 from mixpose.rigid import twist_between

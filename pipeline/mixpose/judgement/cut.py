@@ -19,6 +19,7 @@ import math
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
+from mixpose.judgement.information import inverted
 from mixpose.matching import ErrorRules, Matches
 from mixpose.records import Floats
 
@@ -29,7 +30,7 @@ def with_cut_spots(
     found: Matches,
     J: Floats,  # (R, k) of the residuals, both in units of what detections err by
     r: Floats,  # (R,)
-    C: Floats,  # (k, k) of the pose as these tell it
+    information: Floats,  # (k, k) of the pose as these tell it
     known: Floats,  # (k,) deviations of it before
     variances: Floats,  # (L, N) of detections, σ_ε²
     errors: ErrorRules,
@@ -37,11 +38,11 @@ def with_cut_spots(
 ) -> tuple[Floats, float]:
     """What a covariance (k, k) is larger by as one detection may be cut, and a factor for both."""
     is_spot = (found.detections >= 0) & (found.dimensions == 2)[:, None]
-    met, k = (is_spot & (found.shares > 0)).nonzero(), len(C)
+    met, k = (is_spot & (found.shares > 0)).nonzero(), len(known)
     if not (len(met[0]) and k and any(errors.chances)):
-        return np.zeros(C.shape), 1.0
+        return np.zeros(information.shape), 1.0
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
-    C = np.linalg.pinv(np.linalg.pinv(C, hermitian=True) + np.diag(1 / known**2), hermitian=True)
+    C = inverted(information + np.diag(1 / known**2))
     G = J @ C
     values, axes = np.linalg.eigh(G @ J.swapaxes(1, 2))
     M, axes = 1 / np.maximum(1 - values, 1e-9), axes.swapaxes(1, 2)
@@ -79,7 +80,7 @@ def _larger(
     outside: float,
 ) -> float:
     """The factor by which an ellipsoid (k, k) has all but some truths inside."""
-    B = np.linalg.pinv(C + spread, hermitian=True)
+    B = inverted(C + spread)
     BC = B @ C
     H, K = G @ B @ G.swapaxes(1, 2), G @ BC @ B @ G.swapaxes(1, 2)
     own, beside = (one.diagonal(axis1=1, axis2=2) for one in (H, K))

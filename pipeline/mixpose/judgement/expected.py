@@ -7,22 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from mixpose.body import Body
-from mixpose.judgement.noise import inverted
+from mixpose.judgement.information import invert_information
 from mixpose.objective import project_body
 from mixpose.records import Floats, Mask
 from mixpose.sensors import Sensor, as_images
-
-
-def invert_information(information: Floats, free: Mask) -> Floats:
-    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
-    inner, covariance = np.ix_(free, free), np.zeros((6, 6))
-    covariance[inner] = inverted(information[inner])
-    # so much larger than if all other directions were known
-    inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
-    unknown = inflation > 1e9
-    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
-    covariance[unknown, unknown] = np.inf
-    return covariance
 
 
 def expected_covariance(

@@ -25,7 +25,8 @@ from scipy.special import gammaln
 
 from mixpose.body import Body
 from mixpose.constants import constant
-from mixpose.judgement.noise import NoiseModel, RememberedNoise, information_of, inverted, noise_of
+from mixpose.judgement.information import information_of, inverted
+from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
 from mixpose.records import Floats, Indices, Mask, SensorReport

@@ -29,6 +29,7 @@ from scipy.special import chdtri
 
 from mixpose.constants import constant
 from mixpose.judgement.cut import with_cut_spots
+from mixpose.judgement.information import inverted
 from mixpose.matching import (
     ErrorRules,
     Matches,
@@ -131,7 +132,7 @@ def noise_of(
     r, rows = roots * found.offsets.ravel(), roots[:, None] * found.J.reshape(-1, 6)
     J, fields = rows[:, chosen], fields_of_sensors(found, shares, met)
     markers, kinds = _by_marker(found, rows[:, :3]), kinds_of(*shares.shape)
-    inverse, q = inverted(J.T @ J), fields.shape[1]
+    inverse, q = inverted(information := J.T @ J), fields.shape[1]
     by_markers = of_each(J, found).swapaxes(1, 2) @ markers  # (N, k, 3)
     taken = np.concatenate([J.T @ fields, by_markers.swapaxes(0, 1).reshape(count, -1)], axis=1)
     # by how much fields move the pose, and what it leaves of those of sensors, which may last
@@ -159,7 +160,7 @@ def noise_of(
     # fields last: a further frame shows no more of them
     by_kind *= model.enlargement(np.array([degrees, *of_fields]))
     covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
-    given = found, J, r, inverse, known[chosen], wide, model.errors, 1 - model.by_chance
+    given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
     spread, larger = with_cut_spots(*given)
     covariance[inner] = larger * (covariance[inner] + spread)
     if found.by_calibration is not None:
@@ -347,41 +348,3 @@ def _variances(
     once = own[0, 1:4] + [fields * met, fields * met, fields * own[0, 3] + least]
     squared = own.diagonal()[1:] + believed[1:]
     return variances, once**2 / np.maximum(squared, least)
-
-
-def inverted(information: Floats) -> Floats:
-    """The inverse of an information matrix (k, k).
-
-    Directions that the data leave open get the variance that their information says: large, and
-    at most what float64 can invert.
-    """
-    if not information.size:
-        return information
-    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-18))
-    both = scale[:, None] * scale
-    factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
-    if failure or min(factor.diagonal().tolist()) < 1e-5:
-        values, vectors = np.linalg.eigh(information * both)
-        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
-        halves = vectors / np.sqrt(np.maximum(values, 1e-14))
-        inverse = halves @ halves.T
-    return np.asarray(inverse * both)
-
-
-def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
-    """Σ_l Σ_i J_iᵀ J_i / s_l² (..., 6, 6) over the met features, for noise (..., L) in σ_ε².
-
-    What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
-    """
-    *poses, sensors, n, m, _ = found.J.shape
-    by_feature, weights = (
-        (*poses, n, sensors * m, 6),
-        found.shares * found.each_part[:, None] / (variances[..., None] + found.extra),
-    )
-    rows = found.J, weights[..., None, None] * found.J
-    J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]
-    information = scaled.swapaxes(-2, -1) @ J
-    if spreads is not None:
-        taken = spreads @ np.linalg.inv(np.eye(3) + information[..., :3, :3] @ spreads)
-        information = information - information[..., :3] @ taken @ information[..., :3, :]
-    return np.asarray(information.sum(axis=-3))

@@ -1,0 +1,59 @@
+"""What met features tell of a pose, and the covariance that is its inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from mixpose.matching import Matches
+from mixpose.records import Floats, Mask
+
+
+def inverted(information: Floats) -> Floats:
+    """The inverse of an information matrix (k, k).
+
+    Directions that the data leave open get the variance that their information says: large, and
+    at most what float64 can invert.
+    """
+    if not information.size:
+        return information
+    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-18))
+    both = scale[:, None] * scale
+    factor, inverse, failure = dposv(information * both, np.eye(len(scale)))
+    if failure or min(factor.diagonal().tolist()) < 1e-5:
+        values, vectors = np.linalg.eigh(information * both)
+        # of a matrix of diagonal 1, float64 tells no smaller eigenvalue from none
+        halves = vectors / np.sqrt(np.maximum(values, 1e-14))
+        inverse = halves @ halves.T
+    return np.asarray(inverse * both)
+
+
+def information_of(found: Matches, variances: Floats, spreads: Floats | None = None) -> Floats:
+    """Σ_l Σ_i J_iᵀ J_i / s_l² (..., 6, 6) over the met features, for noise (..., L) in σ_ε².
+
+    What features tell that are off by `spreads` (..., N, 3, 3) in the world is less.
+    """
+    *poses, sensors, n, m, _ = found.J.shape
+    by_feature, weights = (
+        (*poses, n, sensors * m, 6),
+        found.shares * found.each_part[:, None] / (variances[..., None] + found.extra),
+    )
+    rows = found.J, weights[..., None, None] * found.J
+    J, scaled = [one.swapaxes(-4, -3).reshape(by_feature) for one in rows]
+    information = scaled.swapaxes(-2, -1) @ J
+    if spreads is not None:
+        taken = spreads @ np.linalg.inv(np.eye(3) + information[..., :3, :3] @ spreads)
+        information = information - information[..., :3] @ taken @ information[..., :3, :]
+    return np.asarray(information.sum(axis=-3))
+
+
+def invert_information(information: Floats, free: Mask) -> Floats:
+    """Covariance (6, 6) of the free directions; a direction without information is infinite."""
+    inner, covariance = np.ix_(free, free), np.zeros((6, 6))
+    covariance[inner] = inverted(information[inner])
+    # so much larger than if all other directions were known
+    inflation = covariance.diagonal() * np.maximum(information.diagonal(), 1e-18)
+    unknown = inflation > 1e9
+    covariance[unknown], covariance[:, unknown] = 0.0, 0.0
+    covariance[unknown, unknown] = np.inf
+    return covariance
