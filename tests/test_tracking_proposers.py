@@ -19,6 +19,7 @@ from mixpose.records import Estimate
 from mixpose.rigid import (
     from_parts,
     from_rotation_vector,
+    inverse,
     perturb,
     rotation_angle_deg,
     transform,
@@ -236,6 +237,36 @@ def test_a_detection_taken_for_one_of_two_features_may_be_both_of_them() -> None
     rivals = [start.T_world_object for start in merged_pair(data, likelihood, judged)]
     assert min(float(rotation_angle_deg(rival, T)) for rival in rivals) < 0.02
     assert rotation_angle_deg(bent, T) > 0.1
+
+
+def test_two_detections_of_one_image_may_both_be_of_two_features() -> None:
+    camera, T, _ = two_in_one()
+    # one more before the fifth, 1 px aside
+    behind = transform(T, SIX)[4:5]
+    before = transform(inverse(T), 0.8 * (behind + np.array([-1.0 / 700 * behind[0, 2], 0.0, 0.0])))
+    points = np.concatenate([SIX, before])
+    body = Body("wand", tuple(PointFeature(point) for point in points))
+    y = camera.project(transform(T, points))[0]
+    for pair in ([1, 2], [4, 6]):
+        y[pair] = y[pair].mean(axis=0)
+    weights = np.array([1.0, 10.0, 0.0, 1.0, 10.0, 1.0, 0.0])[:, None]
+
+    def away(twist: Floats) -> Floats:
+        there = camera.project(transform(perturb(T, twist), points))[0]
+        return np.asarray((weights * (there - y)).ravel())
+
+    bent = perturb(T, least_squares(away, np.zeros(6), x_scale=np.repeat([100.0, 1.0], 3)).x)
+    views = [view_of("camera", camera, y[[0, 1, 3, 4, 5]])]
+    tracker = Tracker.create(body, EstimatorOptions(), bent)
+    data = tracker.data(tracker.begin(), 1, None, views)
+    likelihood, here = likelihood_of(data), Start(bent)
+    judged = likelihood.judge(likelihood.fit(here), here)
+    assert judged.matches.missed.tolist() == [2.0]
+    rivals = [start.T_world_object for start in merged_pair(data, likelihood, judged)]
+    off = [float(rotation_angle_deg(rival, T)) for rival in rivals]
+    # the nearest pair alone, and both
+    assert len(off) == 2
+    assert off[1] < 0.02 < off[0]
 
 
 def test_two_features_seen_as_one_are_put_where_their_middle_is() -> None:

@@ -76,19 +76,20 @@ def test_a_false_point_beside_a_plane_is_no_mirror_image(
     assert tracker.advance(tracker.begin(), 0, None, views)[1].status == "ok"
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("false", [0, 1])
+@pytest.mark.parametrize("seed", [0, 1, 101])
 @pytest.mark.parametrize("seen_by", [1, 2])
 def test_a_body_given_mirrored_is_never_ok(
-    pinhole_cameras: list[PinholeCamera], seed: int, seen_by: int
+    pinhole_cameras: list[PinholeCamera], seed: int, seen_by: int, false: int
 ) -> None:
     points = np.random.default_rng(seed).uniform(-80, 80, (6, 3))
     given = Body("given", tuple(PointFeature(point) for point in points * [1, 1, -1]))
     shown = Body("shown", tuple(PointFeature(point) for point in points))
     tracker = Tracker.create(given, EstimatorOptions())
     track = tracker.begin()
-    for frame in range(3):
+    for frame in range(5):
         T = perturb(TRUTH, np.array([frame, 0, 0, 0, 0.02 * frame, 0]))
-        views = detect(pinhole_cameras[:seen_by], shown, T, noise=0.2, seed=frame)
+        views = detect(pinhole_cameras[:seen_by], shown, T, noise=0.2, false=false, seed=frame)
         track, estimate = tracker.advance(track, frame, None, views)
         assert estimate.status != "ok"
 

@@ -162,7 +162,7 @@ _GATING = (
     Mutant(
         "tracking-windows-for-ever",
         "tracking/scene.py",
-        "in_turn = frame % self.scene.rules.thorough == 0",
+        "in_turn = any(one.frame is None or frame // every > one.frame // every for one in tracks)",
         "in_turn = False",
         "what enters the view elsewhere is never seen",
         ("test_runner_windows.py",),
@@ -170,8 +170,8 @@ _GATING = (
     Mutant(
         "tracking-windows-are-sure",
         "tracking/scene.py",
-        "            if self._are_sure(after):",
-        "            if after:",
+        "            if self._are_sure(after) and all(",
+        "            if after or all(",
         "a body that left its window is lost, or in doubt for nothing",
         ("test_runner_windows.py",),
     ),

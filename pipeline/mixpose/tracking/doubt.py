@@ -66,7 +66,7 @@ def decided(data: Frame, ranked: Sequence[ScoredPose]) -> Verdict:
     before = {name: odds for name, odds in data.track.mistaken.items() if name != MIRRORED}
     given = rules.judgement.noise, sensors, before
     mistakes = [*possible_mistakes(best, data.body, data.free, *given), of_reflection(data, best)]
-    # however often it was seen, frames that tell otherwise are as rare as mistakes
+    # one frame in as many as there are sessions with a mistake may be of another kind
     most = -2 * math.log(rules.acceptance.mistaken)
     mistaken = {one.name: min(one.log_odds, most) for one in mistakes if one.log_odds > 0}
     against = _alternatives(data, best, mistakes)
@@ -99,30 +99,39 @@ def _alternatives(
 def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
     """Log odds of clutter where no frame was ok before: what looks like the body goes on to do so.
 
-    Each feature tells once that it is none, as well as any frame shows it.
+    What a frame tells by itself counts, and features that it misses, where frames before met them.
     """
     track = data.track
     if track.believed or track.frame is None:
         return -math.inf
-    before = 0.0 if track.shown is None else track.shown
-    more = float(np.maximum(before - _shown(data, best), 0.0).sum())
-    gained = max(_gained(data, best) - more, 0.0)
+    told = _evidence(_alone(data), Start(best.T_world_object, left_out=best.left_out))
+    if track.shown is not None:
+        told += float(track.shown[best.used.met_by == 0].sum())
+    more = best.log_evidence - told
     # beyond that of clutter, which counts already
-    return gained + math.log(-math.expm1(-gained)) - best.log_evidence if gained else -math.inf
+    return math.log(-math.expm1(-more)) - told if more > 0 else -math.inf
 
 
 def shown_after(data: Frame, best: ScoredPose) -> Floats | None:
     """`Track.shown` after a frame; of a pose that nobody expected, by this frame alone."""
     if data.track.believed:
         return None
-    own, before = _shown(data, best), data.track.shown
-    return own if before is None or not _gained(data, best) else np.maximum(own, before)
+    used, detection = best.used, data.rules.judgement.detection
+    gained = gained_by(used, np.sqrt(best.variances[:, None] + used.extra), detection)
+    # what a covered sensor meets, it meets by chance
+    gained[gained.sum(axis=1) + used.missed * detection.log_missed < detection.log_blind] = 0.0
+    before = data.track.shown
+    if before is None or not _gained(data, best):
+        before = np.zeros(gained.shape[1])
+    # each time that a sensor misses a feature, it is less likely to have been met
+    lost = np.maximum(before + used.weights.max(axis=0) * detection.log_missed, 0.0)
+    return np.asarray(np.where(used.met_by > 0, gained.max(axis=0), lost))
 
 
-def _shown(data: Frame, best: ScoredPose) -> Floats:
-    """What each feature (N,) gains in the sensor that shows it best, in nats."""
-    roots = np.sqrt(best.variances[:, None] + best.used.extra)
-    return np.asarray(gained_by(best.used, roots, data.rules.judgement.detection).max(axis=0))
+def _alone(data: Frame) -> Frame:
+    """The frame, of which nothing is known from those before it but the noise."""
+    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
+    return data.seen_otherwise(predictions=(), beside=None, searches=[], track=track, options=live)
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
@@ -167,7 +176,7 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
     can_be = data.body.is_exact and thickness(data.body) >= 1e-6
     if "mirrored" not in rules.look_alikes.kinds or not can_be:
         return -math.inf
-    accepted, met = rules.acceptance, seen.met_by
+    accepted, met, near = rules.acceptance, seen.met_by, -math.inf
     own, likely = judged.log_evidence, accepted.log_doubt - math.log(accepted.mistaken)
     # of these the mirror image may meet more than the body
     if asked or sum(np.minimum(seen.missed, seen.unmatched_nearby).tolist()) > 0.5:
@@ -179,18 +188,17 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
         if asked or theirs > value / 16:
             # fitted, which may end at clutter, and where it is asked for as it stands
             starts = [Start(T, data.close), *([Start(T)] if asked else [])]
-            odds = max([_evidence(there, one) for one in starts]) - own
-            if asked or odds > likely:
-                return odds
+            near = max([_evidence(there, one) for one in starts]) - own
+            if near > likely:
+                return near
     if not _is_by_chance(data, judged):
-        return -math.inf
+        return near if asked else -math.inf
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
-    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
-    alone = data.seen_otherwise(predictions=(), beside=None, searches=[], track=track, options=live)
+    alone = _alone(data)
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
     found = (_evidence(mirror, start) - own for start in starts_at(mirror, rivals))
-    return next((odds for odds in found if odds > likely), -math.inf)
+    return next((odds for odds in found if odds > likely), near if asked else -math.inf)
 
 
 def look_alikes_of(data: Frame, best: ScoredPose, others: Iterable[Frame]) -> Iterator[Alternative]:

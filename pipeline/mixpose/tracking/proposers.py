@@ -58,7 +58,7 @@ def is_doubtful(frame: Frame, ranked: list[ScoredPose]) -> bool:
     if not ranked or not is_sure(ranked[0], frame.free, rules.acceptance):
         return True
     is_new = track.believed < rules.proposals.believed or len(track.branches) != 1
-    before = sum(met for met, _ in track.tallies.values())
+    before = sum(track.met_before.values())
     misses_more = np.count_nonzero(ranked[0].used.shares) <= rules.acceptance.convincing * before
     return bool(is_new or track.misses or track.doubted or misses_more)
 
@@ -238,25 +238,34 @@ def disagreeing(seen: Matches, rules: AcceptanceRules, model: NoiseModel) -> lis
 
 
 def merged_pair(frame: Frame, likelihood: Likelihood, judged: ScoredPose) -> Iterable[Start]:
-    """Least squares with the middle of two features that run into each other in one detection."""
-    rules = frame.rules.judgement.association
-    at, seen = judged, _paired(judged.matches, rules.reach_squared, rules.middle)
-    for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
-        if not np.count_nonzero(seen.merged):
-            break
-        blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
-        J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
-        rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
-        start = Start(perturb(at.T_world_object, least_squares(rest, free=frame.free).states[0]))
-        at = likelihood.judge(likelihood.fit(start), start)
-        seen = at.matches
-    return [] if at is judged else [Start(at.T_world_object)]
+    """Least squares with the middles of features that run into each other in one detection.
+
+    Of the nearest pair in each sensor, and of all that may be.
+    """
+    rules, before = frame.rules.judgement.association, 0
+    for most in (1, len(frame.body)):
+        at, seen = judged, _paired(judged.matches, rules.reach_squared, rules.middle, most)
+        if (pairs := int(seen.merged.sum())) == before:
+            return
+        before = pairs
+        for _ in range(2):  # the second step starts within 0.01 σ_ε of the first's end
+            if not np.count_nonzero(seen.merged):
+                break
+            blurs = frame.rules.judgement.noise.errors.blur * np.sqrt(frame.variances)
+            J, offsets = replace(seen, shares=seen.shares * welsch(seen.squared, blurs)).rows()
+            rest = LinearResiduals(J.reshape(-1, 6), offsets.ravel())
+            moved = least_squares(rest, free=frame.free).states[0]
+            start = Start(perturb(at.T_world_object, moved))
+            at = likelihood.judge(likelihood.fit(start), start)
+            seen = at.matches
+        if at is not judged:
+            yield Start(at.T_world_object)
 
 
-def _paired(seen: Matches, reach: float, middle: float) -> Matches:
-    """In each sensor the features missed near detections of single ones, as one with these.
+def _paired(seen: Matches, reach: float, middle: float, most: int) -> Matches:
+    """In each sensor features missed near detections of single ones, as one with these.
 
-    `reach` is how far that may be, squared, in variances of C.
+    The nearest first, so many at most; `reach` is how far that may be, squared, in variances of C.
     """
     if not np.count_nonzero(seen.missed):
         return seen
@@ -268,7 +277,9 @@ def _paired(seen: Matches, reach: float, middle: float) -> Matches:
         lost = np.flatnonzero((seen.weights[k] > 0) & (shares[k] == 0))
         away = (seen.places[k, met] - seen.places[k, lost, None]) / seen.sigmas[k] + offsets[k, met]
         squared = (away * away).sum(axis=2) / 2
-        while squared.min(initial=np.inf) <= reach:
+        for _ in range(most):
+            if squared.min(initial=np.inf) > reach:
+                break
             i, j = np.unravel_index(int(squared.argmin()), squared.shape)
             pair = [lost[i], met[j]]
             shares[k, pair] = shares[k, met[j]] / 2

@@ -192,20 +192,21 @@ class WindowedScene:
 
         `observe` makes views of boxes by camera, of `images` only; without a box they are whole.
         """
-        in_turn = frame % self.scene.rules.thorough == 0  # for what enters the view
-        boxes = {}
+        every, boxes = self.scene.rules.thorough, {}
+        # for what enters the view
+        in_turn = any(one.frame is None or frame // every > one.frame // every for one in tracks)
         if images and not in_turn and self._are_sure(tracks):
             boxes = self._windows(tracks, frame, time_s)
         if windows := {name: box for name, box in boxes.items() if name in images}:
             views = observe(windows)
             after, estimates = self.scene.advance(tracks, frame, time_s, views)
-            if self._are_sure(after):
+            if self._are_sure(after) and all(one.status == "ok" for one in estimates):
                 return after, estimates, views
         views = observe({})
         return *self.scene.advance(tracks, frame, time_s, views), views
 
     def _are_sure(self, tracks: Sequence[Track]) -> bool:
-        """Whether the last frame was sure of all bodies, and of none in a mirror."""
+        """Whether the last frame was sure of all bodies, and a flat one is no mirror image."""
         return all(
             not (track.misses or track.doubted)
             and (track.believed >= tracked.rules.proposals.whole or not is_flat(tracked))

@@ -129,14 +129,15 @@ class Track:
     residuals: RememberedNoise = RememberedNoise()  # so far
     sizes: Sizes = Sizes()  # of markers, as spots show them
     walk: RandomWalk | None = None  # None before two uncertain poses
-    # features of the last pose that each sensor met, and that it should have
-    tallies: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    met_before: Mapping[str, int] = field(
+        default_factory=dict
+    )  # features of the last pose, by sensor
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
     delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
     doubted: bool = False  # whether another body may have what the last pose meets
     agreed: bool = False  # whether two sensors met most of the body in some frame
     believed: int = 0  # frames whose pose was ok
-    # (N,) nats that each feature gained at most, in frames one after the other, none of them ok
+    # (N,) nats that each feature gained when it was met last, in frames of which none was ok
     shown: Floats | None = None
     known: bool = False  # whether it was told from things that have three markers alike
     # detections that sensors had left where a second pose was sought in vain

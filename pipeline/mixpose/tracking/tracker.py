@@ -255,9 +255,8 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         spread = one.spread if data.options.fuse else None
         found.append(Branch(one.T_world_object, belief, spread=spread, deviation=momentary))
     used = best.used
-    counts, least = (used.shares > 0, used.weights > 0), data.rules.acceptance.agreeing
-    tallies = list(zip(*[one.sum(axis=1).tolist() for one in counts], strict=True))
-    agreeing = sum(met >= least * max(in_view, 1) for met, in_view in tallies) > 1
+    met, in_view = ((one > 0).sum(axis=1) for one in (used.shares, used.weights))
+    agreeing = np.count_nonzero(met >= data.rules.acceptance.agreeing * np.maximum(in_view, 1)) > 1
     # sensors whose delays are not known contradict each other until they are
     late = verdict.doubt == APART and any(view.unsure is not None for view in data.views)
     sizes = track.sizes
@@ -268,7 +267,7 @@ def followed(data: Frame, verdict: Verdict) -> Track:
         found,
         residuals=best.noise if is_ok else track.residuals,
         sizes=sizes,
-        tallies=dict(zip(used.names, tallies)),
+        met_before=dict(zip(used.names, met.tolist(), strict=True)),
         delays=delays_after(data, best) if is_ok or late else track.delays,
         agreed=track.agreed or agreeing,
         known=is_ok

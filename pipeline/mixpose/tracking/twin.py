@@ -80,8 +80,10 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     # as much as would convince, by as many sensors
     if np.minimum(rest, used.met).sum() < rules.acceptance.convincing * used.met.sum():
         return False
-    is_more = any(count > data.track.tried.get(name, 0) for name, count in left.items())
-    return is_more or data.track.doubted or data.frame % rules.proposals.static == 0
+    track, every = data.track, rules.proposals.static
+    is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
+    in_turn = track.frame is None or data.frame // every > track.frame // every
+    return is_more or track.doubted or in_turn
 
 
 def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
