@@ -11,7 +11,15 @@ import pytest
 from mixpose.cli.findings import Findings
 from mixpose.density import Observation
 from mixpose.objective import View
-from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, Status
+from mixpose.records import (
+    Estimate,
+    FrameSet,
+    Offsets,
+    PointPattern,
+    RawFrame,
+    SensorReport,
+    Status,
+)
 from mixpose.runner import observation_of
 from mixpose.session import load_session
 from mixpose.tracking import TWICE
@@ -28,7 +36,7 @@ def test_poses_before_the_body_is_seen_twice_may_be_of_its_mirror_image(before: 
         doubt = "" if frame < before else TWICE
         pose, label = np.eye(4), session.labels[0]
         findings.add(Estimate(frame, None, label, status, pose, np.eye(6), 1.0, {}, doubt=doubt))
-    (line,) = findings.warnings()
+    (line,) = findings.causes()
     assert line.startswith(f"{TWICE} in {20 - before} of 20 frames")
     assert line.endswith("is there a mirror?") == (before > 0)
 
@@ -53,7 +61,7 @@ def test_features_by_the_hundred_are_told_where_frames_are_not_ok(
         findings.watch(FrameSet(frame, None, pictures), views, estimate)
         if status == "lost":
             findings.add(estimate)
-    warnings = findings.warnings()
+    warnings = findings.of_sensors()
     assert len(warnings) == warned
     for line in warnings:
         assert line.startswith("sensor 'right' found up to 700 features, where 7 are expected, in")
@@ -76,6 +84,27 @@ def test_a_flooded_image_is_told_as_such_though_nothing_of_it_is_used() -> None:
         view = View(setup.name, setup.sensor, observation)
         findings.watch(FrameSet(frame, None, {setup.name: raw}), [view], estimate)
         findings.add(estimate)
-    flooded = [line for line in findings.warnings() if line.startswith(f"sensor {setup.name!r}")]
+    flooded = [
+        line
+        for line in [*findings.of_sensors(), *findings.causes()]
+        if line.startswith(f"sensor {setup.name!r}")
+    ]
     assert len(flooded) == 1
     assert flooded[0].startswith(f"sensor {setup.name!r} found up to 8374 features")
+
+
+def test_markers_that_are_never_met_are_told_in_one_line() -> None:
+    session = load_session(SESSION)
+    findings, features = Findings(session), np.arange(7)
+    is_met, nothing = np.isin(features, [0, 1, 5]), np.zeros((7, 2))
+    seen = Offsets(features, is_met, nothing, np.zeros((7, 2, 3)), nothing, np.zeros(7, np.bool_))
+    sensors = {name: SensorReport(True, 0.9, 0.1) for name in ("left", "right")}
+    for frame in range(20):
+        label, T = session.labels[0], np.eye(4)
+        measured = Estimate(
+            frame, None, label, "ok", T, np.eye(6), 1.0, sensors, measured=lambda: {"left": seen}
+        )
+        findings.add(measured)
+    names = [session.body.labels[i] for i in (2, 3, 4, 6)]
+    (line,) = findings.causes()
+    assert line.startswith(f"markers {', '.join(names)} are each met in none of 20 frames")

@@ -13,12 +13,23 @@ from mixpose.body import Body, PointFeature
 from mixpose.cli.notices import Summary
 from mixpose.cli.request import RunRequest
 from mixpose.cli.run import run_session
-from mixpose.records import Estimate, SensorReport, Status
+from mixpose.density import Observation
+from mixpose.objective import View
+from mixpose.records import (
+    MEETS_NOTHING,
+    Estimate,
+    FrameSet,
+    PointPattern,
+    RawFrame,
+    SensorReport,
+    Status,
+)
 from mixpose.selection import Selection
 from mixpose.session import Session, load_session
 
 SYNTHETIC = Path(__file__).parents[1] / "data" / "synthetic"
 UNUSED = SensorReport(False)
+FEW = PointPattern(np.full((7, 2), 200.0), np.ones(7))
 
 
 @pytest.fixture
@@ -69,6 +80,22 @@ def test_sensors_that_take_turns_are_told(session: Session) -> None:
     assert warning.startswith("in 3 of 4 frames with a pose only one of 2 sensors is explained")
     assert summary(session, left, *[both] * 5).warnings() == []
     assert len(summary(session, left, *[both] * 4).warnings()) == 1
+
+
+def test_a_sensor_that_meets_nothing_is_named_whatever_else_is_odd_about_it(
+    session: Session,
+) -> None:
+    nothing = SensorReport(False, 0.0, None, MEETS_NOTHING)
+    found = summary(session, *[[met(0.9), nothing]] * 20)
+    (warning,) = found.warnings()
+    assert warning.startswith("sensor 'right' explained less than 1 % in 20 of 20 frames")
+    for frame in range(7):
+        seen = View("left", session.sensors[0].sensor, Observation(FEW, 1.0))
+        pictures = {name: RawFrame(frame, None, FEW) for name in ("left", "right")}
+        estimate = Estimate(frame, None, session.labels[0], "ok", np.eye(4), None, 0.5, {})
+        found.watch(FrameSet(frame, None, pictures), [seen], estimate)
+    assert [line for line in found.warnings() if "no feature" in line]
+    assert warning in found.warnings()
 
 
 def test_of_more_sensors_those_not_explained_are_named() -> None:

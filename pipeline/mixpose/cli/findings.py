@@ -221,14 +221,14 @@ class Findings:
                 marker.since = estimate.frame if marker.since is None else marker.since
                 marker.missed_since += 1
 
-    def warnings(self) -> list[str]:
-        """What is most likely at fault, a line each."""
+    def causes(self) -> list[str]:
+        """What of the session or the bodies is most likely at fault, a line each."""
         sizes = size_warnings(self._sizes)
         # a body of another size is met off at all of its markers
-        of_bodies = sizes or self._of_markers()
-        return [*self._of_sensors(), *self._of_doubts(), *of_bodies]
+        return [*self._of_doubts(), *(sizes or self._of_markers())]
 
-    def _of_sensors(self) -> list[str]:
+    def of_sensors(self) -> list[str]:
+        """What is odd about what sensors see, a line each."""
         total, lines = self._places + 1, []
         kinds = (("no frame", self._no_frame), ("no feature", self._no_feature))
         for what, found in kinds:
@@ -304,10 +304,12 @@ class Findings:
                 continue
             name = max(names, key=len)
             of = f" of {label!r}" if len(self._session.labels) > 1 else ""
-            typical = self._typical(markers)
+            typical, told = self._typical(markers), dict[str, list[int]]()
             for i, marker in sorted(markers.items()):
-                called = f"marker {bodies[name].labels[i]}{of}"
-                lines += _about(called, marker, typical.get(i, np.inf), self._session.unit)
+                for text in _about(marker, typical.get(i, np.inf), self._session.unit):
+                    told.setdefault(text, []).append(i)
+            labels = bodies[name].labels
+            lines += [_of_some(text, some, labels, of) for text, some in told.items()]
         return lines
 
     @staticmethod
@@ -321,13 +323,23 @@ class Findings:
         }
 
 
-def _about(called: str, marker: _Marker, typical: float, unit: str) -> list[str]:
+def _of_some(text: str, numbers: Sequence[int], labels: Sequence[str], of: str) -> str:
+    """What is odd about markers (their numbers, rising) that have it in common."""
+    names = [labels[i] for i in numbers]
+    if len(names) == 1:
+        return f"marker {names[0]}{of} is {text}"
+    in_a_row = len(names) > 2 and numbers[-1] - numbers[0] == len(names) - 1
+    called = f"{names[0]} to {names[-1]}" if in_a_row else ", ".join(names)
+    return f"markers {called}{of} are each {text}"
+
+
+def _about(marker: _Marker, typical: float, unit: str) -> list[str]:
     """What is odd about a marker."""
     if marker.expected < _FEWEST:
         return []
     if not marker.met:
         return [
-            f"{called} is met in none of {marker.expected} frames where it should be seen: gone, "
+            f"met in none of {marker.expected} frames where it should be seen: gone, "
             "or measured wrong?"
         ]
     systematic = marker.systematic()
@@ -336,13 +348,12 @@ def _about(called: str, marker: _Marker, typical: float, unit: str) -> list[str]
     if sure and systematic > _MEASURED**2 * typical:
         off = float(np.linalg.norm(marker.shift()))
         return [
-            f"{called} is met {off:.2g} {unit} off in {marker.met} of {marker.expected} frames: "
-            "measured wrong?"
+            f"met {off:.2g} {unit} off in {marker.met} of {marker.expected} frames: measured wrong?"
         ]
     # one that is measured wrong is missed, too, wherever it is too far off
     gone = marker.missed_since
     if marker.since is not None and gone >= max(_FEWEST, _GONE * marker.expected):
-        return [f"{called} is not met from frame {marker.since} on, in {gone} frames: gone?"]
+        return [f"not met from frame {marker.since} on, in {gone} frames: gone?"]
     return []
 
 

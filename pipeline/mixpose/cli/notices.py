@@ -72,7 +72,9 @@ class Summary:
             if setup.sensor.unit == "px" and not any(one.body.spread for one in session.objects)
         }
         from mixpose.cli.findings import Findings  # noqa: PLC0415 - only a run needs it
+        from mixpose.records import MEETS_NOTHING  # noqa: PLC0415
 
+        self.idle_for = MEETS_NOTHING
         self.findings = Findings(session)
         self.bodies = len(session.labels)
         self.statuses: Counter[Status] = Counter()
@@ -97,8 +99,12 @@ class Summary:
         if estimate.status == "lost":
             return
         reasons = {n: one.why for n, one in estimate.sensors.items() if one.why}
-        self.left_out.update(reasons.items())
-        shares = {n: one.explained or 0.0 for n, one in estimate.sensors.items() if one.used}
+        self.left_out.update((n, why) for n, why in reasons.items() if why != self.idle_for)
+        shares = {
+            n: one.explained or 0.0
+            for n, one in estimate.sensors.items()
+            if one.used or one.why == self.idle_for
+        }
         idle = [name for name, share in shares.items() if share < _NOTHING]
         self.posed.update(shares.keys())
         self.idle.update(idle)
@@ -147,13 +153,13 @@ class Summary:
             for name in self.idle
             if name in apart
         ]
+        posed = sum(self.statuses.values()) - self.statuses["lost"]
+        seen, causes = self.findings.of_sensors(), self.findings.causes()
         if not found and self.split_frames and self.split_frames >= _OFTEN * self.shared:
             apart = set(self.split)
-            found.append(self._split_text())
-        posed = sum(self.statuses.values()) - self.statuses["lost"]
-        told = self.findings.warnings()
+            found += [] if seen else [self._split_text()]
         # what names the cause stands for what only shows it
-        found = [*told, *(line for line in found if not told)]
+        found = [*seen, *causes, *(line for line in found if not causes)]
         found += [
             f"sensor {name!r} was left out of {count} of {posed} frames with a pose: {why}"
             for (name, why), count in self.left_out.items()

@@ -29,7 +29,7 @@ from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import Floats, Indices, Mask, SensorReport
+from mixpose.records import MEETS_NOTHING, Floats, Indices, Mask, SensorReport
 
 Prior: TypeAlias = tuple[float, Floats]
 """What is known of a pose before its frame: log of its density, per length and radian of each free
@@ -127,10 +127,13 @@ class ScoredPose:
         self, residuals: Mapping[str, Mapping[str, float | None]]
     ) -> dict[str, SensorReport]:
         """How each sensor took part, with residuals of features by sensor."""
-        out, rows = self.left_out, zip(self.matches.explained.tolist(), self.matches.rms)
+        found = self.matches
+        idle = [name for name, met in zip(found.names, found.met.tolist()) if not met]
+        out = dict.fromkeys(idle, MEETS_NOTHING) | dict(self.left_out)
+        rows = zip(found.explained.tolist(), found.rms)
         return {
             name: SensorReport(name not in out, *row, out.get(name), residuals.get(name, {}))
-            for name, row in zip(self.matches.names, rows)
+            for name, row in zip(found.names, rows)
         }
 
 
