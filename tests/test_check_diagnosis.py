@@ -186,6 +186,24 @@ def test_a_calibration_that_two_cameras_share_is_that_of_one_of_them(right: Sess
     )
 
 
+def test_calibrations_that_are_swapped_are_told(right: Session) -> None:
+    left, other = right.sensors
+    camera: Any = left.sensor
+    K = camera.camera_matrix * [[1.1], [1.1], [1.0]] + [[0, 0, 25.0], [0, 0, -18.0], [0, 0, 0]]
+    unlike = replace(left, sensor=replace(camera, camera_matrix=K))
+    true = replace(right, sensors=(unlike, other))
+    lens: Any = other.sensor
+    swapped = (
+        replace(camera, camera_matrix=lens.camera_matrix, distortion=lens.distortion),
+        replace(lens, camera_matrix=K, distortion=camera.distortion),
+    )
+    given = [replace(each, sensor=one) for each, one in zip(right.sensors, swapped, strict=True)]
+    assert told(replace(right, sensors=tuple(given)), recorded(true)) == (
+        "calibrations of 'left' and 'right' are swapped: with camera_matrix and distortion of each "
+        "given to the other"
+    )
+
+
 def test_normals_that_point_inwards_are_told(right: Session) -> None:
     means = right.body.means
     normals = means - means.mean(axis=0)

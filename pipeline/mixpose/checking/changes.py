@@ -78,6 +78,17 @@ def changes(session: Session) -> Iterator[Change]:
             "with the source of each given to the other",
             lambda views, a=a, b=b: _swapped(views, a, b),  # type: ignore[misc]
         )
+    sensors: dict[str, Any] = {setup.name: setup.sensor for setup in cameras}
+    for a, b in combinations(sensors, 2):
+        if type(sensors[a]) is type(sensors[b]):
+            lenses = {a: _with_lens(sensors[a], sensors[b]), b: _with_lens(sensors[b], sensors[a])}
+            yield Change(
+                f"calibrations of {a!r} and {b!r} {{are}} swapped",
+                "with camera_matrix and distortion of each given to the other",
+                lambda views, lenses=lenses: [  # type: ignore[misc]
+                    with_sensor(view, lenses.get(view.name, view.sensor)) for view in views
+                ],
+            )
     sized = {s.name: s.resolution[0] for s in cameras if s.resolution is not None}
     for names in _all_or_one(list(sized)):
         yield Change(
@@ -171,6 +182,11 @@ def _inversions(cameras: Sequence[SensorSetup]) -> Iterator[Change]:
                 _inverted(view) if view.name in names else view for view in views
             ],
         )
+
+
+def _with_lens(sensor: Any, other: Any) -> Any:
+    """A camera where it is, with the lens of another."""
+    return replace(sensor, camera_matrix=other.camera_matrix, distortion=other.distortion)
 
 
 def _inverted(view: View) -> View:

@@ -128,7 +128,7 @@ def _at_the_start(
 
 
 def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
-    """Why no frame is ok, where it is that sensors contradict each other."""
+    """Why no frame is ok: sensors that contradict each other, or nobody knows."""
     doubt, frames = "", frames[:2]
     for number, views in frames:
         tracker, track = begin(session)
@@ -138,7 +138,12 @@ def _contradiction(session: Session, frames: Frames) -> tuple[str, ...]:
         doubt = estimate.doubt or doubt
     numbers = " and ".join(str(number) for number, _ in sorted(frames, key=lambda each: each[0]))
     where = f"frame{'s' * (len(frames) > 1)} {numbers}"
-    return (f"{where}: {doubt}: {CAUSES}",) if doubt else ()
+    if doubt:
+        return (f"{where}: {doubt}: {CAUSES}",)
+    return (
+        f"{where}: the body is not found, by the session as it is or with any one change of it: is "
+        "it in view, or are several things wrong at once?",
+    )
 
 
 def _otherwise(
