@@ -113,6 +113,10 @@ class Findings:
         self._far = {name: Stretches() for name in names}
         self._usual = {name: deque[float](maxlen=_USUAL) for name in names}
         self._sigmas = {setup.name: setup.extract.sigma for setup in session.sensors}
+        self._units = {
+            setup.name: "px" if setup.sensor.unit == "px" else session.unit
+            for setup in session.sensors
+        }
         self._images: dict[str, Image] = {}
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
@@ -255,8 +259,8 @@ class Findings:
             if each.longest >= _LONG:
                 lines.append(
                     f"sensor {name!r} is met far off, against {median(self._usual[name]):.2g} "
-                    f"before, in {each.count} of {total} frames: {each.text()}: images torn or "
-                    "blurred, or out of step?"
+                    f"{self._units[name]} before, in {each.count} of {total} frames: "
+                    f"{each.text()}: images torn or blurred, markers half hidden, or out of step?"
                 )
         return lines
 

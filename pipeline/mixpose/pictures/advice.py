@@ -199,7 +199,8 @@ def _about_extra(
     unsure = not expected.sure or expected.met.sum() < _MOST * expected.seen.sum()
     if unsure or extra.all():
         # what looks like clutter may be the markers
-        return [f"{text}; which are markers cannot be told here: look at a frame that is ok"]
+        where = "shows more of the body" if expected.sure else "is ok"
+        return [f"{text}; which are markers cannot be told here: look at a frame that {where}"]
     size, peak = np.array(sizes), np.array(peaks)
     own = ~extra
     if size[extra].max() < 0.8 * size[own].min():
