@@ -167,8 +167,9 @@ class Summary:
         far = self._far_off(apart)
         if far:
             found.append(
-                f"features are met far off, {' and '.join(far)}: the size of [object], its unit, "
-                "the calibration or T_sensor_world is wrong, or frames are out of step"
+                f"features are met far off, {' and '.join(far)}: is the size of [object], its "
+                "unit, the calibration or T_sensor_world wrong, are frames out of step, or are "
+                "features found no better?"
             )
         return found
 
