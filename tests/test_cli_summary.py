@@ -14,9 +14,9 @@ from mixpose.cli.notices import Summary
 from mixpose.cli.request import RunRequest
 from mixpose.cli.run import run_session
 from mixpose.density import Observation
+from mixpose.judgement import MEETS_NOTHING
 from mixpose.objective import View
 from mixpose.records import (
-    MEETS_NOTHING,
     Estimate,
     FrameSet,
     PointPattern,

@@ -254,9 +254,6 @@ class MeasuredPoint:
     residual: float
 
 
-MEETS_NOTHING = "it meets nothing of the body"
-
-
 @dataclass(frozen=True)
 class SensorReport:
     """How one sensor took part in an estimate.

@@ -72,7 +72,7 @@ class Summary:
             if setup.sensor.unit == "px" and not any(one.body.spread for one in session.objects)
         }
         from mixpose.cli.findings import Findings  # noqa: PLC0415 - only a run needs it
-        from mixpose.records import MEETS_NOTHING  # noqa: PLC0415
+        from mixpose.judgement import MEETS_NOTHING  # noqa: PLC0415
 
         self.idle_for = MEETS_NOTHING
         self.findings = Findings(session)

@@ -16,6 +16,7 @@ from mixpose.judgement.acceptance import (
     one_misses as one_misses,
 )
 from mixpose.judgement.judge import (
+    MEETS_NOTHING as MEETS_NOTHING,
     Case as Case,
     DetectionModel as DetectionModel,
     JudgementRules as JudgementRules,

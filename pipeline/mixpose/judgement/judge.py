@@ -29,7 +29,7 @@ from mixpose.judgement.information import information_of, inverted
 from mixpose.judgement.noise import NoiseModel, RememberedNoise, noise_of
 from mixpose.matching import AssociationRules, Matches, NoiseEstimate, associate
 from mixpose.objective import MatchedObjective
-from mixpose.records import MEETS_NOTHING, Floats, Indices, Mask, SensorReport
+from mixpose.records import Floats, Indices, Mask, SensorReport
 
 Prior: TypeAlias = tuple[float, Floats]
 """What is known of a pose before its frame: log of its density, per length and radian of each free
@@ -65,6 +65,9 @@ class JudgementRules:
     association: AssociationRules = AssociationRules()
     detection: DetectionModel = DetectionModel()
     noise: NoiseModel = NoiseModel()
+
+
+MEETS_NOTHING = "it meets nothing of the body"
 
 
 @dataclass(frozen=True, eq=False)
