@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -31,8 +32,8 @@ from mixpose.pictures.overlay import (
 from mixpose.pictures.ranges import draw_ranges
 from mixpose.pictures.scene import draw_scene
 from mixpose.pictures.signature import is_ours
-from mixpose.records import Estimate, FrameSet, PointPattern, SensorReport
-from mixpose.rigid import perturb, transform
+from mixpose.records import Estimate, FrameSet, PointPattern, RawFrame, SensorReport
+from mixpose.rigid import from_parts, perturb, transform
 from mixpose.runner import run
 from mixpose.selection import Selection
 from mixpose.sensors import PinholeCamera, RangeSensor
@@ -116,6 +117,33 @@ def test_projected_covariances_are_those_of_drawn_poses(
     propagated = projected_covariances(camera, paper_body, T, covariance)
     # 20 000 samples leave 1 % per entry
     assert np.abs(propagated - sampled).max() < 0.05 * np.abs(sampled).max()
+
+
+@pytest.mark.parametrize("of_images", [True, False])
+def test_a_body_that_is_small_in_its_frame_is_drawn_larger_in_a_corner(of_images: bool) -> None:
+    session = mixpose.load_session(SYNTHETIC / "two_cameras" / "session.toml")
+    camera: Any = session.sensors[0].sensor
+    setup = replace(session.sensors[0], sensor=replace(camera, T_sensor_world=np.eye(4)))
+    alone = replace(session, sensors=(setup,))
+
+    def drawn(distance: float) -> NDArray[np.uint8]:
+        T = from_parts(np.eye(3), np.array([0.0, 0.0, distance]))
+        points = setup.sensor.project(transform(T, session.body.means))[0]
+        image = np.full((512, 640), 40, np.uint8)
+        for u, v in np.rint(points).astype(int):
+            image[v, u] = 250
+        data = image if of_images else PointPattern(points, np.ones(len(points)))
+        frames = FrameSet(0, None, {setup.name: RawFrame(0, None, data)})
+        one = Estimate(0, None, session.labels[0], "ok", T, None, 1.0, {})
+        return draw_scene(alone, frames, one)
+
+    # the body is amid the frame; 0.4 of its shorter side have it once more, in the lower left
+    green = np.array(STATUS_COLOURS["ok"], dtype=np.int64)
+    far, near = (drawn(distance)[-380:-20, 20:380] for distance in (4000.0, 1500.0))
+    marked = [(np.abs(one - green) < 40).all(axis=2).sum() for one in (far, near)]
+    # seven rings of at least as many pixels each
+    assert marked[0] > 7 * 20
+    assert marked[1] == 0
 
 
 def test_the_ellipse_holds_95_percent() -> None:

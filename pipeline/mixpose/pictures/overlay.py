@@ -91,6 +91,7 @@ def draw_pose(
     found: Floats | None = None,
     magnified: float = 1.0,
     colour: Colour | None = None,
+    named: bool = True,
 ) -> Picture:
     """Draw a pose on a camera's frame.
 
@@ -118,6 +119,8 @@ def draw_pose(
         Factor by which ellipses are drawn larger than they are.
     colour : Colour or None
         Of the features, where the status does not give it.
+    named : bool
+        Whether names stand beside features.
 
     Returns
     -------
@@ -133,7 +136,7 @@ def draw_pose(
     if T_world_object is not None:
         colour = colour or STATUS_COLOURS[status or "ok"]
         _draw_ellipses(picture, sensor, body, T_world_object, covariance, part, magnified)
-        _draw_features(picture, sensor, body, T_world_object, part, colour)
+        _draw_features(picture, sensor, body, T_world_object, part, colour, named)
         _draw_axes(picture, sensor, body, T_world_object, part)
     caption(picture, status, frame)
     return picture
@@ -175,7 +178,13 @@ def ellipse_95(covariance: Floats) -> Floats:
 
 
 def _draw_features(
-    picture: Picture, sensor: Sensor, body: Body, T: Floats, part: Part, colour: Colour
+    picture: Picture,
+    sensor: Sensor,
+    body: Body,
+    T: Floats,
+    part: Part,
+    colour: Colour,
+    named: bool,
 ) -> None:
     radius = mark_radius(picture, sensor, body, T, part)
     nodes, inside = sensor.project(transform(T, body.nodes.points))
@@ -190,7 +199,7 @@ def _draw_features(
             ring(picture, place, radius / 2, GREY)
             continue
         ring(picture, place, radius, colour)
-        if len(body) <= _MOST_NUMBERS:
+        if named and len(body) <= _MOST_NUMBERS:
             beside = (place[0] + 1.2 * radius, place[1] - 0.9 * radius)
             words(picture, body.labels[i], beside, colour, size=0.8)
 

@@ -11,8 +11,17 @@ import numpy as np
 from mixpose.body import Body
 from mixpose.pictures.canvas import GREY, WHITE, Colour, Picture, line_height, ring, stroke, words
 from mixpose.pictures.display import displayable
+from mixpose.pictures.inset import enlarged, put_into, small_box
 from mixpose.pictures.layout import columns_for, in_grid, stacked
-from mixpose.pictures.overlay import BODY_COLOURS, FOUND, Part, caption, draw_pose, legend
+from mixpose.pictures.overlay import (
+    BODY_COLOURS,
+    FOUND,
+    STATUS_COLOURS,
+    Part,
+    caption,
+    draw_pose,
+    legend,
+)
 from mixpose.pictures.ranges import BACKGROUND, STRIP_SIZE, draw_ranges
 from mixpose.records import (
     Estimate,
@@ -54,10 +63,7 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     rows: list[Picture] = []
     if cameras:
         columns, room = columns_for(len(cameras)), room_for(len(cameras))
-        panels = [
-            draw_camera(posed, one, *backdrop(one, frame_set.frames.get(one.name), room))
-            for one in cameras
-        ]
+        panels = [_panel(posed, one, frame_set.frames.get(one.name), room) for one in cameras]
         for panel, setup in zip(panels, cameras, strict=True):
             if setup.name not in frame_set.frames:
                 _name(panel, f"{setup.name}: no frame", GREY)
@@ -71,6 +77,39 @@ def draw_scene(session: Session, frame_set: FrameSet, *estimates: Estimate) -> P
     for setup in strips:
         rows += draw_strips(posed, setup, frame_set.frames.get(setup.name))
     return stacked(rows)
+
+
+def _panel(
+    posed: Sequence[tuple[Body, Estimate]],
+    setup: SensorSetup,
+    frame: RawFrame | None,
+    room: tuple[int, int],
+) -> Picture:
+    """A camera's frame with its poses, and those that are small in it larger in a corner."""
+    ground, part = backdrop(setup, frame, room)
+    box = small_box(ground, part, posed, setup.sensor)
+    if box is None:
+        return draw_camera(posed, setup, ground, part)
+    panel = draw_camera(posed, setup, ground, part, named=False)
+    data = None if frame is None else frame.data
+    whole = displayable(data) if isinstance(data, np.ndarray) else None
+    inset, larger = enlarged(whole, panel, box)
+    _mark_detections(inset, data, larger)
+    colours = BODY_COLOURS if len(posed) > 1 else (STATUS_COLOURS[posed[0][1].status],)
+    for k, (body, one) in enumerate(posed):
+        inset = draw_pose(
+            inset, setup.sensor, body, one.T_world_object, one.covariance,
+            part=larger, colour=colours[k % len(colours)],
+        )  # fmt: skip
+    put_into(panel, part, inset, box)
+    return panel
+
+
+def _mark_detections(picture: Picture, data: object, part: Part) -> None:
+    """Draw the detections of a camera that has them in place of images, if it has."""
+    if isinstance(data, PointPattern):
+        for place in part.places(data.points):
+            ring(picture, place, _DETECTION_PX * stroke(picture), FOUND)
 
 
 def with_bodies(session: Session, estimates: Sequence[Estimate]) -> list[tuple[Body, Estimate]]:
@@ -101,9 +140,7 @@ def backdrop(
         shape = max(round(height * zoom), 1), max(round(width * zoom), 1), 3
         picture = np.full(shape, BACKGROUND, np.uint8)
         part = Part(zoom)
-        if isinstance(data, PointPattern):
-            for place in part.places(data.points):
-                ring(picture, place, _DETECTION_PX * stroke(picture), FOUND)
+        _mark_detections(picture, data, part)
         return picture, part
     data, zoom = resized(data, room)
     return displayable(data), Part(zoom)
@@ -141,25 +178,27 @@ def draw_camera(
     picture: Picture,
     part: Part,
     found: Floats | None = None,
+    *,
+    named: bool = True,
 ) -> Picture:
     """Draw the bodies of a moment on a camera's frame, as of `backdrop`.
 
     Of several each has a colour of its own.  Features `found` (M, 2), in pixels of the sensor, are
-    marked too.
+    marked too; those of bodies are `named`.
     """
     if len(posed) == 1:
         body, one = posed[0]
         T, covariance = one.T_world_object, one.covariance
         return draw_pose(
             picture, setup.sensor, body, T, covariance, one.status, one.frame,
-            part=part, found=found,
+            part=part, found=found, named=named,
         )  # fmt: skip
     for k, (body, one) in enumerate(posed):
         colour = BODY_COLOURS[k % len(BODY_COLOURS)]
         T, covariance = one.T_world_object, one.covariance
         picture = draw_pose(
             picture, setup.sensor, body, T, covariance, part=part, colour=colour,
-            found=None if k else found,
+            found=None if k else found, named=named,
         )  # fmt: skip
     legend(picture, [(one.label, one.status) for _, one in posed], posed[0][1].frame)
     return picture
