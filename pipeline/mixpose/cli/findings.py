@@ -19,7 +19,7 @@ from mixpose.judgement import APART
 from mixpose.objective import View
 from mixpose.records import Estimate, Floats, FrameSet, Image
 from mixpose.session import Session
-from mixpose.tracking import TWICE
+from mixpose.tracking import CHANGED, TWICE
 
 _LONG = 3  # frames in a row that are more than an accident
 _OFTEN = 0.2  # of the frames: what comes in turns is no accident either
@@ -120,6 +120,7 @@ class Findings:
         self._images: dict[str, Image] = {}
         self._again: set[str] = set()
         self._doubts: dict[str, Stretches] = {}
+        self._doubted = Stretches()  # for whatever reason
         self._markers: dict[str, dict[int, _Marker]] = {}
         self._sizes = {
             label: BodySize(session, one.body.means)
@@ -174,6 +175,7 @@ class Findings:
         self._ok += estimate.status == "ok"
         if estimate.doubt:
             self._doubts.setdefault(estimate.doubt, Stretches()).add(estimate.frame, self._places)
+            self._doubted.add(estimate.frame, self._places)
             for name in self._again:
                 self._same[name].add(estimate.frame, self._places)
         elif estimate.status == "ok":
@@ -270,15 +272,14 @@ class Findings:
             return [f"{change}, frames that are not ok would be"]
         total, lines = self._places + 1, []
         frozen = sum(each.count for each in self._same.values())
+        since = self._changed_since()
+        if since is not None:
+            lines.append(since[1])
         for doubt, each in self._doubts.items():
-            if each.count <= frozen:
+            if each.count <= frozen or (since is not None and each.found[0][0] >= since[0]):
                 continue  # said of the sensor
             if each.count < _LONG and each.count <= total / 2:
                 continue  # a frame here and there: clutter does that
-            goes_on = each.last_place == self._places and each.found[-1][2] >= _LONG
-            if doubt == APART and goes_on and self._agreed_before >= _LONG:
-                lines.append(f"{doubt} from frame {each.found[-1][0]} on: was one of them bumped?")
-                continue
             line = f"{doubt} in {each.count} of {total} frames, {each.text()}"
             if doubt == APART:
                 line += f": {CAUSES}"
@@ -288,6 +289,19 @@ class Findings:
                 line += ": poses before may be of its mirror image; is there a mirror?"
             lines.append(line)
         return lines
+
+    def _changed_since(self) -> tuple[int, str] | None:
+        """From which frame on all are in doubt, where it is most likely a sensor, and in words."""
+        most = max(self._doubts, key=lambda doubt: self._doubts[doubt].count, default="")
+        asked = {
+            APART: "was one of them bumped?",
+            CHANGED: "was a sensor bumped, or is it out of focus?",
+        }
+        goes_on = self._doubted.last_place == self._places and self._agreed_before >= _LONG
+        if most not in asked or not goes_on or self._doubted.found[-1][2] < _LONG:
+            return None
+        first = self._doubted.found[-1][0]
+        return first, f"{most} from frame {first} on: {asked[most]}"
 
     def _change(self) -> str | None:
         """What the session should have said, where few frames are ok and some are doubted."""

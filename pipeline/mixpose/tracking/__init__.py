@@ -5,6 +5,7 @@ from mixpose.tracking.clouds import (
     plane_views as plane_views,
     with_clouds as with_clouds,
 )
+from mixpose.tracking.doubt import CHANGED as CHANGED
 from mixpose.tracking.labels import labelled as labelled
 from mixpose.tracking.prediction import Foreseen as Foreseen
 from mixpose.tracking.rules import Rules as Rules
