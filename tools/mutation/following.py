@@ -162,7 +162,7 @@ _GATING = (
     Mutant(
         "tracking-windows-for-ever",
         "tracking/scene.py",
-        "in_turn = any(one.frame is None or frame // every > one.frame // every for one in tracks)",
+        "in_turn = any(one.is_in_turn(frame, self.scene.rules.thorough) for one in tracks)",
         "in_turn = False",
         "what enters the view elsewhere is never seen",
         ("test_runner_windows.py",),

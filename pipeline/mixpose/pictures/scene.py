@@ -95,13 +95,7 @@ def _panel(
     whole = displayable(data) if isinstance(data, np.ndarray) else None
     inset, larger = enlarged(whole, panel, box)
     _mark_detections(inset, data, larger)
-    colours = BODY_COLOURS if len(posed) > 1 else (STATUS_COLOURS[posed[0][1].status],)
-    for k, (body, one) in enumerate(posed):
-        inset = draw_pose(
-            inset, setup.sensor, body, one.T_world_object, one.covariance,
-            part=larger, colour=colours[k % len(colours)],
-        )  # fmt: skip
-    put_into(panel, part, inset, box)
+    put_into(panel, part, _draw_bodies(posed, setup, inset, larger), box)
     return panel
 
 
@@ -186,21 +180,31 @@ def draw_camera(
     Of several each has a colour of its own.  Features `found` (M, 2), in pixels of the sensor, are
     marked too; those of bodies are `named`.
     """
+    picture = _draw_bodies(posed, setup, picture, part, found, named=named)
+    first = posed[0][1]
     if len(posed) == 1:
-        body, one = posed[0]
-        T, covariance = one.T_world_object, one.covariance
-        return draw_pose(
-            picture, setup.sensor, body, T, covariance, one.status, one.frame,
-            part=part, found=found, named=named,
-        )  # fmt: skip
+        caption(picture, first.status, first.frame)
+    else:
+        legend(picture, [(one.label, one.status) for _, one in posed], first.frame)
+    return picture
+
+
+def _draw_bodies(
+    posed: Sequence[tuple[Body, Estimate]],
+    setup: SensorSetup,
+    picture: Picture,
+    part: Part,
+    found: Floats | None = None,
+    *,
+    named: bool = True,
+) -> Picture:
+    """The same without words about the frame: on a new picture."""
+    colours = BODY_COLOURS if len(posed) > 1 else (STATUS_COLOURS[posed[0][1].status],)
     for k, (body, one) in enumerate(posed):
-        colour = BODY_COLOURS[k % len(BODY_COLOURS)]
-        T, covariance = one.T_world_object, one.covariance
         picture = draw_pose(
-            picture, setup.sensor, body, T, covariance, part=part, colour=colour,
-            found=None if k else found, named=named,
+            picture, setup.sensor, body, one.T_world_object, one.covariance,
+            part=part, colour=colours[k % len(colours)], found=None if k else found, named=named,
         )  # fmt: skip
-    legend(picture, [(one.label, one.status) for _, one in posed], posed[0][1].frame)
     return picture
 
 

@@ -34,7 +34,6 @@ from mixpose.records import Floats, Mask
 from mixpose.tracking.frame import Frame, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of, met_features, reason, starts_at
-from mixpose.tracking.track import Track
 from mixpose.tracking.twin import IN_A_MIRROR, TWICE, are_both, is_flat
 
 FEW = "few markers are met, which other things may have alike"
@@ -104,7 +103,7 @@ def _of_chance_that_lasts(data: Frame, best: ScoredPose) -> float:
     track = data.track
     if track.believed or track.frame is None:
         return -math.inf
-    told = _evidence(_alone(data), Start(best.T_world_object, left_out=best.left_out))
+    told = _evidence(data.alone(), Start(best.T_world_object, left_out=best.left_out))
     if track.shown is not None:
         told += float(track.shown[best.used.met_by == 0].sum())
     more = best.log_evidence - told
@@ -126,12 +125,6 @@ def shown_after(data: Frame, best: ScoredPose) -> Floats | None:
     # each time that a sensor misses a feature, it is less likely to have been met
     lost = np.maximum(before + used.weights.max(axis=0) * detection.log_missed, 0.0)
     return np.asarray(np.where(used.met_by > 0, gained.max(axis=0), lost))
-
-
-def _alone(data: Frame) -> Frame:
-    """The frame, of which nothing is known from those before it but the noise."""
-    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
-    return data.seen_otherwise(predictions=(), beside=None, searches=[], track=track, options=live)
 
 
 def _gained(data: Frame, best: ScoredPose) -> float:
@@ -194,7 +187,7 @@ def _reflected(data: Frame, judged: ScoredPose, asked: bool) -> float:
     if not _is_by_chance(data, judged):
         return near if asked else -math.inf
     # wherever it is found, and nothing known of either; the first guesses meet what explains more
-    alone = _alone(data)
+    alone = data.alone()
     own, mirror = _evidence(alone, Start(T)), _mirrored(alone, met >= 0)
     rivals = [one for one in candidates_of(mirror) if one.evidence > own - rules.search.outdone]
     found = (_evidence(mirror, start) - own for start in starts_at(mirror, rivals))

@@ -186,6 +186,17 @@ class Frame(Setup):
         """With other views or another body, of which nothing is drawn or fitted yet."""
         return replace(self, drawn=None, together=None, **changes)
 
+    def alone(self, **changes: Any) -> Frame:
+        """With nothing known from the frames before it but the noise, for a quick search."""
+        return self.seen_otherwise(
+            predictions=(),
+            beside=None,
+            searches=[],
+            track=Track(residuals=self.track.residuals),
+            options=replace(self.options, search="live"),
+            **changes,
+        )
+
     def in_motion(self, motion: Motion) -> Frame:
         """The frame as of the common time, of a body that moves."""
         still = self.still or self.views

@@ -192,9 +192,9 @@ class WindowedScene:
 
         `observe` makes views of boxes by camera, of `images` only; without a box they are whole.
         """
-        every, boxes = self.scene.rules.thorough, {}
+        boxes = {}
         # for what enters the view
-        in_turn = any(one.frame is None or frame // every > one.frame // every for one in tracks)
+        in_turn = any(one.is_in_turn(frame, self.scene.rules.thorough) for one in tracks)
         if images and not in_turn and self._are_sure(tracks):
             boxes = self._windows(tracks, frame, time_s)
         if windows := {name: box for name, box in boxes.items() if name in images}:

@@ -129,9 +129,8 @@ class Track:
     residuals: RememberedNoise = RememberedNoise()  # so far
     sizes: Sizes = Sizes()  # of markers, as spots show them
     walk: RandomWalk | None = None  # None before two uncertain poses
-    met_before: Mapping[str, int] = field(
-        default_factory=dict
-    )  # features of the last pose, by sensor
+    # features of the last pose that each sensor met
+    met_before: Mapping[str, int] = field(default_factory=dict)
     search: SearchState = SearchState()  # where one with a budget goes on while nothing convinces
     delays: DelayEvidence = field(default_factory=DelayEvidence)  # how late sensors are
     doubted: bool = False  # whether another body may have what the last pose meets
@@ -151,6 +150,10 @@ class Track:
     def seconds_until(self, time_s: float | None) -> float | None:
         """Seconds since the last pose; None where either has no time."""
         return None if time_s is None or self.time_s is None else time_s - self.time_s
+
+    def is_in_turn(self, frame: int, every: int) -> bool:
+        """Whether a frame is the first of so many numbers, whatever frames there are."""
+        return self.frame is None or frame // every > self.frame // every
 
     def elapsed(self, frame: int, time_s: float | None) -> float:
         """Time since the last pose: seconds where both frames have times, else frames."""

@@ -21,7 +21,6 @@ from mixpose.search import Candidate, Copy, search_copies
 from mixpose.tracking.frame import Frame, Setup, Start
 from mixpose.tracking.likelihood import likelihood_of
 from mixpose.tracking.proposers import candidates_of
-from mixpose.tracking.track import Track
 
 TWICE = "the body seems to be there twice: a mirror image, or a second one (`count = 2`)"
 IN_A_MIRROR = "a flat body looks the same in a mirror, and the session says that there are some"
@@ -80,25 +79,14 @@ def _is_due(data: Frame, best: ScoredPose, left: Mapping[str, int]) -> bool:
     # as much as would convince, by as many sensors
     if np.minimum(rest, used.met).sum() < rules.acceptance.convincing * used.met.sum():
         return False
-    track, every = data.track, rules.proposals.static
+    track = data.track
     is_more = any(count > track.tried.get(name, 0) for name, count in left.items())
-    in_turn = track.frame is None or data.frame // every > track.frame // every
-    return is_more or track.doubted or in_turn
+    return is_more or track.doubted or track.is_in_turn(data.frame, rules.proposals.static)
 
 
 def _second_pose(data: Frame, best: ScoredPose, views: Sequence[View]) -> ScoredPose | None:
     """A pose that is sure by itself and meets as much as the best one."""
-    live, track = replace(data.options, search="live"), Track(residuals=data.track.residuals)
-    rest = data.seen_otherwise(
-        views=views,
-        still=(),
-        predictions=(),
-        beside=None,
-        starts=(),
-        searches=[],
-        track=track,
-        options=live,
-    )
+    rest = data.alone(views=views, still=(), starts=())
     rules, least = data.rules, data.rules.acceptance.convincing * best.measurements
     likelihood = likelihood_of(rest)
     for start in _starts(data, best, rest):
