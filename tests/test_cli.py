@@ -226,6 +226,19 @@ def test_an_interrupt_leaves_whole_lines_and_status_130(tmp_path: Path) -> None:
     assert 1 < len(lines_of(poses.read_text(encoding="utf-8"))) <= RANGE_FRAMES
 
 
+def test_an_interrupt_of_code_that_is_being_made_is_status_130_as_well() -> None:
+    # dataclasses are made by `exec`; Python ends by the signal where one is left by an interrupt
+    script = (
+        "from mixpose import cli\n"
+        "cli._status = lambda arguments: exec('raise KeyboardInterrupt')\n"
+        "cli.main([])\n"
+    )
+    words = [sys.executable, "-c", script]
+    result = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert result.returncode == 130
+    assert result.stderr == "mixpose: interrupted; everything so far is written\n"
+
+
 @pytest.mark.skipif(os.name == "nt", reason="pipes to head are a POSIX habit")
 def test_a_reader_that_has_seen_enough_is_no_error(recording: Path) -> None:
     line = f"{sys.executable} -m mixpose run {recording / 'session.toml'} | head -n 1"

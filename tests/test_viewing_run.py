@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import gc
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
+import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -110,6 +112,31 @@ def test_an_interrupt_ends_a_run_that_waits_for_its_page() -> None:
         assert process.wait() == 130
         assert process.stderr is not None
         assert process.stderr.read() == "mixpose: interrupted; everything so far is written\n"
+
+
+@needs_proc
+def test_a_page_that_is_interrupted_while_it_begins_is_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said: list[str] = []
+    begun: list[int] = []
+
+    def start(thread: threading.Thread) -> None:
+        if thread.name.startswith("mixpose page: _receive"):
+            begun.extend(child.pid or 0 for child in multiprocessing.active_children())
+            raise KeyboardInterrupt
+        plain_start(thread)
+
+    plain_start = threading.Thread.start
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with (
+        pytest.raises(KeyboardInterrupt),
+        Viewer(load_session(TWO), "0", said.append, on_files=False),
+    ):
+        raise AssertionError("it has begun")
+    assert len(begun) == 1
+    wait_until(lambda: not multiprocessing.active_children())
+    assert said == []
 
 
 def test_frames_that_nobody_asks_for_are_left_out() -> None:

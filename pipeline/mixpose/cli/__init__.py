@@ -110,6 +110,9 @@ def _status(arguments: list[str]) -> int:
 
 
 def _interrupted() -> int:
+    # where the interrupt fell into an `exec`, as of a dataclass that was being imported, Python
+    # would end by the signal whatever the status; the next `exec` makes it forget that
+    exec("")
     return _fail("interrupted; everything so far is written", INTERRUPTED)
 
 

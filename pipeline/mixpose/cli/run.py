@@ -181,7 +181,8 @@ def _view(
 
     waits = all(source.kind != "live" for source in opened.values())
     viewer = Viewer(session, request.view, say, on_files=waits, paused=request.pause)
-    return stack.enter_context(viewer).watch
+    stack.enter_context(viewer).announce()
+    return viewer.watch
 
 
 def _each(*watches: Watch | None) -> Watch:

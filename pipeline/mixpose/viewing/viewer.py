@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from multiprocessing.connection import Connection
@@ -39,7 +39,7 @@ class _Frame:
 
 
 class Viewer:
-    """Shows a run on a page; a context for ``run(watch=...)``.
+    """Shows a run on a page; a context for ``run(watch=...)``, announced once it is entered.
 
     Parameters
     ----------
@@ -92,15 +92,24 @@ class Viewer:
         self._waits_for_page = on_files
         self._patience = float("inf") if paused else PACE.patience_s
         self._ended = self._gone = False
-        self._begin(text)
+        self._threads: list[threading.Thread] = []
+        self._place = listen(text)
+        self._address = self._place.address
 
-    def _begin(self, text: str) -> None:
+    def __enter__(self) -> Viewer:
+        with ExitStack() as opened:
+            self._begin(opened)
+            self._opened = opened.pop_all()
+        return self
+
+    def _begin(self, opened: ExitStack) -> None:
+        """Start the page and what talks to it; an interrupt meanwhile ends both."""
         from mixpose.viewing.process import show  # noqa: PLC0415 - loads drawing
 
-        place = listen(text)
-        self.address = place.address
+        place = self._place
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
+        opened.callback(self._close)
         self._process = context.Process(
             target=show,
             args=(place, theirs, self._session, self._on_files, self._paused),
@@ -109,20 +118,32 @@ class Viewer:
         )
         with _interrupts_ignored():
             self._process.start()
+        opened.callback(self._process.kill)
+        opened.callback(self._end)
         theirs.close()
         place.socket.close()
+        for each in (self._send, self._receive):
+            name = f"mixpose page: {each.__name__}"
+            thread = threading.Thread(target=each, name=name, daemon=True)
+            thread.start()
+            self._threads.append(thread)
+
+    def announce(self) -> None:
+        """Tell people where the page is, and whether the run waits for it."""
         begins = "; the run begins when it is open" if self._on_files else ""
         limit = f", in {PACE.patience_s:g} s at the latest" if begins and not self._paused else ""
-        self._say(f"see {self.address}{begins}{limit}")
+        self._say(f"see {self._address}{begins}{limit}")
 
-    def __enter__(self) -> Viewer:
-        self._threads = [
-            threading.Thread(target=each, name=f"mixpose page: {each.__name__}", daemon=True)
-            for each in (self._send, self._receive)
-        ]
+    def _close(self) -> None:
         for thread in self._threads:
-            thread.start()
-        return self
+            thread.join(_LOOK_S)
+        self._connection.close()
+
+    def _end(self) -> None:
+        """Say that what comes from now on is nothing to warn of."""
+        with self._state:
+            self._ended = True
+            self._state.notify_all()
 
     def __exit__(
         self,
@@ -130,16 +151,11 @@ class Viewer:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        with self._state:
-            self._ended = True
-            self._state.notify_all()
+        self._end()
         if kind is None:
             with suppress(KeyboardInterrupt):  # the recording is done
                 self._stay()
-        self._process.kill()
-        for thread in self._threads:
-            thread.join(_LOOK_S)
-        self._connection.close()
+        self._opened.close()
 
     def _stay(self) -> None:
         """Let those who look see the last frame, for a while."""
