@@ -122,8 +122,8 @@ _CUT = (
     Mutant(
         "judgement-cut-not-beyond-the-ellipsoid",
         "judgement/cut.py",
-        "(beyond > outside)[:-1].sum()",
-        "(beyond > 1)[:-1].sum()",
+        "@ shares <= outside",
+        "@ shares <= 1",
         "of few spots one in a hundred poses is out of its ellipsoid",
         ("test_judgement_cut.py",),
     ),

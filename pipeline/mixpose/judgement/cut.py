@@ -15,6 +15,7 @@ and are taken for a multiple of χ² with as much.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 
 import numpy as np
 from scipy.special import chdtrc, chdtri
@@ -23,7 +24,7 @@ from mixpose.judgement.information import inverted
 from mixpose.matching import ErrorRules, Matches
 from mixpose.records import Floats
 
-LARGER = np.geomspace(1.0, 30.0, 40)  # a step is 9 % of a variance
+LARGER: list[float] = np.geomspace(1.0, 30.0, 40).tolist()  # a step is 9 % of a variance
 
 
 def with_cut_spots(
@@ -44,8 +45,8 @@ def with_cut_spots(
     J, r = J.reshape(*found.shares.shape, 2, k)[met], r.reshape(*found.shares.shape, 2)[met]
     C = inverted(information + np.diag(1 / known**2))
     G = J @ C
-    values, axes = np.linalg.eigh(G @ J.swapaxes(1, 2))
-    M, axes = 1 / np.maximum(1 - values, 1e-9), axes.swapaxes(1, 2)
+    values, axes = _axes(G @ J.swapaxes(1, 2))
+    M = 1 / np.maximum(1 - values, 1e-9)
     G, r = axes @ G, (axes @ r[..., None])[..., 0]
     m, s2 = found.dimensions[met[0]], variances[met]
     v = np.maximum(np.array([*np.square(errors.cuts), 1e9])[:, None] / s2, 1.0)
@@ -92,6 +93,18 @@ def _larger(
     variance += 2 * np.vecdot(pulled**2, wider)
     # of half the variances: a multiple of χ² with as many degrees of freedom
     means, halves = np.append(mean, np.trace(BC)), np.append(variance, np.vdot(BC, BC.T))
-    limits = float(chdtri(len(C), outside)) * LARGER[:, None] * means / halves
-    beyond = chdtrc(means**2 / halves, limits) @ np.append(chances, whole)
-    return float(LARGER[int((beyond > outside)[:-1].sum())])
+    degrees, limits = means**2 / halves, float(chdtri(len(C), outside)) * means / halves
+    shares = np.append(chances, whole)
+    enough = bisect_left(
+        LARGER[:-1], True, key=lambda factor: chdtrc(degrees, factor * limits) @ shares <= outside
+    )
+    return LARGER[enough]
+
+
+def _axes(S: Floats) -> tuple[Floats, Floats]:
+    """Variances (n, 2) of symmetric matrices (n, 2, 2) along their axes, the rows (n, 2, 2)."""
+    a, b, c = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
+    angle, half = 0.5 * np.arctan2(2 * b, a - c), 0.5 * np.hypot(a - c, 2 * b)
+    x, y, mean = np.cos(angle), np.sin(angle), 0.5 * (a + c)
+    axes = np.stack([x, y, -y, x], axis=1).reshape(-1, 2, 2)
+    return np.stack([mean + half, mean - half], axis=1), axes
