@@ -106,15 +106,15 @@ _BATCH = (
     Mutant(
         "sensors-batch-jacobian-without-lens",
         "sensors/batch.py",
-        "J = K @ lens.derivative(y) @ J",
+        "J = K @ D @ J",
         "J = K @ J",
         "steps of the ascent are wrong by the lens distortion",
     ),
     Mutant(
         "sensors-batch-pixels-without-lens",
         "sensors/batch.py",
-        "y = (K @ lens.apply(y)[..., None])",
-        "y = (K @ y[..., None])",
+        "y, D = lens.linearise(y)",
+        "_, D = lens.linearise(y)",
         "features are predicted where a lens without distortion shows them",
     ),
     Mutant(
@@ -263,15 +263,15 @@ _SENSORS = (
     Mutant(
         "sensors-lens-prism-derivative",
         "sensors/distortion.py",
-        "d_prism_y = k[10] + 2 * r2 * k[11]",
-        "d_prism_y = k[10] + r2 * k[11]",
+        "k[10] + 2 * r2 * k[11]]",
+        "k[10] + r2 * k[11]]",
         "the Jacobian is wrong for lenses with a thin prism",
     ),
     Mutant(
         "sensors-lens-tangential-swapped",
         "sensors/distortion.py",
-        "k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y",
-        "k[3] * (r2 + 2 * y * y) + 2 * k[2] * x * y",
+        "k[2] * (r2 + 2 * yy) + k[3] * xy2",
+        "k[3] * (r2 + 2 * yy) + k[2] * xy2",
         "p1 and p2 have changed places",
     ),
     Mutant(

@@ -116,8 +116,9 @@ class PinholeBatch:
         J *= inverse_depth[..., None, None]
         if lens is not None:
             K = self._K[:, None, :2, :2]
-            J = K @ lens.derivative(y) @ J
-            y = (K @ lens.apply(y)[..., None])[..., 0] + self._K[:, None, :2, 2]
+            y, D = lens.linearise(y)
+            J = K @ D @ J
+            y = (K @ y[..., None])[..., 0] + self._K[:, None, :2, 2]
         inside = np.abs(y - self._middle) <= self._half
         if np.count_nonzero(inside) == inside.size and np.count_nonzero(in_front) == in_front.size:
             return y, J, in_front

@@ -7,7 +7,7 @@ tangential, thin prism, tilted sensor.  Acts on normalised coordinates (x/z, y/z
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,50 +46,72 @@ class LensDistortion:
         full[: given.size] = given
         return cls(full, _monotonic_radius(tuple(full.tolist())))
 
+    @cached_property
+    def _parts(self) -> tuple[bool, bool, bool]:
+        """Whether a denominator, thin prisms and a tilted sensor are there."""
+        k = self.coefficients
+        return bool(k[5:8].any()), bool(k[8:12].any()), bool(k[12:].any())
+
     def apply(self, xy: Floats) -> Floats:
         """Distort normalised coordinates (..., 2)."""
-        k = self.coefficients
-        x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        radial = _polynomial(r2, k[0], k[1], k[4]) / _polynomial(r2, k[5], k[6], k[7])
-        prism_x = r2 * (k[8] + r2 * k[9])
-        prism_y = r2 * (k[10] + r2 * k[11])
-        out = np.empty_like(xy)
-        out[..., 0] = x * radial + 2 * k[2] * x * y + k[3] * (r2 + 2 * x * x) + prism_x
-        out[..., 1] = y * radial + k[2] * (r2 + 2 * y * y) + 2 * k[3] * x * y + prism_y
-        if np.any(k[12:]):
-            M = _tilt_matrix(k[12], k[13])
-            h = out @ M[:, :2].T + M[:, 2]
-            out = h[..., :2] / h[..., 2:]
-        return out
+        k, products = self.coefficients, _products(xy)
+        r2 = products[-1]
+        radial = _polynomial(r2, k[0], k[1], k[4])
+        if self._parts[0]:
+            radial = radial / _polynomial(r2, k[5], k[6], k[7])
+        flat = self._on_flat(xy, radial, *products)
+        return self._tilted(flat)[0] if self._parts[2] else flat
 
-    def derivative(self, xy: Floats) -> Floats:
-        """Jacobian (..., 2, 2) of `apply`."""
-        k = self.coefficients
+    def linearise(self, xy: Floats) -> tuple[Floats, Floats]:
+        """As `apply`, with its Jacobian (..., 2, 2)."""
+        k, (is_rational, has_prisms, is_tilted) = self.coefficients, self._parts
         x, y = xy[..., 0], xy[..., 1]
-        r2 = x * x + y * y
-        top, bottom = _polynomial(r2, k[0], k[1], k[4]), _polynomial(r2, k[5], k[6], k[7])
-        radial = top / bottom
-        d_top, d_bottom = _derivative(r2, k[0], k[1], k[4]), _derivative(r2, k[5], k[6], k[7])
-        d_radial = (d_top - radial * d_bottom) / bottom  # by r²
-        d_prism_x = k[8] + 2 * r2 * k[9]
-        d_prism_y = k[10] + 2 * r2 * k[11]
+        xx, yy, xy2, r2 = products = _products(xy)
+        radial, slope = _polynomial(r2, k[0], k[1], k[4]), _derivative(r2, k[0], k[1], k[4])
+        if is_rational:
+            bottom = _polynomial(r2, k[5], k[6], k[7])
+            radial = radial / bottom
+            slope = (slope - radial * _derivative(r2, k[5], k[6], k[7])) / bottom
+        slope2 = 2 * slope  # of the radial factor, by r²
         D = np.empty((*xy.shape, 2))
-        D[..., 0, 0] = radial + 2 * x * (x * d_radial + d_prism_x) + 2 * k[2] * y + 6 * k[3] * x
-        D[..., 0, 1] = 2 * y * (x * d_radial + d_prism_x) + 2 * k[2] * x + 2 * k[3] * y
-        D[..., 1, 0] = 2 * x * (y * d_radial + d_prism_y) + 2 * k[2] * x + 2 * k[3] * y
-        D[..., 1, 1] = radial + 2 * y * (y * d_radial + d_prism_y) + 6 * k[2] * y + 2 * k[3] * x
-        if np.any(k[12:]):
-            D = self._tilt_derivative(xy) @ D
-        return D
+        D[..., 0, 0] = radial + slope2 * xx + 2 * k[2] * y + 6 * k[3] * x
+        D[..., 0, 1] = D[..., 1, 0] = slope * xy2 + 2 * k[2] * x + 2 * k[3] * y
+        D[..., 1, 1] = radial + slope2 * yy + 6 * k[2] * y + 2 * k[3] * x
+        if has_prisms:
+            by_r2 = np.stack([k[8] + 2 * r2 * k[9], k[10] + 2 * r2 * k[11]], axis=-1)
+            D += by_r2[..., :, None] * (2 * xy[..., None, :])
+        flat = self._on_flat(xy, radial, *products)
+        if not is_tilted:
+            return flat, D
+        tilted, by_flat = self._tilted(flat)
+        return tilted, by_flat @ D
 
-    def _tilt_derivative(self, xy: Floats) -> Floats:
+    def _on_flat(
+        self, xy: Floats, radial: Floats, xx: Floats, yy: Floats, xy2: Floats, r2: Floats
+    ) -> Floats:
+        """Coordinates (..., 2) on a sensor that is not tilted."""
+        k, flat = self.coefficients, np.empty_like(xy)
+        flat[..., 0] = xy[..., 0] * radial + k[2] * xy2 + k[3] * (r2 + 2 * xx)
+        flat[..., 1] = xy[..., 1] * radial + k[2] * (r2 + 2 * yy) + k[3] * xy2
+        if self._parts[1]:
+            flat[..., 0] += r2 * (k[8] + r2 * k[9])
+            flat[..., 1] += r2 * (k[10] + r2 * k[11])
+        return flat
+
+    def _tilted(self, flat: Floats) -> tuple[Floats, Floats]:
+        """Coordinates (..., 2) on a tilted sensor, and their Jacobian by those on a flat one."""
         M = _tilt_matrix(self.coefficients[12], self.coefficients[13])
-        flat = LensDistortion(np.append(self.coefficients[:12], [0.0, 0.0]), self.radius_limit)
-        h = flat.apply(xy) @ M[:, :2].T + M[:, 2]
-        scaled = h[..., :2] / h[..., 2:]
-        inner = M[:2, :2] - scaled[..., :, None] * M[2, :2]
-        return np.asarray(inner / h[..., 2, None, None])
+        h = flat @ M[:, :2].T + M[:, 2]
+        tilted = h[..., :2] / h[..., 2:]
+        inner = M[:2, :2] - tilted[..., :, None] * M[2, :2]
+        return tilted, np.asarray(inner / h[..., 2, None, None])
+
+
+def _products(xy: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """x², y², 2 x y and r² of coordinates (..., 2)."""
+    x, y = xy[..., 0], xy[..., 1]
+    xx, yy = x * x, y * y
+    return xx, yy, 2 * x * y, xx + yy
 
 
 def _polynomial(r2: Floats, a: Floats | float, b: Floats | float, c: Floats | float) -> Floats:

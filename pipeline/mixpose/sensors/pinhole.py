@@ -69,7 +69,7 @@ class PinholeCamera:
         xy, inverse_depth, visible = self._normalised(points_world)
         y, D = xy, np.broadcast_to(np.eye(2), (*xy.shape, 2))
         if self.lens:
-            y, D = self.lens.apply(xy), self.lens.derivative(xy)
+            y, D = self.lens.linearise(xy)
         y = y @ self.camera_matrix[:2, :2].T + self.camera_matrix[:2, 2]
         R = self.T_sensor_world[:3, :3]
         normalised_by_world = (R[:2] - xy[..., :, None] * R[2]) * inverse_depth[..., None, None]
