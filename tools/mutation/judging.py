@@ -53,8 +53,8 @@ _FIELDS = (
     Mutant(
         "judgement-fields-of-a-sensor-are-noise",
         "judgement/noise.py",
-        "by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T",
-        "by_kind[0] * inverse",
+        "variances[0] * inverse + (drawn * (kinds @ variances)) @ drawn.T",
+        "variances[0] * inverse",
         "a camera that was turned after its calibration leaves the pose as sure as before",
     ),
     Mutant(

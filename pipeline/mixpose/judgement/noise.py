@@ -7,7 +7,8 @@ all sensors (s_3²).  With weights W, A = JᵀWJ, R = 1 − J A⁻¹JᵀW, field
     rᵀWr = s_0² tr R + Σ_k s_k² tr K_kk,      |P_jᵀWr|² = s_0² tr K_jj + Σ_k s_k² |K_jk|²
 
 is expected of residuals r (C. R. Henderson's method of moments), and the covariance of a pose is
-s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, variances enlarged as by Student.
+s_0² A⁻¹ + Σ_k s_k² A⁻¹ JᵀW P_k P_kᵀ WJ A⁻¹, enlarged as by Student, with the degrees of freedom
+that B. L. Welch and F. E. Satterthwaite give to a sum of variances of shares w_k: 1/ν = Σ w_k²/ν_k.
 
 Fields of a sensor that last, of sizes γ in σ_ε, show in fading sums A of PᵀWRP and v of PᵀWr.  With
 γ normal, of the deviation d before, γ̂ = S v, S = (A + 1/d²)⁻¹: where vᵀγ̂ is larger than chance
@@ -153,13 +154,13 @@ def noise_of(
     moments = model.memory * before.moments + own
     by_kind, of_fields = _variances(moments, own, sum(found.met.tolist()) / len(found.names), model)
     share = float(by_kind[1:3].sum() / by_kind[:3].sum())
-    # independent errors are of this frame, drawn to those of all, as in `_of_frame`
-    nu, spare = model.of_frame, max(spare, 0.0)
-    by_kind[0] = (nu * by_kind[0] + own[0, 4]) / (nu + spare)
-    degrees = min(degrees, nu + spare)
+    # independent errors are of this frame, whose variance is one of a scaled inverse χ² of ν
+    # degrees of freedom: its mean, which all frames show, counts as ν − 2
+    counts, spare = model.of_frame - 2, max(spare, 0.0)
+    by_kind[0] = (counts * by_kind[0] + own[0, 4]) / (counts + spare)
     # fields last: a further frame shows no more of them
-    by_kind *= model.enlargement(np.array([degrees, *of_fields]))
-    covariance[inner] = by_kind[0] * inverse + (drawn * (kinds @ by_kind)) @ drawn.T
+    known_to = np.array([degrees, *of_fields])
+    covariance[inner] = _of_all_kinds(by_kind, known_to, inverse, drawn, kinds, model)
     given = found, J, r, information, known[chosen], wide, model.errors, 1 - model.by_chance
     spread, larger = with_cut_spots(*given)
     covariance[inner] = larger * (covariance[inner] + spread)
@@ -168,6 +169,24 @@ def noise_of(
         covariance[inner] += pulled @ pulled.T
     after = before.followed(found.names, sums, moments, biases, share)
     return variances, covariance + steady, steady, after, ratio, rarity
+
+
+def _of_all_kinds(
+    variances: Floats,  # (4,) of independent errors and of fields
+    degrees: Floats,  # (4,) of freedom that they are known to
+    inverse: Floats,  # (k, k) covariance by unit errors
+    drawn: Floats,  # (k, q + 3 N) what a field of unit size moves a pose by
+    kinds: Floats,
+    model: NoiseModel,
+) -> Floats:
+    """The covariance (k, k) by all kinds of errors; their shares are of all directions together."""
+    covariance = variances[0] * inverse + (drawn * (kinds @ variances)) @ drawn.T
+    B = inverted(covariance)
+    shares = variances * (np.vecdot(drawn.T, (B @ drawn).T) @ kinds)
+    shares[0] = variances[0] * np.vdot(B, inverse)
+    shares /= max(float(shares.sum()), 1e-300)
+    known = np.maximum(degrees, model.fewest_degrees)
+    return np.asarray(covariance * model.enlargement(1 / float(shares**2 @ (1 / known))))
 
 
 def _level(
