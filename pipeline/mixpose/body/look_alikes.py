@@ -252,25 +252,23 @@ def _kept(
     least: int,
 ) -> Iterable[LookAlike]:
     """Of motions (K, 4, 4), those that bring enough of the chosen features to partners."""
-    alive, lacking = np.arange(len(T_other_body)), np.zeros(len(T_other_body), dtype=np.intp)
-    partners, near = np.zeros((2, len(T_other_body), len(chosen)), dtype=np.intp)
+    T, lacking = T_other_body, np.zeros(len(T_other_body), dtype=np.intp)
+    tried: list[tuple[NDArray[np.intp], NDArray[np.bool_]]] = []
     # some from everywhere at a time: few motions leave so many of them without
     chosen = np.random.default_rng(0).permutation(chosen)
     for first in range(0, len(chosen), _TOGETHER):
-        some = slice(first, first + _TOGETHER)
-        partners[alive, some], fits = _partners(
-            body, chosen[some], other, T_other_body[alive], 2 * tolerance
-        )
-        near[alive, some] = fits
-        lacking[alive] += (~fits).sum(axis=1)
-        tried = first + _TOGETHER
-        alive = alive[lacking[alive] <= min(len(chosen) - least, 2 * LOST * tried)]
+        some = chosen[first : first + _TOGETHER]
+        tried.append(_partners(body, some, other, T, 2 * tolerance))
+        lacking = lacking + (~tried[-1][1]).sum(axis=1)
+        alive = lacking <= min(len(chosen) - least, 2 * LOST * (first + _TOGETHER))
+        T, lacking = T[alive], lacking[alive]
+        tried = [(partners[alive], near[alive]) for partners, near in tried]
     order = chosen.argsort()
-    chosen, partners, near = chosen[order], partners[:, order], near[:, order]
-    for k in alive:
-        keep = near[k] > 0
+    chosen = chosen[order]
+    partners, near = (np.concatenate(one, axis=1)[:, order] for one in zip(*tried, strict=True))
+    for own, keep in zip(partners, near, strict=True):
         # once more after a fit to all of them, which errs less than that to three
-        part = _fitted(body, other, chosen[keep], partners[k][keep])
+        part = _fitted(body, other, chosen[keep], own[keep])
         if part.off <= tolerance and len(set(part.partners)) >= least:
             yield part
 
