@@ -203,7 +203,9 @@ def close_pairs(places: Floats, variances: Floats) -> Indices:
     reaches = np.sqrt(2 * DRAWING.negligible * variances).tolist()
     each = [cKDTree(y).query_pairs(r, output_type="ndarray") for y, r in zip(places, reaches)]
     n = places.shape[1]
-    return np.stack(np.divmod(np.unique(np.concatenate(each) @ [n, 1]), n), axis=1)
+    numbers = np.sort(np.concatenate(each) @ [n, 1])
+    is_first = np.append(True, numbers[1:] > numbers[:-1])[: len(numbers)]
+    return np.stack(np.divmod(numbers[is_first], n), axis=1)
 
 
 @lru_cache
